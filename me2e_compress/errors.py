@@ -1,0 +1,60 @@
+"""Everything this package raises on purpose.
+
+* Me2eError
+  x GraphError           a file is not a graph we can read, or lacks what we need
+  x FramesError          calibration frames are missing, wrong or not finite
+  x ModuleMapError       a module map is malformed or matches nothing
+  x RecipeError          a recipe or pipeline names an unknown pass or option
+  x PreconditionError    a pass was given a graph it cannot work on
+  x PassError            a pass broke (the cause is chained)
+  x VerificationError    the graph after a pass is not a valid successor
+  x EvaluationError      a route, a policy or a results folder is not usable
+  x MissingExtraError    an optional package is not installed
+
+Every message says what was found, what there is, and names the culprit, on one line.
+"""
+
+
+class Me2eError(Exception):
+    """Base class: the command line prints these on one line, without a traceback."""
+
+
+class GraphError(Me2eError):
+    """A file is not a graph we can read, or lacks something we need."""
+
+
+class FramesError(Me2eError):
+    """Calibration frames are missing, of another model, or not finite."""
+
+
+class ModuleMapError(Me2eError):
+    """A module map is malformed, or one of its patterns matches nothing."""
+
+
+class RecipeError(Me2eError):
+    """A recipe or pipeline names an unknown pass or option."""
+
+
+class PreconditionError(Me2eError):
+    """A pass was given a graph it cannot work on."""
+
+
+class PassError(Me2eError):
+    """A pass broke; the cause is chained."""
+
+
+class VerificationError(Me2eError):
+    """The graph after a pass is not a valid successor of the one before."""
+
+
+class EvaluationError(Me2eError):
+    """A route, a policy or a folder of results is not usable."""
+
+
+class MissingExtraError(Me2eError):
+    """An optional package is not installed; the message says which extra brings it."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(
+            f"{package} is not installed: pip install 'me2e-compress[{extra}]'"
+        )

@@ -1,0 +1,1 @@
+"""What drives a compressed model and scores the drive."""
