@@ -75,6 +75,18 @@ def save(model: ir.Model, path: Path, *, external: bool | None = None) -> None:
         os.replace(draft, path)
 
 
+def is_external(model: ir.Model) -> bool:
+    """Say whether some of the weights lie in a file of their own."""
+    return any(True for _ in _external(model))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, all or nothing."""
+    draft = path.with_name(f".{path.name}.draft")
+    draft.write_text(text, encoding="utf-8")
+    os.replace(draft, path)
+
+
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
     seal = hashlib.sha256()
@@ -112,7 +124,7 @@ def _check_external(model: ir.Model, path: Path) -> None:
 
 
 def _inlined(model: ir.Model) -> ir.Model:
-    if not any(True for _ in _external(model)):
+    if not is_external(model):
         return model
     copy = model.clone()
     for graph in copy.graphs():

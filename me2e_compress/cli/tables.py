@@ -1,0 +1,87 @@
+"""Tables that several commands show."""
+
+from collections.abc import Iterable
+
+from rich.table import Table
+
+from me2e_compress.cli.console import megabytes, number, table
+from me2e_compress.manager import Step, Verification
+from me2e_compress.metrics.fidelity import Fidelity
+from me2e_compress.modules import Item
+
+
+def steps_table(steps: Iterable[Step]) -> Table:
+    """Show pass by pass what changed and what it cost."""
+    shown = table(
+        "Pass by pass", "pass", "changes", "nodes", "weights MB", "GMACs", "CPU s"
+    )
+    for step in steps:
+        shown.add_row(
+            step.name,
+            str(step.changes),
+            f"{step.before.nodes} → {step.after.nodes}",
+            f"{megabytes(step.before.weight_bytes)} →"
+            f" {megabytes(step.after.weight_bytes)}",
+            _giga(step.after.macs),
+            f"{step.seconds:.2f}",
+        )
+        for note in step.notes:
+            shown.add_row(f"  [dim]{note}[/dim]")
+    return shown
+
+
+def verification_table(verifications: Iterable[Verification]) -> Table:
+    """Show how far exact passes moved the outputs."""
+    shown = table(
+        "Exact passes, checked by running both graphs",
+        "passes",
+        "inputs",
+        "worst output",
+        "max|a-b|/max|a|",
+        "allowed",
+        left=3,
+    )
+    for check in verifications:
+        names = ", ".join(check.passes)
+        if check.skipped is not None:
+            shown.add_row(names, f"not measured: {check.skipped}")
+            continue
+        worst = max(check.errors, key=lambda name: check.errors[name])
+        shown.add_row(
+            names,
+            check.inputs,
+            worst,
+            f"{check.errors[worst]:.1e}",
+            f"{check.tolerances[worst]:.0e}",
+        )
+    return shown
+
+
+def modules_table(before: Iterable[Item], after: Iterable[Item]) -> Table:
+    """Show module by module what a graph held and holds."""
+    shown = table(
+        "Module by module", "module", "nodes", "parameters", "weights MB", "GMACs"
+    )
+    held = {item.module: item for item in after}
+    for item in before:
+        now = held.get(item.module)
+        shown.add_row(
+            item.module,
+            f"{item.nodes} → {now.nodes if now else 0}",
+            number(item.parameters),
+            f"{megabytes(item.bytes)} → {megabytes(now.bytes if now else 0)}",
+            f"{_giga(item.macs)} → {_giga(now.macs if now else 0)}",
+        )
+    return shown
+
+
+def fidelity_table(fidelity: Fidelity) -> Table:
+    """Show how close the outputs of two graphs are."""
+    shown = table("Fidelity", "output", "SQNR dB", "max|a-b|/max|a|")
+    for item in fidelity.outputs:
+        shown.add_row(item.name, number(item.sqnr_db, ".1f"), f"{item.error:.1e}")
+    return shown
+
+
+def _giga(count: int | None) -> str:
+    return number(None if count is None else count / 1e9, ".2f")

@@ -1,0 +1,117 @@
+"""Do two graphs give the same outputs?"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress.calibration.dataset import CalibrationSet, synthetic
+from me2e_compress.errors import GraphError
+from me2e_compress.manager.report import Verification
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import Session, replay
+
+TOLERANCES = {"float64": 1e-9, "float32": 1e-4, "float16": 1e-2, "bfloat16": 5e-2}
+"""Allowed max|a-b|/max|a| by output dtype: what reordered sums of that dtype cost in
+networks of a few hundred layers (float32: 1e-6 to 1e-5 measured on VAD-tiny); every
+other dtype must be equal."""
+
+Outputs = dict[str, npt.NDArray[np.generic]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """The inputs that two graphs are compared on.
+
+    Attributes:
+        frames: what is fed, in order.
+        kind: ``recorded`` or ``synthetic``.
+    """
+
+    frames: Sequence[Frame]
+    kind: str
+
+    @classmethod
+    def of(
+        cls, model: ir.Model, frames: CalibrationSet | None, seed: int, count: int
+    ) -> "Probe":
+        """Take the first recorded frames, or make seeded inputs where none are given.
+
+        Raises:
+            PreconditionError: none are given and the inputs have no static shape.
+        """
+        if frames is not None:
+            chosen = [frames[i] for i in range(min(count, len(frames)))]
+            return cls(chosen, "recorded")
+        return cls(list(synthetic(model, seed=seed, count=count)), "synthetic")
+
+    def run(self, model: ir.Model) -> list[Outputs]:
+        """Run a graph over the frames, recurrent state fed forward."""
+        return list(replay(Session(model), self.frames))
+
+
+def errors(a: Iterable[Outputs], b: Iterable[Outputs]) -> dict[str, float]:
+    """Measure max|a-b|/max|a| of every output over all frames, in float64.
+
+    NaN and infinities count as equal where both graphs give the same one; anything
+    else that is not a number makes the error infinite.
+    """
+    worst: dict[str, float] = {}
+    for left, right in zip(a, b, strict=True):
+        for name, value in left.items():
+            worst[name] = max(worst.get(name, 0.0), relative(value, right[name]))
+    return worst
+
+
+def relative(a: npt.NDArray[np.generic], b: npt.NDArray[np.generic]) -> float:
+    """Give max|a-b|/max|a|; infinite where shapes or kinds differ."""
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return float("inf")
+    if a.size == 0:
+        return 0.0
+    if a.dtype.kind not in "fcV" and a.dtype.name not in TOLERANCES:
+        return 0.0 if np.array_equal(a, b) else float("inf")
+    wide = np.complex128 if a.dtype.kind == "c" else np.float64
+    x, y = a.astype(wide), b.astype(wide)
+    finite = np.isfinite(x)
+    if not np.array_equal(x[~finite], y[~finite], equal_nan=True):
+        return float("inf")
+    if not finite.any():
+        return 0.0
+    gap, scale = np.abs(x[finite] - y[finite]).max(), np.abs(x[finite]).max()
+    if gap == 0.0:
+        return 0.0
+    return float(gap / scale) if scale > 0 else float("inf")
+
+
+def tolerances(outputs: Outputs) -> dict[str, float]:
+    """Look up what each output may differ by."""
+    return {name: TOLERANCES.get(v.dtype.name, 0.0) for name, v in outputs.items()}
+
+
+def verify(
+    passes: tuple[str, ...], before: ir.Model, after: ir.Model, probe: Probe
+) -> Verification:
+    """Compare two graphs on a probe; a graph that no longer runs differs by inf."""
+    left = probe.run(before)
+    allowed = tolerances(left[0])
+    try:
+        right = probe.run(after)
+    except GraphError:
+        broken = dict.fromkeys(left[0], float("inf"))
+        return Verification(passes, probe.kind, broken, allowed)
+    return Verification(passes, probe.kind, errors(left, right), allowed)
+
+
+def skipped(passes: tuple[str, ...], why: str) -> Verification:
+    """Say that nothing was measured, and why."""
+    return Verification(passes, "none", {}, {}, why)
+
+
+def passed(result: Verification) -> bool:
+    """Say whether every output stayed within its tolerance."""
+    return all(
+        error <= result.tolerances[name] for name, error in result.errors.items()
+    )

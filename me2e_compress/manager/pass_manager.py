@@ -1,0 +1,222 @@
+"""The pass manager: clone, run, check, commit; verify exact passes; find the guilty."""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from time import process_time
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import (
+    GraphError,
+    Me2eError,
+    PassError,
+    PreconditionError,
+    VerificationError,
+)
+from me2e_compress.graph import provenance
+from me2e_compress.manager import contract, equivalence, reproducer
+from me2e_compress.manager.report import Report, Step, Verification
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.passes.spec import to_text
+
+Progress = Callable[[int, int, str], None]
+Stretch = list[tuple[Pass, ir.Model]]
+
+
+@dataclasses.dataclass(frozen=True)
+class PassManager:
+    """Runs passes in order and stops at the first that breaks its contract.
+
+    Attributes:
+        passes: what to run. ``import-normalize`` is put in front of a graph whose
+            nodes do not say yet where they come from.
+        verify_frames: how many frames exact passes are checked on; 0 turns it off.
+        reproducers: the folder that a failing pass leaves its reproducer in.
+    """
+
+    passes: tuple[Pass, ...]
+    verify_frames: int = 2
+    reproducers: Path | None = None
+
+    def run(
+        self, model: ir.Model, context: Context, progress: Progress | None = None
+    ) -> Report:
+        """Apply every pass to a copy of the model.
+
+        Args:
+            model: the graph; it stays as it is.
+            context: module map, frames, seed.
+            progress: called as ``progress(done, total, what)``.
+
+        Raises:
+            Me2eError: a pass refused the graph (the message says why).
+            PassError: a pass broke.
+            VerificationError: a pass broke the contract or changed the outputs.
+        """
+        model = model.clone()
+        graph.infer_shapes(model)
+        passes = self._with_import(model)
+        books = _Books(self, context, checkpoint=model)
+        for done, current in enumerate(passes):
+            if progress:
+                progress(done, len(passes), current.name)
+            if not current.exact:
+                books.verify(model)
+            model = books.transact(current, model)
+        if progress:
+            progress(len(passes), len(passes), "verify")
+        books.verify(model)
+        return Report(
+            model, to_text(passes), tuple(books.steps), tuple(books.verifications)
+        )
+
+    def _with_import(self, model: ir.Model) -> tuple[Pass, ...]:
+        known = not provenance.missing(model)
+        first = self.passes[0].name if self.passes else ""
+        if known or first == ImportNormalize.name:
+            return self.passes
+        return (ImportNormalize(), *self.passes)
+
+
+class _Books:
+    """The state of one run: steps done, and the stretch not verified yet."""
+
+    def __init__(
+        self, manager: PassManager, context: Context, checkpoint: ir.Model
+    ) -> None:
+        self.manager = manager
+        self.context = context
+        self.steps: list[Step] = []
+        self.verifications: list[Verification] = []
+        self._stretch: list[tuple[Pass, ir.Model]] = []
+        self._size = graph.size(checkpoint)
+
+    def transact(self, current: Pass, model: ir.Model) -> ir.Model:
+        """Run one pass on a clone; give the clone back only if all checks hold."""
+        start = process_time()
+        result = attempt(current, model, self.context)
+        seconds = process_time() - start
+        if isinstance(result, PassError | VerificationError):
+            raise self._with_reproducer(current, model, result) from result.__cause__
+        if isinstance(result, Me2eError):
+            raise result
+        self._enter(current, result, seconds)
+        if current.exact:
+            self._stretch.append((current, model))
+        return result.model
+
+    def verify(self, model: ir.Model) -> None:
+        """Check the exact passes since the last check, and name the guilty one."""
+        stretch, self._stretch = self._stretch, []
+        if not stretch or not self.manager.verify_frames:
+            return
+        found, runnable, probe = self._compare(stretch, model)
+        self.verifications.append(found)
+        if equivalence.passed(found) or probe is None:
+            return
+        current, guilty = _bisect(runnable, model, probe)
+        worst = max(found.errors, key=lambda name: found.errors[name])
+        error = VerificationError(
+            f"{current.name} promises the same outputs and changed {worst} by"
+            f" {found.errors[worst]:.3g} of its range"
+            f" (allowed {found.tolerances[worst]:.0e}, {found.inputs} inputs)"
+        )
+        raise self._with_reproducer(current, guilty, error)
+
+    def _compare(
+        self, stretch: Stretch, model: ir.Model
+    ) -> tuple[Verification, Stretch, equivalence.Probe | None]:
+        """Compare with the earliest graph that runs (import may make it runnable)."""
+        context, count = self.context, self.manager.verify_frames
+        reason = ""
+        for first, (_, before) in enumerate(stretch):
+            names = tuple(current.name for current, _ in stretch[first:])
+            try:
+                probe = equivalence.Probe.of(
+                    before, context.frames, context.seed, count
+                )
+                found = equivalence.verify(names, before, model, probe)
+            except (GraphError, PreconditionError) as error:
+                reason = reason or str(error)
+                continue
+            return found, stretch[first:], probe
+        names = tuple(current.name for current, _ in stretch)
+        return equivalence.skipped(names, reason), stretch, None
+
+    def _enter(self, current: Pass, result: PassResult, seconds: float) -> None:
+        after = graph.size(result.model)
+        self.steps.append(
+            Step(
+                current.name,
+                to_text((current,)),
+                current.exact,
+                result.changes,
+                seconds,
+                self._size,
+                after,
+                result.notes,
+            )
+        )
+        self._size = after
+
+    def _with_reproducer(
+        self, current: Pass, model: ir.Model, error: Me2eError
+    ) -> Me2eError:
+        """Shrink the failure and add to the message where it lies."""
+        folder = self.manager.reproducers
+        if folder is None:
+            return error
+        piece = reproducer.shrink(
+            model, lambda part: _fails_alike(current, part, self.context, error)
+        )
+        where = reproducer.write(
+            folder, piece, to_text((current,)), self.context.seed, str(error)
+        )
+        return type(error)(f"{error}; reproducer ({len(piece.graph)} nodes): {where}")
+
+
+def attempt(current: Pass, model: ir.Model, context: Context) -> PassResult | Me2eError:
+    """Run a pass on a clone and hold it to its contract; failures are values here."""
+    try:
+        result = current.run(model.clone(), context)
+        contract.check(current, model, result)
+    except Me2eError as error:
+        return error
+    except Exception as cause:  # whatever a pass may raise: chained, never swallowed
+        error = PassError(f"{current.name} broke: {type(cause).__name__}: {cause}")
+        error.__cause__ = cause
+        return error
+    return result
+
+
+def _bisect(
+    stretch: Stretch, last: ir.Model, probe: equivalence.Probe
+) -> tuple[Pass, ir.Model]:
+    """Find the first pass after which the outputs differ, in log2 trials."""
+    models = [*(model for _, model in stretch), last]
+    good, bad = 0, len(stretch)
+    while bad - good > 1:
+        middle = (good + bad) // 2
+        trial = equivalence.verify((), models[0], models[middle], probe)
+        good, bad = (middle, bad) if equivalence.passed(trial) else (good, middle)
+    return stretch[good]
+
+
+def _fails_alike(
+    current: Pass, part: ir.Model, context: Context, error: Me2eError
+) -> bool:
+    """Say whether a part of the graph shows the failure that the whole shows."""
+    result = attempt(current, part, context)
+    if isinstance(result, Me2eError):
+        return type(result) is type(error)
+    if not current.exact or isinstance(error, PassError):
+        return False
+    try:
+        probe = equivalence.Probe.of(part, None, context.seed, 1)
+        found = equivalence.verify((), part, result.model, probe)
+    except (GraphError, PreconditionError):
+        return False
+    return not equivalence.passed(found)
