@@ -1,0 +1,29 @@
+"""Modules: which node of a graph belongs to which part of the driving stack."""
+
+from me2e_compress.modules.assign import Assignment, Placement, assign
+from me2e_compress.modules.detect import detect
+from me2e_compress.modules.inventory import Inventory, Weight, inventory
+from me2e_compress.modules.itemise import Item, itemise
+from me2e_compress.modules.map import Module, ModuleMap, Role, Substitute, presets
+from me2e_compress.modules.patterns import Pattern
+from me2e_compress.modules.scopes import exits, scope_of
+
+__all__ = [
+    "Assignment",
+    "Inventory",
+    "Item",
+    "Module",
+    "ModuleMap",
+    "Pattern",
+    "Placement",
+    "Role",
+    "Substitute",
+    "Weight",
+    "assign",
+    "detect",
+    "exits",
+    "inventory",
+    "itemise",
+    "presets",
+    "scope_of",
+]

@@ -1,0 +1,132 @@
+"""Every node gets a module: by its parameters, by its scope, by its neighbours."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping
+from typing import Literal
+
+import onnx_ir as ir
+
+from me2e_compress.errors import ModuleMapError
+from me2e_compress.modules.map import ModuleMap
+from me2e_compress.modules.neighbours import spread
+from me2e_compress.modules.parameters import by_parameter, is_constant, parameter_path
+from me2e_compress.modules.scopes import scope_of
+
+Rule = Literal["stamp", "parameter", "scope", "neighbour"]
+
+STAMP = "me2e.module"
+"""Node metadata in which an imported graph already says its module."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Placement:
+    """The module of a node, and the rule that found it."""
+
+    module: str
+    rule: Rule
+
+
+@dataclasses.dataclass(frozen=True)
+class Assignment:
+    """The module of every node of a graph, nodes in subgraphs included.
+
+    Attributes:
+        modules: the map it was made with.
+        placements: by node, in the order of the graph.
+    """
+
+    modules: ModuleMap
+    placements: Mapping[ir.Node, Placement]
+
+    def module_of(self, node: ir.Node) -> str:
+        """Name the module of a node of the graph that was assigned."""
+        return self.placements[node].module
+
+    def rule_of(self, node: ir.Node) -> Rule:
+        """Say which rule decided."""
+        return self.placements[node].rule
+
+    def nodes(self, module: str) -> list[ir.Node]:
+        """List a module's nodes in graph order."""
+        return [n for n, place in self.placements.items() if place.module == module]
+
+    def rules(self) -> dict[Rule, int]:
+        """Count the nodes that each rule decided."""
+        return dict(Counter(place.rule for place in self.placements.values()))
+
+
+def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
+    """Find the module of every node. Linear in nodes, the same every time.
+
+    The first rule that knows decides:
+
+    0. *stamp*: the node says it itself, being of a graph that was imported before;
+    1. *parameter*: names of the initializers that reach it, directly or through
+       arithmetic of constants alone (Transpose, Cast, Reshape of a weight); a MatMul
+       whose weight lost its name goes by the bias added to it. An initializer that
+       scopes of several modules read was merged by the exporter and decides nothing;
+    2. *scope*: the torch module whose forward made it, see :func:`scope_of`;
+    3. *neighbour*: the nearest node that has a module: the producer that comes last
+       in the graph, else the consumer that comes first. Constants go by their
+       consumer. What hangs on nothing goes with the node before it.
+
+    Raises:
+        ModuleMapError: a required pattern matches nothing, or none at all does.
+    """
+    nodes = list(model.graph.all_nodes())
+    placed = {
+        node: Placement(module, "stamp")
+        for node in nodes
+        if (module := node.metadata_props.get(STAMP)) in modules.names()
+        and module is not None
+    }
+    scopes = {node: scope_of(node) for node in nodes}
+    if not placed:
+        _check(model, modules, scopes)
+    by_scope = {
+        node: module
+        for node, scope in scopes.items()
+        if scope and (module := modules.match(scope)) is not None
+    }
+    constant = is_constant(nodes)
+    for node, module in by_parameter(nodes, modules, by_scope, constant).items():
+        placed.setdefault(node, Placement(module, "parameter"))
+    for node, module in by_scope.items():
+        placed.setdefault(node, Placement(module, "scope"))
+    known = {node: place.module for node, place in placed.items()}
+    if nodes and not known:
+        raise ModuleMapError(
+            f"map {modules.name}: none of its patterns matches a parameter or a scope"
+            f" of this graph, which has {_sample(model, scopes)}"
+        )
+    for node, module in spread(nodes, known, constant).items():
+        placed.setdefault(node, Placement(module, "neighbour"))
+    return Assignment(modules, {node: placed[node] for node in nodes})
+
+
+def _check(model: ir.Model, modules: ModuleMap, scopes: Mapping[ir.Node, str]) -> None:
+    wanted = modules.required()
+    if not wanted:
+        return
+    paths = dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
+    found = {claim for path in paths for claim in modules.claims(path)}
+    for module, pattern in wanted:
+        if (module, pattern) not in found:
+            raise ModuleMapError(
+                f"map {modules.name}: pattern {pattern!r} of module {module} matches"
+                f" no parameter and no scope; there are {_sample(model, scopes)}"
+            )
+
+
+def _sample(model: ir.Model, scopes: Mapping[ir.Node, str]) -> str:
+    paths = [path for path in (*scopes.values(), *_parameters(model)) if path]
+    tops = list(dict.fromkeys(".".join(path.split(".")[:2]) for path in paths))
+    more = f" and {len(tops) - 8} more" if len(tops) > 8 else ""
+    return ", ".join(tops[:8]) + more if tops else "no scopes and no named parameters"
+
+
+def _parameters(model: ir.Model) -> list[str]:
+    return [
+        parameter_path(name) for graph in model.graphs() for name in graph.initializers
+    ]

@@ -1,0 +1,53 @@
+"""Which preset a graph is of."""
+
+import onnx_ir as ir
+
+from me2e_compress.errors import ModuleMapError
+from me2e_compress.modules.map import ModuleMap, presets
+from me2e_compress.modules.parameters import parameter_path
+from me2e_compress.modules.scopes import scope_of
+
+STACK = "me2e.stack"
+"""Model metadata in which our exporters name the stack, e.g. ``vad-tiny``."""
+
+
+def detect(model: ir.Model) -> ModuleMap:
+    """Find the preset of a graph.
+
+    The model's metadata decides (``me2e.stack``: a preset's name, or one followed by
+    ``-`` and a variant, as in ``vad-tiny``). Without it, the preset of which the
+    largest share of modules is found in the graph, then the one that claims most of
+    its names; at least half of the modules must be there.
+
+    Raises:
+        ModuleMapError: no preset fits.
+    """
+    stack = model.metadata_props.get(STACK)
+    for name in presets():
+        if stack is not None and (stack == name or stack.startswith(f"{name}-")):
+            return ModuleMap.load(name)
+    paths = _paths(model)
+    ranked = sorted(
+        ((*_fit(ModuleMap.load(name), paths), name) for name in presets()),
+        key=lambda entry: (-entry[0], -entry[1], entry[2]),
+    )
+    share, _, best = ranked[0]
+    if share < 0.5:
+        raise ModuleMapError(
+            f"no module map fits this graph: {best} comes closest with"
+            f" {share:.0%} of its modules (presets: {', '.join(presets())});"
+            " give a map file"
+        )
+    return ModuleMap.load(best)
+
+
+def _fit(modules: ModuleMap, paths: list[str]) -> tuple[float, int]:
+    claimed = [module for path in paths if (module := modules.match(path)) is not None]
+    return len(dict.fromkeys(claimed)) / len(modules.modules), len(claimed)
+
+
+def _paths(model: ir.Model) -> list[str]:
+    names = (name for graph in model.graphs() for name in graph.initializers)
+    paths = [parameter_path(name) for name in names]
+    paths += [scope_of(node) for node in model.graph.all_nodes()]
+    return [path for path in dict.fromkeys(paths) if path]

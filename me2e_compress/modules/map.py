@@ -1,0 +1,235 @@
+"""Which part of an ME2E stack goes by which names."""
+
+import dataclasses
+import functools
+import tomllib
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Literal, Self
+
+import pydantic
+
+from me2e_compress.errors import ModuleMapError
+from me2e_compress.modules.patterns import Pattern, is_malformed
+
+Role = Literal["feature", "prediction"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Substitute:
+    """What stands in for a scope while a module is ablated.
+
+    Attributes:
+        scope: pattern of the scope whose result must no longer depend on the module.
+        by: pattern of the scope whose result is read in its place; None for zeros.
+    """
+
+    scope: str
+    by: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Module:
+    """One module of a stack.
+
+    Attributes:
+        name: e.g. ``bev_encoder``.
+        role: "feature" for backbone, neck and BEV encoder, "prediction" for the rest:
+            what the quantization schemes go by.
+        patterns: its names, as :class:`Pattern`; each must match something.
+        optional: more names, of other exports of the same stack; they may not match.
+        substitutes: what to re-wire when it is ablated; anything else that reads it
+            reads zeros.
+    """
+
+    name: str
+    role: Role
+    patterns: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+    substitutes: tuple[Substitute, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class ModuleMap:
+    """The modules of a stack and the names they go by.
+
+    One list of patterns a module, matched alike against parameter names
+    (``img_neck.lateral_convs.0.conv.weight``) and scopes (``img_neck.fpn_convs.0``).
+    Where several modules match a path, the pattern that reaches deepest into it
+    wins, then the one with more components written out, then the earlier in the file;
+    so a module may own ``head`` and another ``head.planner``.
+
+    Attributes:
+        name: of the preset, or of the file.
+        modules: in the order of the file.
+        strip: leading components that wrappers add, dropped from every path
+            (``module.img_neck`` is ``img_neck``).
+    """
+
+    name: str
+    modules: tuple[Module, ...]
+    strip: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, source: str | Path) -> Self:
+        """Read a preset by its name, or a user's TOML file.
+
+        ```toml
+        strip = ["model"]                     # may be left out
+        [modules.backbone]
+        role = "feature"                      # or "prediction"
+        patterns = ["img_backbone"]           # each must match something
+        optional = ["encoder.resnet"]         # these need not
+        [[modules.map.substitutes]]           # read on ablation only
+        scope = "*.ego_map_decoder"
+        by = "*.ego_agent_decoder"            # left out: zeros
+        ```
+
+        Raises:
+            ModuleMapError: no such preset or file, not TOML, or not a map.
+        """
+        path = Path(source)
+        if path.suffix == ".toml":
+            if not path.is_file():
+                raise ModuleMapError(f"{path}: no such file")
+            return cls.parse(path.read_text("utf-8"), path.stem, str(path))
+        if str(source) not in presets():
+            raise ModuleMapError(
+                f"{source}: no such module map; presets are {', '.join(presets())},"
+                " anything else must be a .toml file"
+            )
+        text = _folder().joinpath(f"{source}.toml").read_text("utf-8")
+        return cls.parse(text, str(source), f"preset {source}")
+
+    @classmethod
+    def parse(cls, text: str, name: str, origin: str = "map") -> Self:
+        """Read a map from TOML; ``origin`` is what an error message calls it."""
+        try:
+            draft = _File.model_validate(tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise ModuleMapError(f"{origin}: not TOML ({error})") from error
+        except pydantic.ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            message = f"{origin}: {where}: {first['msg']}"
+            raise ModuleMapError(message) from error
+        return cls(
+            name,
+            tuple(table.module(key) for key, table in draft.modules.items()),
+            draft.strip,
+        )
+
+    def names(self, role: Role | None = None) -> tuple[str, ...]:
+        """Name the modules, all or those of a role, in the order of the file."""
+        return tuple(m.name for m in self.modules if role in (None, m.role))
+
+    def module(self, name: str) -> Module:
+        """Give a module by its name.
+
+        Raises:
+            ModuleMapError: the map has no such module.
+        """
+        for module in self.modules:
+            if module.name == name:
+                return module
+        raise ModuleMapError(
+            f"{name}: no such module in map {self.name}; it has"
+            f" {', '.join(self.names())}"
+        )
+
+    def match(self, path: str) -> str | None:
+        """Name the module that a dotted path belongs to; None if none claims it."""
+        return self._match(path)
+
+    def claims(self, path: str) -> list[tuple[str, str]]:
+        """List every (module, pattern) that matches a path, the winner first."""
+        parts = self._parts(path)
+        found = [
+            (-reach, -len(glob.components), order, module, glob.text)
+            for order, (module, glob) in enumerate(self._globs)
+            if (reach := glob.reach(parts)) is not None
+        ]
+        return [(module, text) for _, _, _, module, text in sorted(found)]
+
+    def required(self) -> list[tuple[str, str]]:
+        """List every (module, pattern) that must match something."""
+        return [(m.name, text) for m in self.modules for text in m.patterns]
+
+    @functools.cached_property
+    def _globs(self) -> tuple[tuple[str, Pattern], ...]:
+        return tuple(
+            (module.name, Pattern(text))
+            for module in self.modules
+            for text in module.patterns + module.optional
+        )
+
+    @functools.cached_property
+    def _match(self) -> "functools._lru_cache_wrapper[str | None]":
+        def winner(path: str) -> str | None:
+            claims = self.claims(path)
+            return claims[0][0] if claims else None
+
+        return functools.lru_cache(maxsize=None)(winner)
+
+    def _parts(self, path: str) -> tuple[str, ...]:
+        parts = tuple(part for part in path.split(".") if part)
+        start = 0
+        while start < len(parts) and parts[start] in self.strip:
+            start += 1
+        return parts[start:]
+
+
+def presets() -> tuple[str, ...]:
+    """Name the maps that come with the package."""
+    files = (Path(item.name) for item in _folder().iterdir())
+    return tuple(sorted(file.stem for file in files if file.suffix == ".toml"))
+
+
+def _folder() -> Traversable:
+    return resources.files("me2e_compress.modules").joinpath("presets")
+
+
+def _checked(texts: tuple[str, ...]) -> tuple[str, ...]:
+    for text in texts:
+        if is_malformed(text):
+            raise ValueError(f"{text!r} is not a pattern: a component is empty")
+    return texts
+
+
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class _SubstituteTable(_Strict):
+    scope: str
+    by: str | None = None
+
+
+class _ModuleTable(_Strict):
+    role: Role
+    patterns: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+    substitutes: tuple[_SubstituteTable, ...] = ()
+
+    _check = pydantic.field_validator("patterns", "optional")(_checked)
+
+    @pydantic.model_validator(mode="after")
+    def _has_a_name(self) -> Self:
+        if not self.patterns + self.optional:
+            raise ValueError("it has no patterns")
+        return self
+
+    def module(self, name: str) -> Module:
+        return Module(
+            name,
+            self.role,
+            self.patterns,
+            self.optional,
+            tuple(Substitute(item.scope, item.by) for item in self.substitutes),
+        )
+
+
+class _File(_Strict):
+    strip: tuple[str, ...] = ()
+    modules: dict[str, _ModuleTable] = pydantic.Field(min_length=1)

@@ -1,0 +1,103 @@
+"""What the names of weights say about the nodes that read them."""
+
+from collections.abc import Collection, Mapping, Sequence
+
+import onnx_ir as ir
+
+from me2e_compress.modules.map import ModuleMap
+
+
+def parameter_path(name: str | None) -> str:
+    """Give an initializer's dotted path; empty for names that tools made up.
+
+    The TorchScript exporter's ``onnx::MatMul_123`` and values of nodes
+    (``/img_neck/Constant_output_0``) are no parameter names.
+    """
+    return "" if not name or ":" in name or "/" in name else name
+
+
+def is_constant(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
+    """Find the nodes that compute from constants alone. Nodes come in graph order."""
+    found: set[ir.Node] = set()
+    for node in nodes:
+        if _holds_a_graph(node):
+            continue
+        if all(_known(value, found) for value in node.inputs if value is not None):
+            found.add(node)
+    return frozenset(found)
+
+
+def by_parameter(
+    nodes: Sequence[ir.Node],
+    modules: ModuleMap,
+    by_scope: Mapping[ir.Node, str],
+    constant: Collection[ir.Node],
+) -> dict[ir.Node, str]:
+    """Place the nodes that named parameters reach.
+
+    Args:
+        nodes: all nodes, in graph order.
+        modules: the map.
+        by_scope: what scopes say, to tell merged initializers.
+        constant: the nodes that compute from constants alone.
+    """
+    claims: dict[ir.Value, str | None] = {}
+    placed: dict[ir.Node, str] = {}
+    for node in nodes:
+        votes = [
+            module
+            for value in node.inputs
+            if value is not None
+            and (module := _claim(value, claims, modules, by_scope)) is not None
+        ]
+        if votes:
+            placed[node] = votes[0]
+        if node in constant:
+            claims.update((value, placed.get(node)) for value in node.outputs)
+    for node in nodes:
+        if node not in placed and (bias := _bias_reader(node)) is not None:
+            module = placed.get(bias)
+            if module is not None:
+                placed[node] = module
+    return placed
+
+
+def _claim(
+    value: ir.Value,
+    claims: dict[ir.Value, str | None],
+    modules: ModuleMap,
+    by_scope: Mapping[ir.Node, str],
+) -> str | None:
+    if value in claims:
+        return claims[value]
+    module = None
+    if value.is_initializer() and not value.is_graph_input():
+        module = modules.match(parameter_path(value.name))
+        if module is not None and _merged(value, by_scope):
+            module = None
+        claims[value] = module
+    return module
+
+
+def _merged(value: ir.Value, by_scope: Mapping[ir.Node, str]) -> bool:
+    readers = [by_scope[node] for node in value.consumers() if node in by_scope]
+    return any(module != readers[0] for module in readers)
+
+
+def _bias_reader(node: ir.Node) -> ir.Node | None:
+    if node.op_type != "MatMul" or node.outputs[0].is_graph_output():
+        return None
+    readers = node.outputs[0].consumers()
+    return readers[0] if len(readers) == 1 and readers[0].op_type == "Add" else None
+
+
+def _known(value: ir.Value, constant: Collection[ir.Node]) -> bool:
+    producer = value.producer()
+    if producer is None:
+        return value.is_initializer() and not value.is_graph_input()
+    return producer in constant
+
+
+def _holds_a_graph(node: ir.Node) -> bool:
+    kinds = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
+    return any(attribute.type in kinds for attribute in node.attributes.values())

@@ -1,0 +1,84 @@
+"""The module path of a node, as the exporters write it down."""
+
+import ast
+
+import onnx_ir as ir
+
+from me2e_compress.modules.patterns import Pattern
+
+_SCOPES = "pkg.torch.onnx.name_scopes"
+_NAMESPACE = "namespace"
+
+
+def scope_of(node: ir.Node) -> str:
+    """Give the dotted path of the torch module whose forward made a node.
+
+    Read, in this order, from
+
+    1. the dynamo exporter's metadata (``pkg.torch.onnx.name_scopes``: a list of paths,
+       each within the one before; or ``namespace``: ``path: class/path: class/...``),
+    2. the node's name as the TorchScript exporter writes it:
+       ``/img_backbone/layer1/layer1.0/conv1/Conv`` is
+       ``img_backbone.layer1.layer1.0.conv1``,
+    3. the name of its first output, which tools that rename nodes often keep
+       (``/img_neck/Resize_output_0``).
+
+    Empty where there is none: glue of the outermost forward, or renamed by a tool.
+    """
+    props = node.metadata_props
+    if props:
+        if (scopes := props.get(_SCOPES)) is not None:
+            return _last_path(_parse_list(scopes)[:-1])
+        if (namespace := props.get(_NAMESPACE)) is not None:
+            paths = [part.partition(": ")[0] for part in namespace.split("/")]
+            return _last_path(paths[:-1])
+    scope = _from_name(node.name)
+    if not scope and node.outputs:
+        scope = _from_name(node.outputs[0].name)
+    return scope
+
+
+def exits(model: ir.Model, pattern: str) -> tuple[ir.Value, ...]:
+    """List the values that a scope gives to the rest of the graph, in graph order.
+
+    Args:
+        model: the graph, its nodes still scoped.
+        pattern: as in a module map, e.g. ``*.motion_decoder``.
+
+    Returns:
+        Values made inside that are read outside or are outputs of the graph; the last
+        one is what the torch module returned, where it returns one tensor.
+    """
+    glob = Pattern(pattern)
+    inside = [node for node in model.graph if _within(glob, scope_of(node))]
+    members = set(inside)
+    return tuple(
+        value
+        for node in inside
+        for value in node.outputs
+        if value.is_graph_output()
+        or any(reader not in members for reader in value.consumers())
+    )
+
+
+def _within(glob: Pattern, scope: str) -> bool:
+    return bool(scope) and glob.reach(tuple(scope.split("."))) is not None
+
+
+def _from_name(name: str | None) -> str:
+    if not name or "/" not in name:
+        return ""
+    parts = [part for part in name.split("/")[:-1] if part]
+    return ".".join(parts)
+
+
+def _last_path(paths: list[str]) -> str:
+    return next((path for path in reversed(paths) if path), "")
+
+
+def _parse_list(text: str) -> list[str]:
+    try:
+        parsed: object = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return []
+    return [str(item) for item in parsed] if isinstance(parsed, list) else []
