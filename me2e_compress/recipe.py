@@ -29,7 +29,8 @@ from me2e_compress.passes.spec import to_text
 __all__ = ["build", "load", "parse", "registry", "shipped", "to_text"]
 
 _PASS = re.compile(r"\s*([A-Za-z][\w.-]*)\s*(\{[^{}]*\})?\s*(,|$)")
-_WORD = re.compile(r'"[^"]*"|[A-Za-z_*/.][\w*/.:?-]*(?!\s*=)(?![\w*/.:?-])')
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[^\s\[\]{},="]+(?P<key>\s*=)?')
+_LITERAL = re.compile(r"true|false|[+-]?\d[\d_]*(\.\d+)?([eE][+-]?\d+)?")
 
 
 @cache
@@ -84,7 +85,7 @@ def load(name: str | Path) -> tuple[Pass, ...]:
         raise RecipeError(f"{name} is not TOML: {error}") from error
     if not isinstance(entries, list) or not entries:
         raise RecipeError(f"{name} has no [[pass]]")
-    built = []
+    built: list[Pass] = []
     for entry in entries:
         options = dict(entry)
         built.append(build(str(options.pop("name", "")), options))
@@ -97,7 +98,8 @@ def parse(text: str) -> tuple[Pass, ...]:
     Raises:
         RecipeError: the text is not a pipeline, or names an unknown pass or option.
     """
-    built, at = [], 0
+    built: list[Pass] = []
+    at = 0
     while at < len(text) or not built:
         match = _PASS.match(text, at)
         if match is None:
@@ -133,7 +135,7 @@ def build(name: str, options: Mapping[str, object]) -> Pass:
 
 
 def _options(name: str, body: str) -> dict[str, object]:
-    quoted = _WORD.sub(_quote, body)
+    quoted = _TOKEN.sub(_quote, body)
     try:
         return dict(tomllib.loads(f"options = {quoted}")["options"])
     except tomllib.TOMLDecodeError as error:
@@ -142,4 +144,5 @@ def _options(name: str, body: str) -> dict[str, object]:
 
 def _quote(match: re.Match[str]) -> str:
     word = match.group()
-    return word if word.startswith('"') or word in ("true", "false") else f'"{word}"'
+    bare = match["key"] is None and not word.startswith('"')
+    return f'"{word}"' if bare and _LITERAL.fullmatch(word) is None else word

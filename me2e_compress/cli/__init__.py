@@ -1,4 +1,4 @@
-"""The ``me2e-compress`` command: one short file a command; the only room that prints."""
+"""The ``me2e-compress`` command, one short file each; the only room that prints."""
 
 import sys
 

@@ -19,4 +19,6 @@ def export(
     """Write a reference stack as ONNX, at its published dimensions."""
     with console.status(f"exporting {stack}"):
         exporter.export(stack, output, opset=opset, seed=seed, heads=heads)
-    console.print(f"{output}: {stack}, opset {opset}, {megabytes(file_bytes(output))} MB")
+    console.print(
+        f"{output}: {stack}, opset {opset}, {megabytes(file_bytes(output))} MB"
+    )

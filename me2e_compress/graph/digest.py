@@ -4,6 +4,7 @@ import hashlib
 import weakref
 from collections.abc import Iterable
 
+import numpy as np
 import onnx_ir as ir
 
 _TENSORS: "weakref.WeakKeyDictionary[ir.TensorProtocol, bytes]" = (
@@ -78,7 +79,9 @@ def _tensor(tensor: ir.TensorProtocol) -> bytes:
         if tensor.dtype == ir.DataType.STRING:
             seal.update(repr(tensor.numpy().tolist()).encode())
         else:
-            seal.update(tensor.tobytes())
+            # A view, not bytes: a mapped weight must not be copied to be hashed.
+            flat = np.ascontiguousarray(tensor.numpy()).reshape(-1)
+            seal.update(flat.view(np.uint8).data)
         known = seal.digest()
         _TENSORS[tensor] = known
     return known

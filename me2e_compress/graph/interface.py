@@ -1,6 +1,7 @@
 """What a graph promises to the outside."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import onnx_ir as ir
 
@@ -19,5 +20,5 @@ def interface(model: ir.Model) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
     return _ports(model.graph.inputs), _ports(model.graph.outputs)
 
 
-def _ports(values: "ir.Graph.inputs") -> tuple[Port, ...]:  # type: ignore[name-defined]
+def _ports(values: Iterable[ir.Value]) -> tuple[Port, ...]:
     return tuple(Port(v.name or "", str(v.type), str(v.shape)) for v in values)

@@ -29,7 +29,7 @@ def add_constant(
     tensor = ir.tensor(array, name=unique)
     value = ir.Value(
         name=unique,
-        shape=tensor.shape,
+        shape=ir.Shape(array.shape),
         type=ir.TensorType(tensor.dtype),
         const_value=tensor,
     )
@@ -69,7 +69,7 @@ def can_replace(old: ir.Value, new: ir.Value) -> bool:
 def sweep(model: ir.Model) -> None:
     """Drop the nodes, weights and functions nothing reads any more."""
     common.RemoveUnusedNodesPass()(model)
-    common.RemoveUnusedFunctionsPass()(model)
+    common.RemoveUnusedFunctionsPass()(model)  # type: ignore[no-untyped-call]
 
 
 def sort(model: ir.Model) -> None:

@@ -1,7 +1,7 @@
 """The pass manager: clone, run, check, commit; verify exact passes; find the guilty."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from time import process_time
 

@@ -1,0 +1,42 @@
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes.base import Context
+
+DRIVER = """
+<ir_version: 9, opset_import: ["" : 17]>
+driver (float[1,4] camera) => (float[1,4] plan) {
+    ["/backbone/Relu"] features = Relu(camera)
+    ["/occ_head/Sigmoid"] occupancy = Sigmoid(features)
+    ["/plan_head/Add"] plan = Add(features, occupancy)
+}
+"""
+
+DRIVER_MAP = """
+[modules.backbone]
+role = "feature"
+patterns = ["backbone"]
+[modules.occ]
+role = "prediction"
+patterns = ["occ_head"]
+[modules.planner]
+role = "prediction"
+patterns = ["plan_head"]
+"""
+
+
+@pytest.fixture
+def driver() -> ir.Model:
+    """A driving model in three nodes."""
+    return ir.from_onnx_text(DRIVER)
+
+
+@pytest.fixture
+def driver_map() -> ModuleMap:
+    return ModuleMap.parse(DRIVER_MAP, "driver")
+
+
+@pytest.fixture
+def context(driver_map: ModuleMap) -> Context:
+    return Context(driver_map)

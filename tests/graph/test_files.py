@@ -1,0 +1,134 @@
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.errors import GraphError
+
+
+def weighted(rows: int = 64) -> ir.Model:
+    """x @ w with a weight that is worth a file of its own."""
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        f"m (float[1,{rows}] x, float[{rows},8] w) => (float[1,8] y)"
+        " { y = MatMul(x, w) }"
+    )
+    w = model.graph.inputs.pop(1)
+    draws = np.random.default_rng(0).normal(size=(rows, 8)).astype(np.float32)
+    w.const_value = ir.tensor(draws, name="w")
+    model.graph.register_initializer(w)
+    return model
+
+
+def test_a_saved_graph_comes_back_as_it_was(tmp_path: Path) -> None:
+    model = weighted()
+    graph.save(model, tmp_path / "m.onnx")
+    assert graph.digest(graph.load(tmp_path / "m.onnx")) == graph.digest(model)
+
+
+def test_external_weights_stay_on_disk(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx", external=True)
+    back = graph.load(tmp_path / "m.onnx")
+    assert isinstance(back.graph.initializers["w"].const_value, ir.ExternalTensor)
+    assert (tmp_path / "m.onnx.data").stat().st_size == 64 * 8 * 4
+
+
+def test_what_came_external_is_saved_external(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx", external=True)
+    graph.save(graph.load(tmp_path / "m.onnx"), tmp_path / "n.onnx")
+    assert (tmp_path / "n.onnx.data").exists()
+
+
+def test_saving_inline_reads_external_weights(tmp_path: Path) -> None:
+    model = weighted()
+    graph.save(model, tmp_path / "m.onnx", external=True)
+    graph.save(graph.load(tmp_path / "m.onnx"), tmp_path / "n.onnx", external=False)
+    assert not (tmp_path / "n.onnx.data").exists()
+    assert graph.digest(graph.load(tmp_path / "n.onnx")) == graph.digest(model)
+
+
+def test_saving_leaves_nothing_else_behind(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx")
+    assert [file.name for file in tmp_path.iterdir()] == ["m.onnx"]
+
+
+def test_a_failed_save_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "m.onnx"
+    graph.save(weighted(), path)
+    before = path.read_bytes()
+
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(onnx, "save", full)
+    with pytest.raises(OSError, match="No space"):
+        graph.save(weighted(32), path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["m.onnx"]
+
+
+def test_the_data_file_of_the_model_itself_is_not_overwritten(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx", external=True)
+    model = graph.load(tmp_path / "m.onnx")
+    with pytest.raises(GraphError, match=r"m\.onnx\.data: holds the weights"):
+        graph.save(model, tmp_path / "m.onnx")
+
+
+def test_initializers_listed_as_inputs_stop_being_inputs(tmp_path: Path) -> None:
+    model = weighted()
+    model.graph.inputs.append(model.graph.initializers["w"])
+    graph.save(model, tmp_path / "m.onnx")
+    inputs, _ = graph.interface(graph.load(tmp_path / "m.onnx"))
+    assert [port.name for port in inputs] == ["x"]
+
+
+def test_no_such_file(tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match=r"none\.onnx: no such file"):
+        graph.load(tmp_path / "none.onnx")
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [b"", b"PK\x03\x04 a zip, not a graph", bytes(range(256)) * 8, b"hello\n" * 99],
+    ids=["empty", "zip", "binary", "text"],
+)
+def test_what_is_not_onnx_is_said_so(tmp_path: Path, junk: bytes) -> None:
+    (tmp_path / "junk.onnx").write_bytes(junk)
+    with pytest.raises(GraphError, match=r"junk\.onnx: not an? .*ONNX"):
+        graph.load(tmp_path / "junk.onnx")
+
+
+def test_a_truncated_file_is_said_so(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx")
+    whole = (tmp_path / "m.onnx").read_bytes()
+    (tmp_path / "cut.onnx").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(GraphError, match=r"cut\.onnx: not an ONNX file, or cut short"):
+        graph.load(tmp_path / "cut.onnx")
+
+
+def test_missing_external_data_is_named(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx", external=True)
+    (tmp_path / "m.onnx.data").unlink()
+    with pytest.raises(GraphError, match=r"m\.onnx\.data is missing"):
+        graph.load(tmp_path / "m.onnx")
+
+
+def test_external_data_cut_short_is_named(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx", external=True)
+    data = tmp_path / "m.onnx.data"
+    data.write_bytes(data.read_bytes()[:100])
+    with pytest.raises(GraphError, match=r"m\.onnx\.data is cut short: w ends"):
+        graph.load(tmp_path / "m.onnx")
+
+
+def test_a_hash_covers_the_external_weights(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx", external=True)
+    before = graph.sha256_of(tmp_path / "m.onnx")
+    data = tmp_path / "m.onnx.data"
+    data.write_bytes(data.read_bytes()[::-1])
+    assert graph.sha256_of(tmp_path / "m.onnx") != before

@@ -1,0 +1,48 @@
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.graph import provenance
+from me2e_compress.graph.rewrite import can_replace
+
+
+def test_replacing_an_output_keeps_its_name(driver: ir.Model) -> None:
+    plan = driver.graph.outputs[0]
+    features = driver.graph[0].outputs[0]
+    before = graph.interface(driver)
+    graph.replace_value(plan, features)
+    assert graph.interface(driver) == before
+    assert driver.graph.outputs[0] is features
+
+
+def test_an_input_cannot_stand_for_an_output(driver: ir.Model) -> None:
+    assert not can_replace(driver.graph.outputs[0], driver.graph.inputs[0])
+
+
+def test_an_inner_value_can_be_replaced_by_an_input(driver: ir.Model) -> None:
+    assert can_replace(driver.graph[0].outputs[0], driver.graph.inputs[0])
+
+
+def test_a_constant_takes_a_free_name(driver: ir.Model) -> None:
+    first = graph.add_constant(driver.graph, np.zeros(2, np.float32), "c")
+    second = graph.add_constant(driver.graph, np.ones(2, np.float32), "c")
+    assert (first.name, second.name) == ("c", "c_1")
+
+
+def test_the_array_of_a_computed_value_is_not_known(driver: ir.Model) -> None:
+    assert graph.array_of(driver.graph[0].outputs[0]) is None
+
+
+def test_an_heir_unites_the_origins(driver: ir.Model) -> None:
+    relu, sigmoid, add = driver.graph
+    provenance.stamp(relu, provenance.Provenance("backbone", ("r",)))
+    provenance.stamp(sigmoid, provenance.Provenance("occ", ("s", "r"), ("fold",)))
+    provenance.inherit(add, [sigmoid, relu], by="fuse")
+    assert provenance.read(add) == provenance.Provenance(
+        "occ", ("s", "r"), ("fold", "fuse")
+    )
+
+
+def test_a_node_without_a_past_is_named(driver: ir.Model) -> None:
+    provenance.stamp(driver.graph[0], provenance.Provenance("backbone", ("r",)))
+    assert provenance.missing(driver) == ["/occ_head/Sigmoid", "/plan_head/Add"]
