@@ -1,0 +1,10 @@
+"""The reference stacks in torch, their exporters and their synthetic frames.
+
+Importing this needs no torch; using an exporter does (extra ``zoo``).
+"""
+
+from me2e_compress.zoo.export import export
+from me2e_compress.zoo.frames import write_frames
+from me2e_compress.zoo.stacks import STACKS, Stack
+
+__all__ = ["STACKS", "Stack", "export", "write_frames"]

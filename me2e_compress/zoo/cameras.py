@@ -1,0 +1,191 @@
+"""Six pinhole cameras around a vehicle, and how they see boxes on a painted ground."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from me2e_compress.zoo.world import Box, Pose, World
+
+Array = NDArray[np.float32]
+
+SCALE = 0.4
+"""VAD-tiny sees 1600 x 900 images at this scale."""
+
+WIDTH, HEIGHT = 640, 360
+
+MOUNTS = (
+    ("CAM_FRONT", 0.0, (0.0, 0.7, -0.33), (1266.0, 816.0, 491.0)),
+    ("CAM_FRONT_LEFT", 55.0, (-0.5, 0.55, -0.35), (1272.0, 826.0, 480.0)),
+    ("CAM_FRONT_RIGHT", -55.0, (0.5, 0.55, -0.35), (1260.0, 807.0, 495.0)),
+    ("CAM_BACK", 180.0, (0.0, -0.9, -0.28), (809.0, 829.0, 482.0)),
+    ("CAM_BACK_LEFT", 110.0, (-0.5, 0.2, -0.3), (1256.0, 792.0, 492.0)),
+    ("CAM_BACK_RIGHT", -110.0, (0.5, 0.2, -0.3), (1259.0, 807.0, 501.0)),
+)
+"""Name, yaw in degrees (left positive), position in the lidar frame in metres (x right,
+y forward, z up) and focal length and principal point in pixels of the full image:
+rounded from the calibration of nuScenes (Caesar et al. 2020), order of Bench2Drive."""
+
+LIDAR_HEIGHT_M = 1.84
+"""Of nuScenes' lidar above the ground."""
+
+NEAR_M = 0.3
+FAR_M = 1.0e6
+
+SUN = np.array([0.45, 0.35, 0.82], np.float32)
+SKY_LOW = np.array([214.0, 222.0, 232.0], np.float32)
+SKY_HIGH = np.array([96.0, 148.0, 214.0], np.float32)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole.
+
+    Attributes:
+        position: [3] metres, lidar frame.
+        to_camera: [3, 3] lidar frame to camera (x right, y down, z forward).
+        intrinsics: [3, 3] pixels of the 640 x 360 image.
+    """
+
+    position: Array
+    to_camera: Array
+    intrinsics: Array
+
+    def lidar2img(self) -> Array:
+        """[4, 4]: lidar metres to (u * depth, v * depth, depth, 1)."""
+        out = np.eye(4, dtype=np.float32)
+        out[:3, :3] = self.intrinsics @ self.to_camera
+        out[:3, 3] = -out[:3, :3] @ self.position
+        return out
+
+    def rays(self) -> Array:
+        """[360, 640, 3]: directions through the pixel centres, depth 1, lidar frame."""
+        focal, cx, cy = (
+            self.intrinsics[0, 0],
+            self.intrinsics[0, 2],
+            self.intrinsics[1, 2],
+        )
+        v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32) + np.float32(0.5)
+        flat = np.stack([(u - cx) / focal, (v - cy) / focal, np.ones_like(u)], -1)
+        return np.ascontiguousarray(flat @ self.to_camera)
+
+
+@cache
+def rig() -> tuple[Camera, ...]:
+    """The six cameras, in the order of the image input."""
+    cameras = []
+    for _, yaw_deg, position, (focal, cx, cy) in MOUNTS:
+        yaw = math.radians(yaw_deg)
+        ahead = (-math.sin(yaw), math.cos(yaw), 0.0)
+        right = (math.cos(yaw), math.sin(yaw), 0.0)
+        cameras.append(
+            Camera(
+                np.array(position, np.float32),
+                np.array([right, (0.0, 0.0, -1.0), ahead], np.float32),
+                np.array(
+                    [
+                        [focal * SCALE, 0, cx * SCALE],
+                        [0, focal * SCALE, cy * SCALE],
+                        [0, 0, 1],
+                    ],
+                    np.float32,
+                ),
+            )
+        )
+    return tuple(cameras)
+
+
+@cache
+def _rays() -> tuple[Array, ...]:
+    return tuple(camera.rays() for camera in rig())
+
+
+def render(world: World, ego: Pose, boxes: Sequence[Box]) -> NDArray[np.uint8]:
+    """Draw what the six cameras see: [6, 360, 640, 3] RGB.
+
+    Args:
+        world: The ground.
+        ego: Where the vehicle stands in the world.
+        boxes: Everything that stands on the ground, in the world.
+    """
+    images = np.empty((len(MOUNTS), HEIGHT, WIDTH, 3), np.uint8)
+    for image, camera, rays in zip(images, rig(), _rays(), strict=True):
+        colour, depth = _background(world, ego, camera, rays)
+        for box in boxes:
+            _draw(box, ego, camera, rays, colour, depth)
+        haze = np.exp(-depth / 220.0)[..., None]
+        colour = colour * haze + SKY_LOW * (1 - haze)
+        image[:] = np.clip(colour, 0, 255)
+    return images
+
+
+def _background(
+    world: World, ego: Pose, camera: Camera, rays: Array
+) -> tuple[Array, Array]:
+    """Sky and ground: colour [360, 640, 3] and depth [360, 640]."""
+    rise = np.clip(rays[..., 2:] / 0.5, 0, 1)
+    colour = SKY_LOW * (1 - rise) + SKY_HIGH * rise
+    depth = np.full(rays.shape[:2], np.float32(0))
+    down = rays[..., 2] < -0.01
+    height = camera.position[2] + LIDAR_HEIGHT_M
+    reach = -height / rays[..., 2][down]
+    right = camera.position[0] + reach * rays[..., 0][down]
+    ahead = camera.position[1] + reach * rays[..., 1][down]
+    x, y = ego.to_world(right, ahead)
+    colour[down] = world.ground(x, y)
+    depth[down] = reach
+    depth[~down] = 0
+    return colour, depth
+
+
+def _draw(
+    box: Box, ego: Pose, camera: Camera, rays: Array, colour: Array, depth: Array
+) -> None:
+    """Cast the rays that may hit the box and paint where it is nearest."""
+    window = _window(box, ego, camera)
+    if window is None:
+        return
+    cos, sin = math.cos(ego.yaw - box.yaw), math.sin(ego.yaw - box.yaw)
+    right, ahead = ego.to_lidar(box.x, box.y)
+    start = camera.position - np.array([right, ahead, -LIDAR_HEIGHT_M], np.float32)
+    turn = np.array([[sin, -cos, 0], [cos, sin, 0], [0, 0, 1]], np.float32).T
+    origin, towards = turn.T @ start, rays[window] @ turn
+    half = np.array([box.length / 2, box.width / 2, box.height / 2], np.float32)
+    origin[2] -= half[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-half - origin) / towards, (half - origin) / towards
+    enter = np.minimum(one, other)
+    leave = np.maximum(one, other)
+    near = np.maximum(np.maximum(enter[..., 0], enter[..., 1]), enter[..., 2])
+    far = np.minimum(np.minimum(leave[..., 0], leave[..., 1]), leave[..., 2])
+    hit = (near < far) & (near > NEAR_M)
+    behind = depth[window]
+    hit &= (near < behind) | (behind == 0)
+    if not hit.any():
+        return
+    axis = enter[hit].argmax(-1)
+    at = origin + towards[hit] * near[hit][:, None]
+    colour[window][hit] = box.paint(at, half, axis, turn.T @ SUN)
+    behind[hit] = near[hit]
+
+
+def _window(box: Box, ego: Pose, camera: Camera) -> tuple[slice, slice] | None:
+    """Rows and columns that the box may touch, or None."""
+    x, y, z = box.corners()
+    right, ahead = ego.to_lidar(x, y)
+    points = np.stack([right, ahead, z - LIDAR_HEIGHT_M], -1) - camera.position
+    seen = points @ camera.to_camera.T
+    depth = seen[:, 2]
+    if depth.max() < NEAR_M:
+        return None
+    if depth.min() < NEAR_M:
+        return slice(0, HEIGHT), slice(0, WIDTH)
+    uv = (seen @ camera.intrinsics.T)[:, :2] / depth[:, None]
+    low, high = np.floor(uv.min(0)).astype(int), np.ceil(uv.max(0)).astype(int)
+    columns = slice(max(int(low[0]), 0), min(int(high[0]) + 1, WIDTH))
+    rows = slice(max(int(low[1]), 0), min(int(high[1]) + 1, HEIGHT))
+    empty = columns.start >= columns.stop or rows.start >= rows.stop
+    return None if empty else (rows, columns)

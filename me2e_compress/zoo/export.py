@@ -1,0 +1,134 @@
+"""Write a stack of the zoo as ONNX."""
+
+import importlib.util
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import onnx
+
+from me2e_compress.errors import GraphError, MissingExtraError
+from me2e_compress.zoo.stacks import Stack, find
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from me2e_compress.zoo.vad.config import HeadsName
+
+GRID_SAMPLE_OPSET = 16
+"""GridSample exists from here on; below, sampling is spelled with Gather."""
+
+OPSETS = range(13, 18)
+"""From the first that onnxruntime and TensorRT agree on to the last that torch's
+TorchScript exporter writes as asked (17: LayerNormalization)."""
+
+
+def export(
+    stack: str,
+    path: Path,
+    *,
+    opset: int = 17,
+    seed: int = 0,
+    heads: "HeadsName" = "nuscenes",
+) -> Path:
+    """Build a stack from a seed and write it as one ONNX file.
+
+    Parameters keep their state-dict names and nodes the scopes of their modules, which
+    is what a module map reads; constants are not folded. The metadata says what the
+    file is (`Stack.metadata`).
+
+    Args:
+        stack: Name in `STACKS`.
+        path: The ``.onnx`` to write; replaced in one step.
+        opset: 13 to 17; below 16 grid sampling is decomposed into gathers.
+        seed: Of all weights.
+        heads: Sizes of the last layers.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+        GraphError: Unknown stack or opset, or the exporter wrote another opset.
+    """
+    spec = find(stack)
+    if opset not in OPSETS:
+        raise GraphError(
+            f"cannot export {stack} at opset {opset}: {OPSETS[0]} to {OPSETS[-1]} work"
+        )
+    model = build(stack, opset=opset, seed=seed, heads=heads)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
+        draft = Path(folder) / path.name
+        draft.write_bytes(trace(spec, model, opset).SerializeToString())
+        os.replace(draft, path)
+    return path
+
+
+def build(
+    stack: str, *, opset: int = 17, seed: int = 0, heads: "HeadsName" = "nuscenes"
+) -> "nn.Module":
+    """The torch module of a stack, initialised from a seed and ready to run.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+        GraphError: Unknown stack or heads.
+    """
+    find(stack)
+    if importlib.util.find_spec("torch") is None:
+        raise MissingExtraError("torch", "zoo")
+    from me2e_compress.zoo.vad.build import build as build_vad
+
+    sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
+    return build_vad(seed=seed, heads=heads, sampling=sampling)
+
+
+def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
+    """Trace a module with example inputs and return the checked graph.
+
+    Raises:
+        GraphError: The exporter wrote another opset than it was asked for.
+    """
+    import io
+
+    import torch
+
+    buffer = io.BytesIO()
+    with _quiet_exporter(), torch.no_grad():
+        torch.onnx.export(
+            model,
+            example(spec),
+            buffer,
+            dynamo=False,
+            opset_version=opset,
+            do_constant_folding=False,
+            input_names=list(spec.inputs),
+            output_names=list(spec.outputs),
+        )
+    graph = onnx.load_from_string(buffer.getvalue())
+    written = {entry.domain: entry.version for entry in graph.opset_import}
+    if written != {"": opset}:
+        raise GraphError(f"{spec.name}: asked for opset {opset}, torch wrote {written}")
+    for key, value in spec.metadata().items():
+        graph.metadata_props.add(key=key, value=value)
+    return graph
+
+
+def example(spec: Stack) -> "tuple[Tensor, ...]":
+    """Zeros in the shapes of the inputs: a trace looks at nothing else."""
+    import torch
+
+    return tuple(torch.zeros(shape) for shape in spec.inputs.values())
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Silence what torch says of its exporter, and of traced shapes; nothing else."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "You are using the legacy TorchScript")
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
+        yield

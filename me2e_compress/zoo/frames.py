@@ -1,0 +1,159 @@
+"""Synthetic calibration frames: scenes of a moving world seen by six cameras."""
+
+import json
+import math
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from me2e_compress.errors import FramesError
+from me2e_compress.zoo.cameras import render, rig
+from me2e_compress.zoo.stacks import Stack, find
+from me2e_compress.zoo.traffic import draw_world
+from me2e_compress.zoo.world import FRAME_S, World
+
+Frame = dict[str, NDArray[np.float32]]
+
+INDEX = "scenes.json"
+SENSOR_NOISE = 2.0
+"""Standard deviation of pixel noise, in 1 / 255."""
+
+
+
+def write_frames(
+    stack: str,
+    folder: Path,
+    n: int,
+    seed: int,
+    scene_length: int = 8,
+    on_frame: Callable[[int], None] | None = None,
+) -> Path:
+    """Write a folder of calibration frames, all or nothing.
+
+    One ``000000.npz`` a frame, keyed by input name and without the recurrent inputs,
+    and ``scenes.json``, which says where scenes begin (there the recurrent state is
+    reset). A folder that holds earlier frames of the zoo is replaced.
+
+    Args:
+        stack: Name in `me2e_compress.zoo.stacks.STACKS`.
+        folder: To write.
+        n: Frames.
+        seed: Of the worlds and of the noise.
+        scene_length: Frames a scene; the last may be shorter.
+        on_frame: Told the number of frames written, after each.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FramesError: A count below 1, or the folder holds something else.
+        GraphError: Unknown stack.
+    """
+    spec = find(stack)
+    _refuse_foreign(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
+    try:
+        draft.chmod(0o755)
+        for index, frame in enumerate(frames(spec, n, seed, scene_length)):
+            _write_npz(draft / f"{index:06d}.npz", frame)
+            if on_frame is not None:
+                on_frame(index + 1)
+        index_of_frames = {
+            "scenes": list(range(0, n, scene_length)),
+            "stack": stack,
+            "seed": seed,
+            "count": n,
+        }
+        (draft / INDEX).write_text(json.dumps(index_of_frames, indent=1) + "\n")
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(draft, folder)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    return folder
+
+
+def frames(spec: Stack, n: int, seed: int, scene_length: int = 8) -> Iterator[Frame]:
+    """Make frames one by one, keyed by input name, without the recurrent inputs.
+
+    Raises:
+        FramesError: A count below 1.
+    """
+    if n < 1 or scene_length < 1:
+        raise FramesError(f"{n} frames in scenes of {scene_length}: both must be >= 1")
+    lidar2img = np.stack([camera.lidar2img() for camera in rig()])[None]
+    for index in range(n):
+        scene, step = divmod(index, scene_length)
+        if step == 0:
+            world = draw_world(np.random.default_rng([seed, scene]))
+        noise = np.random.default_rng([seed, scene, step + 1])
+        seconds = step * FRAME_S
+        seen = render(world, world.ego(seconds), world.boxes_at(seconds))
+        yield {
+            "img": _normalise(spec, seen, noise),
+            "lidar2img": lidar2img,
+            "can_bus": _can_bus(world, step),
+        }
+
+
+def _normalise(
+    spec: Stack, seen: NDArray[np.uint8], noise: np.random.Generator
+) -> NDArray[np.float32]:
+    """[6, h, w, 3] RGB pixels to the image input, padded with zeros below."""
+    grain = noise.normal(0, SENSOR_NOISE, seen.shape[:3])[..., None]
+    pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
+    mean, std = np.float32(spec.image.mean), np.float32(spec.image.std)
+    out = np.zeros(spec.inputs["img"], np.float32)
+    height, width = seen.shape[1:3]
+    out[0, :, :, :height, :width] = ((pixels - mean) / std).transpose(0, 3, 1, 2)
+    return out
+
+
+def _can_bus(world: World, step: int) -> NDArray[np.float32]:
+    """[18]: 0-2 metres moved since the last frame (world), 3-6 quaternion, 7 speed,
+    10-12 acceleration, 13-15 angular rate, 16 yaw (rad), 17 change of yaw (deg).
+
+    The changes are zero at the start of a scene.
+    """
+    now, before = world.ego(step * FRAME_S), world.ego(max(step - 1, 0) * FRAME_S)
+    turned = now.yaw - before.yaw
+    out = np.zeros(18, np.float32)
+    out[0:2] = now.x - before.x, now.y - before.y
+    out[3], out[6] = math.cos(now.yaw / 2), math.sin(now.yaw / 2)
+    out[7] = world.speed_mps + world.accel_mps2 * step * FRAME_S
+    out[10] = world.accel_mps2
+    out[15] = turned / FRAME_S
+    out[16], out[17] = now.yaw, math.degrees(turned)
+    return out
+
+
+def _refuse_foreign(folder: Path) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise FramesError(f"{folder} is a file, not a folder for frames")
+    names = sorted(path.name for path in folder.iterdir())
+    if not names:
+        return
+    if INDEX not in names:
+        raise FramesError(f"{folder} is not empty and not ours: it has {names[0]}")
+    for name in names:
+        if name != INDEX and not (name.endswith(".npz") and name[:-4].isdigit()):
+            raise FramesError(f"{folder} holds frames but also {name}: not replaced")
+
+
+def _write_npz(path: Path, frame: Frame) -> None:
+    """Like numpy.savez_compressed, at a fast level; the same frame, the same bytes."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, value in frame.items():
+            entry = zipfile.ZipInfo(f"{name}.npy")
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(entry, "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, value, allow_pickle=False)

@@ -1,0 +1,1 @@
+"""VAD-tiny in torch: the vectorised driving stack at its published dimensions."""

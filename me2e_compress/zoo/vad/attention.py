@@ -1,0 +1,164 @@
+"""Attention and feed-forward blocks."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from me2e_compress.zoo.vad.config import (
+    ATTENTION_HEADS,
+    EMBED,
+    FEED_FORWARD,
+    Sampling,
+)
+from me2e_compress.zoo.vad.sampling import sample
+
+MASKED_LOGIT = -1.0e4
+"""Softmax makes it 0, and unlike minus infinity it fits float16 and any observer."""
+
+
+class PackedAttention(nn.Module):
+    """Scaled dot-product attention with the q, k and v projections in one tensor."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * EMBED, EMBED))
+        self.in_proj_bias = nn.Parameter(torch.empty(3 * EMBED))
+        self.out_proj = nn.Linear(EMBED, EMBED)
+
+    def forward(
+        self, query: Tensor, key: Tensor, value: Tensor, ignore: Tensor | None = None
+    ) -> Tensor:
+        """Attend.
+
+        Args:
+            query: [B, Q, 256].
+            key: [B, K, 256].
+            value: [B, K, 256], or [1, K, 256] when all of the batch shares it.
+            ignore: [B, K] bool, true where a key must not be seen.
+
+        Returns:
+            [B, Q, 256].
+        """
+        weights = self.in_proj_weight.chunk(3)
+        biases = self.in_proj_bias.chunk(3)
+        q, k, v = (
+            _split_heads(functional.linear(x, weight, bias))
+            for x, weight, bias in zip(
+                (query, key, value), weights, biases, strict=True
+            )
+        )
+        logits = torch.matmul(q * q.shape[-1] ** -0.5, k.transpose(-2, -1))
+        if ignore is not None:
+            logits = logits.masked_fill(ignore[:, None, None], MASKED_LOGIT)
+        mixed = torch.matmul(logits.softmax(-1), v).transpose(1, 2).flatten(2)
+        out: Tensor = self.out_proj(mixed)
+        return out
+
+
+def _split_heads(x: Tensor) -> Tensor:
+    return x.view(x.shape[0], x.shape[1], ATTENTION_HEADS, -1).transpose(1, 2)
+
+
+class MultiheadAttention(nn.Module):
+    """Attention with positions added to query and key, and the residual."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.attn = PackedAttention()
+
+    def forward(
+        self,
+        query: Tensor,
+        key: Tensor,
+        query_pos: Tensor,
+        key_pos: Tensor,
+        ignore: Tensor | None = None,
+    ) -> Tensor:
+        """[B, Q, 256] and keys, which are the values too, to [B, Q, 256]."""
+        attended: Tensor = self.attn(query + query_pos, key + key_pos, key, ignore)
+        return query + attended
+
+
+class FeedForward(nn.Module):
+    """Linear, ReLU, linear, residual."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Sequential(nn.Linear(EMBED, FEED_FORWARD), nn.ReLU()),
+            nn.Linear(FEED_FORWARD, EMBED),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[..., 256] -> [..., 256]."""
+        return x + self.layers(x)
+
+
+def deformable_attention(
+    value: Tensor,
+    hw: tuple[int, int],
+    locations: Tensor,
+    weights: Tensor,
+    sampling: Sampling,
+) -> Tensor:
+    """Weighted sum of samples of one feature level (Zhu et al. 2021, equation 2).
+
+    Args:
+        value: [B, h * w, heads, 32].
+        hw: Height and width of the level.
+        locations: [B, Q, heads, 1, P, 2], x then y; 0 and 1 are the outer edges.
+        weights: [B, Q, heads, 1, P], summing to 1 over the last two axes.
+        sampling: See `sample`.
+
+    Returns:
+        [B, Q, heads * 32].
+    """
+    batch, _, heads, channels = value.shape
+    queries, points = locations.shape[1], locations.shape[4]
+    image = value.flatten(2).transpose(1, 2).reshape(batch * heads, channels, *hw)
+    grid = (2 * locations - 1)[:, :, :, 0].transpose(1, 2).flatten(0, 1)
+    sampled = sample(image, grid, sampling)
+    weights = weights.transpose(1, 2).reshape(batch * heads, 1, queries, points)
+    out = (sampled * weights).sum(-1).view(batch, heads * channels, queries)
+    return out.transpose(1, 2)
+
+
+class DecoderAttention(nn.Module):
+    """Queries read the BEV around their reference points."""
+
+    points = 4
+
+    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+        super().__init__()
+        self.hw = hw
+        self.sampling: Sampling = sampling
+        self.sampling_offsets = nn.Linear(EMBED, ATTENTION_HEADS * self.points * 2)
+        self.attention_weights = nn.Linear(EMBED, ATTENTION_HEADS * self.points)
+        self.value_proj = nn.Linear(EMBED, EMBED)
+        self.output_proj = nn.Linear(EMBED, EMBED)
+        self.register_buffer("size_xy", torch.tensor(hw[::-1]).float(), False)
+
+    def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
+        """Attend.
+
+        Args:
+            query: [1, Q, 256].
+            pos: [1, Q, 256], added to the query.
+            bev: [1, cells, 256].
+            at: [1, Q, 2] reference points, 0..1.
+
+        Returns:
+            [1, Q, 256], with the residual.
+        """
+        asked = query + pos
+        batch, queries, _ = asked.shape
+        value = self.value_proj(bev)
+        value = value.view(batch, value.shape[1], ATTENTION_HEADS, -1)
+        offsets = self.sampling_offsets(asked)
+        offsets = offsets.view(batch, queries, ATTENTION_HEADS, 1, self.points, 2)
+        weights = self.attention_weights(asked)
+        weights = weights.view(batch, queries, ATTENTION_HEADS, self.points).softmax(-1)
+        weights = weights.view(batch, queries, ATTENTION_HEADS, 1, self.points)
+        locations = at[:, :, None, None, None, :] + offsets / self.size_xy
+        out = deformable_attention(value, self.hw, locations, weights, self.sampling)
+        return query + self.output_proj(out)

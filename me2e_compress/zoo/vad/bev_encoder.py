@@ -1,0 +1,228 @@
+"""Camera features and the previous BEV to a bird's eye view (BEVFormer)."""
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.vad.attention import FeedForward, deformable_attention
+from me2e_compress.zoo.vad.config import (
+    ATTENTION_HEADS,
+    BEV_HW,
+    EMBED,
+    IMAGE_HW,
+    LAYERS,
+    PC_RANGE,
+    PILLAR_POINTS,
+    Sampling,
+)
+from me2e_compress.zoo.vad.geometry import pillars, project
+
+
+class TemporalSelfAttention(nn.Module):
+    """BEV queries read the previous BEV and the present queries."""
+
+    points = 4
+    queue = 2
+
+    def __init__(self, sampling: Sampling) -> None:
+        super().__init__()
+        self.sampling: Sampling = sampling
+        samples = self.queue * ATTENTION_HEADS * self.points
+        self.sampling_offsets = nn.Linear(self.queue * EMBED, samples * 2)
+        self.attention_weights = nn.Linear(self.queue * EMBED, samples)
+        self.value_proj = nn.Linear(EMBED, EMBED)
+        self.output_proj = nn.Linear(EMBED, EMBED)
+        self.register_buffer("size_xy", torch.tensor(BEV_HW[::-1]).float(), False)
+
+    def forward(self, query: Tensor, pos: Tensor, queue: Tensor, at: Tensor) -> Tensor:
+        """Attend.
+
+        Args:
+            query: [1, cells, 256].
+            pos: [1, cells, 256], added to the query.
+            queue: [2, cells, 256], the previous BEV and the present one.
+            at: [1, cells, 2] reference points, 0..1.
+
+        Returns:
+            [1, cells, 256], with the residual.
+        """
+        asked = torch.cat([queue[:1], query + pos], -1)
+        cells = asked.shape[1]
+        heads, points = ATTENTION_HEADS, self.points
+        value = self.value_proj(queue).view(self.queue, cells, heads, -1)
+        offsets = self.sampling_offsets(asked)
+        offsets = offsets.view(1, cells, heads, self.queue, 1, points, 2)
+        offsets = offsets.permute(0, 3, 1, 2, 4, 5, 6).flatten(0, 1)
+        weights = self.attention_weights(asked)
+        weights = weights.view(1, cells, heads, self.queue, points).softmax(-1)
+        weights = weights.permute(0, 3, 1, 2, 4).flatten(0, 1).unsqueeze(3)
+        locations = at[:, :, None, None, None, :] + offsets / self.size_xy
+        out = deformable_attention(value, BEV_HW, locations, weights, self.sampling)
+        return query + self.output_proj(out.mean(0, keepdim=True))
+
+
+class CameraAttention(nn.Module):
+    """The deformable attention inside of `SpatialCrossAttention`."""
+
+    points = 8
+
+    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+        super().__init__()
+        self.hw = hw
+        self.sampling: Sampling = sampling
+        self.sampling_offsets = nn.Linear(EMBED, ATTENTION_HEADS * self.points * 2)
+        self.attention_weights = nn.Linear(EMBED, ATTENTION_HEADS * self.points)
+        self.value_proj = nn.Linear(EMBED, EMBED)
+        self.register_buffer("size_xy", torch.tensor(hw[::-1]).float(), False)
+
+    def forward(self, query: Tensor, tokens: Tensor, at: Tensor) -> Tensor:
+        """Read every camera for every cell, visible or not.
+
+        Args:
+            query: [1, cells, 256].
+            tokens: [cameras, h * w, 256].
+            at: [cameras, cells, pillar points, 2] in the image, 0..1.
+
+        Returns:
+            [cameras, cells, 256].
+        """
+        heads, points = ATTENTION_HEADS, self.points
+        cameras, cells = at.shape[:2]
+        value = self.value_proj(tokens).view(cameras, tokens.shape[1], heads, -1)
+        offsets = self.sampling_offsets(query).view(1, cells, heads, 1, points, 2)
+        offsets = (offsets / self.size_xy).view(
+            1, cells, heads, points // PILLAR_POINTS, PILLAR_POINTS, 2
+        )
+        weights = self.attention_weights(query).view(1, cells, heads, points)
+        weights = weights.softmax(-1).unsqueeze(3)
+        weights = weights.expand(cameras, cells, heads, 1, points)
+        locations = at[:, :, None, None] + offsets
+        locations = locations.view(cameras, cells, heads, 1, points, 2)
+        return deformable_attention(
+            value, self.hw, locations, weights, self.sampling
+        )
+
+
+class SpatialCrossAttention(nn.Module):
+    """BEV queries read the cameras in which their pillar is visible."""
+
+    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+        super().__init__()
+        self.deformable_attention = CameraAttention(hw, sampling)
+        self.output_proj = nn.Linear(EMBED, EMBED)
+
+    def forward(
+        self, query: Tensor, tokens: Tensor, at: Tensor, visible: Tensor
+    ) -> Tensor:
+        """As `CameraAttention`, averaged over the cameras that see the cell.
+
+        Args:
+            query: [1, cells, 256].
+            tokens: [cameras, h * w, 256].
+            at: [cameras, cells, pillar points, 2].
+            visible: [cameras, cells, 1] float32, 1 or 0.
+
+        Returns:
+            [1, cells, 256], with the residual.
+        """
+        seen = self.deformable_attention(query, tokens, at) * visible
+        count = visible.sum(0, keepdim=True).clamp(min=1.0)
+        return query + self.output_proj(seen.sum(0, keepdim=True) / count)
+
+
+class EncoderLayer(nn.Module):
+    """Temporal attention, camera attention, feed-forward; normalised after each."""
+
+    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+        super().__init__()
+        self.attentions = nn.ModuleList(
+            [TemporalSelfAttention(sampling), SpatialCrossAttention(hw, sampling)]
+        )
+        self.ffns = nn.ModuleList([FeedForward()])
+        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
+
+    def forward(
+        self,
+        query: Tensor,
+        pos: Tensor,
+        queue: Tensor,
+        cells_at: Tensor,
+        tokens: Tensor,
+        pillars_at: Tensor,
+        visible: Tensor,
+    ) -> Tensor:
+        """[1, cells, 256] -> [1, cells, 256]."""
+        query = self.norms[0](self.attentions[0](query, pos, queue, cells_at))
+        query = self.norms[1](self.attentions[1](query, tokens, pillars_at, visible))
+        out: Tensor = self.norms[2](self.ffns[0](query))
+        return out
+
+
+class BevEncoder(nn.Module):
+    """Three `EncoderLayer`s over a grid of cells."""
+
+    def __init__(self, sampling: Sampling) -> None:
+        super().__init__()
+        hw = (IMAGE_HW[0] // 32, IMAGE_HW[1] // 32)
+        self.layers = nn.ModuleList(EncoderLayer(hw, sampling) for _ in range(LAYERS))
+        points = pillars(BEV_HW, PC_RANGE, PILLAR_POINTS)
+        self.register_buffer("pillars", points, False)
+        rows, columns = torch.meshgrid(
+            (torch.arange(BEV_HW[0]) + 0.5) / BEV_HW[0],
+            (torch.arange(BEV_HW[1]) + 0.5) / BEV_HW[1],
+            indexing="ij",
+        )
+        cells = torch.stack([columns, rows], -1).view(1, -1, 2)
+        self.register_buffer("cells", cells, False)
+
+    def forward(
+        self,
+        query: Tensor,
+        pos: Tensor,
+        previous: Tensor,
+        first: Tensor,
+        shift: Tensor,
+        tokens: Tensor,
+        lidar2img: Tensor,
+    ) -> Tensor:
+        """Encode one frame.
+
+        Args:
+            query: [1, cells, 256], learned embedding plus ego motion.
+            pos: [1, cells, 256].
+            previous: [1, cells, 256], the last BEV turned to the present heading.
+            first: bool scalar: there is no previous BEV.
+            shift: [1, 2], ego translation as a part of the grid. As in the original,
+                it moves the reference points of both halves of the queue.
+            tokens: [cameras, h * w, 256].
+            lidar2img: [1, cameras, 4, 4].
+
+        Returns:
+            [1, cells, 256].
+        """
+        pillars_at, visible = project(self.pillars, lidar2img, IMAGE_HW)
+        cells_at = self.cells + shift[:, None]
+        start = query
+        for layer in self.layers:
+            older = torch.where(first, query, previous)
+            newer = torch.where(first, query, start)
+            queue = torch.cat([older, newer], 0)
+            query = layer(query, pos, queue, cells_at, tokens, pillars_at, visible)
+        return query
+
+
+class GridPosition(nn.Module):
+    """Learned embedding of a row and a column."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.row_embed = nn.Embedding(BEV_HW[0], EMBED // 2)
+        self.col_embed = nn.Embedding(BEV_HW[1], EMBED // 2)
+
+    def forward(self) -> Tensor:
+        """Return [1, cells, 256]: column half, then row half."""
+        height, width = BEV_HW
+        columns = self.col_embed.weight.unsqueeze(0).expand(height, -1, -1)
+        rows = self.row_embed.weight.unsqueeze(1).expand(-1, width, -1)
+        return torch.cat([columns, rows], -1).flatten(0, 1).unsqueeze(0)
+
+

@@ -1,0 +1,127 @@
+"""Decoders that refine reference points layer by layer (deformable DETR)."""
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.vad.attention import (
+    DecoderAttention,
+    FeedForward,
+    MultiheadAttention,
+)
+from me2e_compress.zoo.vad.config import BEV_HW, EMBED, LAYERS, Sampling
+
+EPSILON = 1.0e-5
+"""Keeps the inverse sigmoid finite (deformable DETR)."""
+
+
+def inverse_sigmoid(x: Tensor) -> Tensor:
+    """Logit of x, which is clamped to [1e-5, 1 - 1e-5]."""
+    x = x.clamp(0.0, 1.0)
+    return torch.log(x.clamp(min=EPSILON) / (1 - x).clamp(min=EPSILON))
+
+
+class DecoderLayer(nn.Module):
+    """Queries read each other, then the BEV, then think."""
+
+    def __init__(self, sampling: Sampling) -> None:
+        super().__init__()
+        self.attentions = nn.ModuleList(
+            [MultiheadAttention(), DecoderAttention(BEV_HW, sampling)]
+        )
+        self.ffns = nn.ModuleList([FeedForward()])
+        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
+
+    def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
+        """[1, Q, 256] -> [1, Q, 256]; ``at`` are reference points [1, Q, 2]."""
+        query = self.norms[0](self.attentions[0](query, query, pos, pos))
+        query = self.norms[1](self.attentions[1](query, pos, bev, at))
+        out: Tensor = self.norms[2](self.ffns[0](query))
+        return out
+
+
+class Decoder(nn.Module):
+    """Three `DecoderLayer`s with a regression branch after each."""
+
+    def __init__(self, sampling: Sampling, *, height: bool) -> None:
+        super().__init__()
+        self.height = height
+        self.layers = nn.ModuleList(DecoderLayer(sampling) for _ in range(LAYERS))
+
+    def forward(
+        self,
+        query: Tensor,
+        pos: Tensor,
+        bev: Tensor,
+        reference: Tensor,
+        branches: nn.ModuleList,
+    ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+        """Decode.
+
+        Args:
+            query: [1, Q, 256].
+            pos: [1, Q, 256].
+            bev: [1, cells, 256].
+            reference: [1, Q, 2 or 3], 0..1; the third is the height.
+            branches: One regression branch a layer; columns 0 and 1, and 4 where there
+                is a height, move the reference.
+
+        Returns:
+            For every layer: queries [1, Q, 256], raw regressions [1, Q, code] and
+            refined references [1, Q, 2 or 3].
+        """
+        queries, regressions, references = [], [], []
+        for layer, branch in zip(self.layers, branches, strict=True):
+            query = layer(query, pos, bev, reference[..., :2])
+            raw = branch(query)
+            moves = raw[..., :2]
+            if self.height:
+                moves = torch.cat([moves, raw[..., 4:5]], -1)
+            reference = (moves + inverse_sigmoid(reference)).sigmoid()
+            queries.append(query)
+            regressions.append(raw)
+            references.append(reference)
+        return queries, regressions, references
+
+
+class InteractionLayer(nn.Module):
+    """Cross-attention and feed-forward."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.attentions = nn.ModuleList([MultiheadAttention()])
+        self.ffns = nn.ModuleList([FeedForward()])
+        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
+
+    def forward(
+        self,
+        query: Tensor,
+        key: Tensor,
+        query_pos: Tensor,
+        key_pos: Tensor,
+        ignore: Tensor | None,
+    ) -> Tensor:
+        """[B, Q, 256] and keys [B or 1, K, 256] to [B, Q, 256]."""
+        attended = self.attentions[0](query, key, query_pos, key_pos, ignore)
+        query = self.norms[0](attended)
+        out: Tensor = self.norms[1](self.ffns[0](query))
+        return out
+
+
+class Interaction(nn.Module):
+    """How one kind of query reads another: a single `InteractionLayer`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([InteractionLayer()])
+
+    def forward(
+        self,
+        query: Tensor,
+        key: Tensor,
+        query_pos: Tensor,
+        key_pos: Tensor,
+        ignore: Tensor | None = None,
+    ) -> Tensor:
+        """As the layer."""
+        out: Tensor = self.layers[0](query, key, query_pos, key_pos, ignore)
+        return out

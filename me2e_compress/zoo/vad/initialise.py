@@ -1,0 +1,136 @@
+"""Weights from a seed, shaped so that the untrained network sees.
+
+A network drawn at random forgets its input on the way: activations of different images
+share a large common part, averages over hundreds of keys cancel, and the plan hardly
+moves when a camera changes. So statistics of the backbone and of the neck are taken
+from rendered frames, residual branches that bring news are louder than what they are
+added to, and attention is sharper than a fresh softmax. No two tensors are equal and
+none is constant, as in a trained model: an exporter merges equal ones.
+"""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.frames import frames
+from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.vad.config import ATTENTION_HEADS
+from me2e_compress.zoo.vad.stack import VadTiny
+
+GAINS = (
+    ("attn.in_proj_weight", 1.6),
+    ("attentions.0.attn.out_proj", 3.0),
+    ("attentions.0.output_proj", 1.0),
+    ("deformable_attention.value_proj", 2.0),
+    ("attentions.1.value_proj", 2.0),
+    ("attentions.1.output_proj", 2.5),
+    ("sampling_offsets", 0.6),
+    ("attention_weights", 1.2),
+    ("reference_points", 1.2),
+    ("pos_mlp", 2.0),
+    ("ffns.0.layers.0.0", 1.4),
+    ("ffns.0.layers.1", 0.7),
+    ("ego_fut_decoder.4", 1.0),
+)
+"""Standard deviation of an output for a unit input, by a part of the name: the first
+that matches; 1.4 (ReLU, He et al. 2015) where none does. Found by trial: the tests say
+what they must achieve."""
+
+DEFAULT_GAIN = math.sqrt(2)
+EMBEDDING_STD = 0.6
+BIAS_STD = 0.1
+RESIDUAL_SCALE = 0.35
+"""Of the last normalisation of a residual block, so that 16 blocks do not explode."""
+
+CALIBRATION_FRAMES = 2
+CALIBRATION_STRIDE = 2
+"""Every second pixel is enough for the statistics of a channel."""
+
+
+def initialise(model: VadTiny, seed: int) -> None:
+    """Draw all parameters, then the statistics of the image branch, in place."""
+    generator = torch.Generator().manual_seed(seed)
+    modules = dict(model.named_modules())
+    for name, parameter in model.named_parameters():
+        owner = modules[name.rpartition(".")[0]]
+        parameter.copy_(_draw(name, parameter, owner, generator))
+    with _one_thread():
+        _calibrate(model, seed)
+
+
+def _draw(
+    name: str, parameter: Tensor, owner: nn.Module, generator: torch.Generator
+) -> Tensor:
+    noise = torch.empty_like(parameter).normal_(generator=generator)
+    if isinstance(owner, nn.BatchNorm2d | nn.LayerNorm) or "code_weights" in name:
+        noise = noise.clamp(-3, 3) * BIAS_STD
+        if name.endswith("bias"):
+            return noise
+        return (1 + noise) * (RESIDUAL_SCALE if name.endswith("bn3.weight") else 1.0)
+    if isinstance(owner, nn.Embedding) or "_embeds" in name:
+        return noise * EMBEDDING_STD
+    if name.endswith("sampling_offsets.bias"):
+        return _spread(parameter) + noise * BIAS_STD
+    if parameter.dim() == 1:
+        return noise * BIAS_STD
+    gain = next((gain for part, gain in GAINS if part in name), DEFAULT_GAIN)
+    return noise * (gain / math.sqrt(parameter[0].numel()))
+
+
+def _spread(bias: Tensor) -> Tensor:
+    """Deformable DETR's offsets: a direction a head, a step further a point."""
+    angles = torch.arange(ATTENTION_HEADS) * (2 * math.pi / ATTENTION_HEADS)
+    directions = torch.stack([angles.cos(), angles.sin()], -1)
+    directions = directions / directions.abs().amax(-1, keepdim=True)
+    points = bias.numel() // (ATTENTION_HEADS * 2)
+    steps = torch.arange(points) % 8 + 1
+    return (directions[:, None] * steps[:, None]).flatten()
+
+
+def _calibrate(model: VadTiny, seed: int) -> None:
+    """Take normalisation statistics from rendered frames."""
+    step = CALIBRATION_STRIDE
+    images = torch.cat(
+        [
+            torch.from_numpy(frame["img"])[0, :, :, ::step, ::step]
+            for frame in frames(VAD_TINY, CALIBRATION_FRAMES, seed, scene_length=1)
+        ]
+    )
+    norms = [m for m in model.img_backbone.modules() if isinstance(m, nn.BatchNorm2d)]
+    for norm in norms:
+        norm.train()
+        norm.momentum = 1.0
+    features = model.img_backbone(images)
+    for norm in norms:
+        norm.eval()
+        norm.momentum = 0.1
+    for conv in _convolutions(model.img_neck):
+        out = conv(features)
+        mean = out.mean((0, 2, 3))
+        scale = out.std((0, 2, 3)).reciprocal()
+        bias = conv.bias
+        if bias is None:
+            raise TypeError("a convolution of the neck has no bias")
+        own = bias.clone()
+        conv.weight.mul_(scale[:, None, None, None])
+        bias.copy_((own - mean) * scale + own)
+        features = conv(features)
+
+
+def _convolutions(module: nn.Module) -> Iterator[nn.Conv2d]:
+    return (m for m in module.modules() if isinstance(m, nn.Conv2d))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """The order of a sum, and so its last bits, must not hang on the machine's load."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,151 @@
+"""The first floor of the head: where the agents will go."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.regions import region
+from me2e_compress.zoo.vad.config import (
+    AGENT_MODES,
+    AGENTS,
+    EMBED,
+    LAYERS,
+    MAP_REACH,
+    MAP_SCORE,
+    STEPS,
+    Heads,
+    Sampling,
+)
+from me2e_compress.zoo.vad.decoder import Interaction
+from me2e_compress.zoo.vad.perception import (
+    Agents,
+    Map,
+    PerceptionHead,
+    classifier,
+    regressor,
+)
+
+
+class Motion(NamedTuple):
+    """Forecasts of every agent."""
+
+    steps: Tensor  # [3, 1, 300, 6, 12], metres a step
+    scores: Tensor  # [3, 1, 300, 6], logits
+    queries: Tensor  # [1, 300, 6, 512]
+
+
+class PointMlp(nn.Module):
+    """Linear, normalisation, ReLU."""
+
+    def __init__(self, width: int, out: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(width, out)
+        self.norm = nn.LayerNorm(out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[..., width] -> [..., out]."""
+        return torch.relu(self.norm(self.linear(x)))
+
+
+class LaneNet(nn.Module):
+    """The points of a vector to one query (VectorNet's sub-graph)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer_seq = nn.Sequential()
+        for layer in range(LAYERS):
+            self.layer_seq.add_module(f"lmlp_{layer}", PointMlp(EMBED, EMBED // 2))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """[1, V, P, 256] -> [1, V, 256]."""
+        for layer in self.layer_seq:
+            own = layer(points)
+            shared = own.amax(2, keepdim=True).expand_as(own)
+            points = torch.cat([own, shared], -1)
+        return points.amax(2)
+
+
+def nearest_points(points: Tensor) -> Tensor:
+    """The point of each vector nearest to the origin: [1, V, P, 2] -> [1, V, 2].
+
+    As in the original, the points are normalised, so their origin is a corner of
+    the grid and not the ego vehicle.
+    """
+    index = points.square().sum(-1).argmin(-1, keepdim=True)
+    return points.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
+
+
+class MotionHead(PerceptionHead):
+    """Agents of six modes read each other and the map."""
+
+    def __init__(self, heads: Heads, sampling: Sampling) -> None:
+        super().__init__(heads, sampling)
+        self.motion_decoder = Interaction()
+        self.motion_mode_query = nn.Embedding(AGENT_MODES, EMBED)
+        self.pos_mlp_sa = nn.Linear(2, EMBED)
+        self.lane_encoder = LaneNet()
+        self.motion_map_decoder = Interaction()
+        self.pos_mlp = nn.Linear(2, EMBED)
+        self.traj_branches = nn.ModuleList([regressor(STEPS * 2, 2 * EMBED)])
+        self.traj_cls_branches = nn.ModuleList([classifier(1, 2 * EMBED)])
+
+    def lanes(self, vectors: Map) -> tuple[Tensor, Tensor]:
+        """One query [1, 100, 256] and one position [1, 100, 2] a map vector."""
+        with region("map"):
+            return self.lane_encoder(vectors.queries), nearest_points(vectors.points[-1])
+
+    def forecast(
+        self, agents: Agents, vectors: Map, lanes: tuple[Tensor, Tensor]
+    ) -> Motion:
+        """Predict the motion of all agents in all modes."""
+        with region("motion"):
+            query = agents.queries.unsqueeze(2) + self.motion_mode_query.weight
+            query = query.flatten(1, 2)
+            centres = agents.centres.unsqueeze(2).expand(-1, -1, AGENT_MODES, -1)
+            centres = centres.flatten(1, 2)
+            pos = self.pos_mlp_sa(centres)
+            social = self.motion_decoder(query, query, pos, pos)
+            aware = self._read_map(social, centres, vectors, lanes)
+            both = torch.cat([social, aware], -1)
+            both = both.view(1, AGENTS, AGENT_MODES, 2 * EMBED)
+            steps = self.traj_branches[0](both)
+            scores = self.traj_cls_branches[0](both).squeeze(-1)
+            return Motion(
+                steps.unsqueeze(0).repeat(LAYERS, 1, 1, 1, 1),
+                scores.unsqueeze(0).repeat(LAYERS, 1, 1, 1),
+                both,
+            )
+
+    def _read_map(
+        self,
+        query: Tensor,
+        centres: Tensor,
+        vectors: Map,
+        lanes: tuple[Tensor, Tensor],
+    ) -> Tensor:
+        """Let each agent-mode read the likely map vectors near it.
+
+        The original gathers the vectors that pass; here all of them stay, and those
+        that do not pass are masked, which gives the same attention at fixed shapes.
+        One empty vector is always there to be read.
+        """
+        lane_query, lane_at = lanes
+        unlikely = vectors.scores[-1].sigmoid().amax(-1) <= MAP_SCORE
+        offset = lane_at.unsqueeze(1) - centres.unsqueeze(2)
+        far = offset.square().sum(-1).sqrt() > MAP_REACH
+        ignore = torch.logical_or(far, unlikely.unsqueeze(1))[0]
+        ignore = _append_zero(ignore)
+        offset = _append_zero(offset[0])
+        key = _append_zero(lane_query)
+        query = query.transpose(0, 1)
+        key_pos = self.pos_mlp(offset)
+        query_pos = self.pos_mlp(torch.zeros_like(query[..., :2]))
+        aware = self.motion_map_decoder(query, key, query_pos, key_pos, ignore)
+        out: Tensor = aware.transpose(0, 1)
+        return out
+
+
+def _append_zero(x: Tensor) -> Tensor:
+    """Zeros (or false) for one more entry of axis 1."""
+    return torch.cat([x, torch.zeros_like(x[:, :1])], 1)

@@ -1,0 +1,156 @@
+"""The ground floor of the head: queries, boxes and map vectors."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.regions import region
+from me2e_compress.zoo.vad.bev_encoder import GridPosition
+from me2e_compress.zoo.vad.config import (
+    AGENTS,
+    BEV_HW,
+    BOX_CODE,
+    EMBED,
+    LAYERS,
+    PC_RANGE,
+    VECTOR_POINTS,
+    VECTORS,
+    Heads,
+    Sampling,
+)
+from me2e_compress.zoo.vad.transformer import PerceptionTransformer
+
+
+class Agents(NamedTuple):
+    """What detection says, the last layer's queries and positions apart."""
+
+    scores: Tensor  # [3, 1, 300, classes], logits
+    boxes: Tensor  # [3, 1, 300, 10], metres
+    queries: Tensor  # [1, 300, 256]
+    centres: Tensor  # [1, 300, 2], 0..1
+
+
+class Map(NamedTuple):
+    """What the map decoder says, the last layer's queries and points apart."""
+
+    scores: Tensor  # [3, 1, 100, classes], logits
+    boxes: Tensor  # [3, 1, 100, 4], cx cy w h, 0..1
+    points: Tensor  # [3, 1, 100, 20, 2], 0..1
+    queries: Tensor  # [1, 100, 20, 256]
+
+
+def classifier(classes: int, width: int = EMBED) -> nn.Sequential:
+    """Two normalised layers and the logits."""
+    return nn.Sequential(
+        nn.Linear(width, width),
+        nn.LayerNorm(width),
+        nn.ReLU(),
+        nn.Linear(width, width),
+        nn.LayerNorm(width),
+        nn.ReLU(),
+        nn.Linear(width, classes),
+    )
+
+
+def regressor(outputs: int, width: int = EMBED) -> nn.Sequential:
+    """Two layers and the values."""
+    return nn.Sequential(
+        nn.Linear(width, width),
+        nn.ReLU(),
+        nn.Linear(width, width),
+        nn.ReLU(),
+        nn.Linear(width, outputs),
+    )
+
+
+class PerceptionHead(nn.Module):
+    """Queries, the perception transformer, and what is read from it."""
+
+    def __init__(self, heads: Heads, sampling: Sampling) -> None:
+        super().__init__()
+        self.code_weights = nn.Parameter(torch.empty(BOX_CODE))
+        self.map_code_weights = nn.Parameter(torch.empty(4))
+        self.positional_encoding = GridPosition()
+        self.transformer = PerceptionTransformer(sampling)
+        self.bev_embedding = nn.Embedding(BEV_HW[0] * BEV_HW[1], EMBED)
+        self.query_embedding = nn.Embedding(AGENTS, 2 * EMBED)
+        self.map_instance_embedding = nn.Embedding(VECTORS, 2 * EMBED)
+        self.map_pts_embedding = nn.Embedding(VECTOR_POINTS, 2 * EMBED)
+        self.cls_branches = _repeat(classifier, heads.det_classes)
+        self.reg_branches = _repeat(regressor, BOX_CODE)
+        self.map_cls_branches = _repeat(classifier, heads.map_classes)
+        self.map_reg_branches = _repeat(regressor, 2)
+
+    def perceive(
+        self, features: Tensor, lidar2img: Tensor, can_bus: Tensor, prev_bev: Tensor
+    ) -> tuple[Tensor, Agents, Map]:
+        """Camera features [cameras, 256, h, w] to BEV [1, cells, 256], boxes, map."""
+        with region("bev_encoder"):
+            cells = self.bev_embedding.weight.unsqueeze(0), self.positional_encoding()
+        with region("map"):
+            points = (
+                self.map_instance_embedding.weight.unsqueeze(1)
+                + self.map_pts_embedding.weight.unsqueeze(0)
+            ).flatten(0, 1)
+        bev, found, mapped = self.transformer(
+            features,
+            cells,
+            self.query_embedding.weight,
+            points,
+            (self.reg_branches, self.map_reg_branches),
+            lidar2img,
+            can_bus,
+            prev_bev,
+        )
+        with region("det"):
+            agents = self._agents(*found)
+        with region("map"):
+            vectors = self._map(*mapped)
+        return bev, agents, vectors
+
+    def _agents(
+        self, queries: list[Tensor], raw: list[Tensor], at: list[Tensor]
+    ) -> Agents:
+        scores = [
+            branch(query)
+            for branch, query in zip(self.cls_branches, queries, strict=True)
+        ]
+        boxes = [_box(r, a) for r, a in zip(raw, at, strict=True)]
+        return Agents(
+            torch.stack(scores), torch.stack(boxes), queries[-1], at[-1][..., :2]
+        )
+
+    def _map(
+        self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]
+    ) -> Map:
+        grouped = [q.view(1, VECTORS, VECTOR_POINTS, EMBED) for q in queries]
+        scores = [
+            branch(query.mean(2))
+            for branch, query in zip(self.map_cls_branches, grouped, strict=True)
+        ]
+        points = [a.view(1, VECTORS, VECTOR_POINTS, 2) for a in at]
+        boxes = [_enclosing(p) for p in points]
+        return Map(
+            torch.stack(scores), torch.stack(boxes), torch.stack(points), grouped[-1]
+        )
+
+
+def _repeat(make: Callable[[int], nn.Module], outputs: int) -> nn.ModuleList:
+    return nn.ModuleList(make(outputs) for _ in range(LAYERS))
+
+
+def _box(raw: Tensor, at: Tensor) -> Tensor:
+    """Raw regression and refined centre (0..1) to a box in metres."""
+    x0, y0, z0, x1, y1, z1 = PC_RANGE
+    x = at[..., 0:1] * (x1 - x0) + x0
+    y = at[..., 1:2] * (y1 - y0) + y0
+    z = at[..., 2:3] * (z1 - z0) + z0
+    return torch.cat([x, y, raw[..., 2:4], z, raw[..., 5:]], -1)
+
+
+def _enclosing(points: Tensor) -> Tensor:
+    """Box (cx, cy, w, h) around the points of every vector."""
+    low, high = points.amin(2), points.amax(2)
+    return torch.cat([(low + high) / 2, high - low], -1)

@@ -1,0 +1,59 @@
+"""Reading a feature map at fractional positions."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from me2e_compress.zoo.vad.config import Sampling
+
+
+def sample(
+    image: Tensor,
+    grid: Tensor,
+    sampling: Sampling,
+    mode: Literal["bilinear", "nearest"] = "bilinear",
+) -> Tensor:
+    """Sample ``image`` at ``grid``; outside of the image is zero.
+
+    Args:
+        image: [N, C, H, W] float32.
+        grid: [N, Q, P, 2] float32, x then y, -1 and 1 are the outer edges.
+        sampling: ``operator`` uses grid_sample (ONNX opset 16 and later), ``gather``
+            says the same in operators of opset 13.
+        mode: How values between pixels are made.
+
+    Returns:
+        [N, C, Q, P] float32.
+    """
+    if sampling == "operator":
+        return functional.grid_sample(
+            image, grid, mode=mode, padding_mode="zeros", align_corners=False
+        )
+    batch, channels, height, width = image.shape
+    rows = image.flatten(2).transpose(1, 2).reshape(-1, channels)
+    start = (torch.arange(batch) * (height * width)).view(-1, 1, 1)
+    x = ((grid[..., 0] + 1) * width - 1) / 2
+    y = ((grid[..., 1] + 1) * height - 1) / 2
+    if mode == "nearest":
+        corners = [(torch.round(x), torch.round(y), torch.ones_like(x))]
+    else:
+        left, top = torch.floor(x), torch.floor(y)
+        right_part, bottom_part = x - left, y - top
+        corners = [
+            (left, top, (1 - right_part) * (1 - bottom_part)),
+            (left + 1, top, right_part * (1 - bottom_part)),
+            (left, top + 1, (1 - right_part) * bottom_part),
+            (left + 1, top + 1, right_part * bottom_part),
+        ]
+    total = None
+    for column, row, weight in corners:
+        inner_column = column.clamp(0, width - 1)
+        inner_row = row.clamp(0, height - 1)
+        inside = (inner_column == column) & (inner_row == row)
+        index = start + (inner_row * width + inner_column).to(torch.int64)
+        part = rows[index] * (weight * inside.to(weight.dtype)).unsqueeze(-1)
+        total = part if total is None else total + part
+    assert total is not None
+    return total.permute(0, 3, 1, 2)

@@ -1,0 +1,101 @@
+"""The perception transformer: BEV encoder, detection decoder, map decoder."""
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.regions import region
+from me2e_compress.zoo.vad.bev_encoder import BevEncoder
+from me2e_compress.zoo.vad.config import CAMERAS, EMBED, FEATURE_LEVELS, Sampling
+from me2e_compress.zoo.vad.decoder import Decoder
+from me2e_compress.zoo.vad.geometry import cell_positions, ego_shift, turn
+
+CAN_BUS = 18
+
+
+class CanBusEncoder(nn.Sequential):
+    """Ego motion to a vector that is added to every BEV query."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            nn.Linear(CAN_BUS, EMBED // 2),
+            nn.ReLU(),
+            nn.Linear(EMBED // 2, EMBED),
+            nn.ReLU(),
+        )
+        self.add_module("norm", nn.LayerNorm(EMBED))
+
+
+class PerceptionTransformer(nn.Module):
+    """Everything between camera features and decoded queries."""
+
+    def __init__(self, sampling: Sampling) -> None:
+        super().__init__()
+        self.sampling: Sampling = sampling
+        self.level_embeds = nn.Parameter(torch.empty(FEATURE_LEVELS, EMBED))
+        self.cams_embeds = nn.Parameter(torch.empty(CAMERAS, EMBED))
+        self.can_bus_mlp = CanBusEncoder()
+        self.encoder = BevEncoder(sampling)
+        self.reference_points = nn.Linear(EMBED, 3)
+        self.decoder = Decoder(sampling, height=True)
+        self.map_reference_points = nn.Linear(EMBED, 2)
+        self.map_decoder = Decoder(sampling, height=False)
+        self.register_buffer("cells", cell_positions(), False)
+
+    def bev(
+        self,
+        features: Tensor,
+        query: Tensor,
+        pos: Tensor,
+        lidar2img: Tensor,
+        can_bus: Tensor,
+        prev_bev: Tensor,
+    ) -> Tensor:
+        """Encode the cameras: [cameras, 256, h, w] to [1, cells, 256]."""
+        tokens = features.flatten(2).transpose(1, 2)
+        tokens = tokens + self.cams_embeds[:, None] + self.level_embeds[0]
+        first = torch.logical_not(torch.any(prev_bev != 0))
+        previous = turn(prev_bev, can_bus, self.cells, self.sampling)
+        query = query + self.can_bus_mlp(can_bus.unsqueeze(0))
+        shift = ego_shift(can_bus)
+        bev: Tensor = self.encoder(
+            query, pos, previous, first, shift, tokens, lidar2img
+        )
+        return bev
+
+    def forward(
+        self,
+        features: Tensor,
+        cells: tuple[Tensor, Tensor],
+        agents: Tensor,
+        points: Tensor,
+        branches: tuple[nn.ModuleList, nn.ModuleList],
+        lidar2img: Tensor,
+        can_bus: Tensor,
+        prev_bev: Tensor,
+    ) -> tuple[Tensor, tuple[list[Tensor], ...], tuple[list[Tensor], ...]]:
+        """Encode and decode.
+
+        Args:
+            features: [cameras, 256, h, w].
+            cells: BEV queries and their positions, [1, cells, 256] each.
+            agents: [300, 512], position then content.
+            points: [2000, 512], position then content.
+            branches: Regression branches of detection and map.
+            lidar2img: [1, cameras, 4, 4].
+            can_bus: [18].
+            prev_bev: [cells, 1, 256].
+
+        Returns:
+            BEV [1, cells, 256] and what `Decoder` says of agents and of map points.
+        """
+        with region("bev_encoder"):
+            bev = self.bev(features, *cells, lidar2img, can_bus, prev_bev)
+        with region("det"):
+            pos, query = agents.unsqueeze(0).split(EMBED, dim=2)
+            at = self.reference_points(pos).sigmoid()
+            found = self.decoder(query, pos, bev, at, branches[0])
+        with region("map"):
+            pos, query = points.unsqueeze(0).split(EMBED, dim=2)
+            at = self.map_reference_points(pos).sigmoid()
+            mapped = self.map_decoder(query, pos, bev, at, branches[1])
+        return bev, found, mapped

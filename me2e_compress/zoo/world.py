@@ -1,0 +1,167 @@
+"""A small world: a bent road with markings, vehicles that move, things that stand."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+FRAME_S = 0.5
+"""Between frames: the rate of nuScenes' key frames, and of the plan's waypoints."""
+
+LANE_M = 3.5
+LANES = 3
+LINE_M = 0.15
+DASH_M, DASH_PERIOD_M = 3.0, 9.0
+TILE = 256
+TILE_CELL_M = 0.25
+
+GRASS = np.array([92.0, 118.0, 74.0], np.float32)
+PAVEMENT = np.array([150.0, 146.0, 140.0], np.float32)
+ASPHALT = np.array([84.0, 85.0, 90.0], np.float32)
+PAINT = np.array([228.0, 228.0, 222.0], np.float32)
+GLASS = np.array([36.0, 44.0, 54.0], np.float32)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Metres and radians in the world; yaw 0 looks along x, left is positive."""
+
+    x: float
+    y: float
+    yaw: float
+
+    def to_world(self, right: Array, ahead: Array) -> tuple[Array, Array]:
+        """Lidar frame (x right, y forward) to world."""
+        cos, sin = np.float32(math.cos(self.yaw)), np.float32(math.sin(self.yaw))
+        x = np.float32(self.x) + cos * ahead + sin * right
+        y = np.float32(self.y) + sin * ahead - cos * right
+        return x, y
+
+    def to_lidar(self, x: float | Array, y: float | Array) -> tuple[Array, Array]:
+        """World to lidar frame (x right, y forward)."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        dx, dy = np.asarray(x) - self.x, np.asarray(y) - self.y
+        right, ahead = sin * dx - cos * dy, cos * dx + sin * dy
+        return right.astype(np.float32), ahead.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cuboid on the ground; metres, radians, metres a second, RGB.
+
+    Attributes:
+        window_m: Vertical period of a dark band; None paints none.
+    """
+
+    x: float
+    y: float
+    yaw: float
+    length: float
+    width: float
+    height: float
+    colour: tuple[float, float, float]
+    speed_mps: float = 0.0
+    window_m: float | None = None
+
+    def moved(self, seconds: float) -> "Box":
+        """The same box later, straight on."""
+        way = self.speed_mps * seconds
+        return replace(
+            self,
+            x=self.x + way * math.cos(self.yaw),
+            y=self.y + way * math.sin(self.yaw),
+        )
+
+    def corners(self) -> tuple[Array, Array, Array]:
+        """World x, y and height above the ground of the 8 corners."""
+        signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (0, 1)])
+        a, b = signs[:, 0] * self.length / 2, signs[:, 1] * self.width / 2
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        x, y = self.x + cos * a - sin * b, self.y + sin * a + cos * b
+        return (
+            x.astype(np.float32),
+            y.astype(np.float32),
+            (signs[:, 2] * self.height).astype(np.float32),
+        )
+
+    def paint(
+        self, at: Array, half: Array, axis: NDArray[np.intp], sun: Array
+    ) -> Array:
+        """Colour of points on the surface.
+
+        Args:
+            at: [N, 3] in the frame of the box (length, width, height).
+            half: [3] half sizes.
+            axis: [N] which face pair was hit.
+            sun: [3] direction to the sun in the same frame.
+
+        Returns:
+            [N, 3] RGB.
+        """
+        rows = np.arange(len(at))
+        side = np.sign(at[rows, axis])
+        shade = 0.62 + 0.38 * np.clip(side * sun[axis], 0, 1)
+        colour = np.array(self.colour, np.float32) * shade[:, None]
+        if self.window_m is not None:
+            level = (at[:, 2] + half[2]) / self.window_m % 1.0
+            along = at[rows, np.where(axis == 0, 1, 0)] / self.window_m % 1.0
+            glass = (axis < 2) & (level > 0.5) & (level < 0.85) & (along > 0.15)
+            colour[glass] = GLASS
+        return colour.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class World:
+    """The ground, and what was on it when the scene began.
+
+    Attributes:
+        bend: Curvature of the road at the start, 1 / m; its middle is
+            y = bend * x ** 2 / 2.
+        crossing_m: Where a zebra crossing begins.
+        tile: [256, 256] brightness of the ground, repeated.
+        boxes: At time 0.
+        speed_mps: Of the ego vehicle at time 0.
+        accel_mps2: Of the ego vehicle.
+        lane_m: Offset of the ego vehicle from the middle of the road, left positive.
+    """
+
+    bend: float
+    crossing_m: float
+    tile: Array
+    boxes: tuple[Box, ...]
+    speed_mps: float
+    accel_mps2: float
+    lane_m: float
+
+    def ego(self, seconds: float) -> Pose:
+        """Where the ego vehicle is: it keeps its lane."""
+        way = self.speed_mps * seconds + self.accel_mps2 * seconds**2 / 2
+        return Pose(
+            way,
+            self.bend * way**2 / 2 + self.lane_m,
+            math.atan(self.bend * way),
+        )
+
+    def boxes_at(self, seconds: float) -> tuple[Box, ...]:
+        """Everything that stands or moves, at a time."""
+        return tuple(box.moved(seconds) for box in self.boxes)
+
+    def ground(self, x: Array, y: Array) -> Array:
+        """Colour [..., 3] of the ground at world positions in metres."""
+        aside = y - self.bend * x * x / 2
+        away = np.abs(aside)
+        edge = LANES * LANE_M / 2
+        colour = np.where((away < edge + 2.5)[..., None], PAVEMENT, GRASS)
+        road = away < edge
+        colour[road] = ASPHALT
+        solid = np.abs(away - edge + 0.3) < LINE_M
+        divider = np.abs(away - LANE_M / 2) < LINE_M / 2
+        dashed = divider & (x % DASH_PERIOD_M < DASH_M)
+        zebra = (np.abs(x - self.crossing_m) < 1.5) & (aside % 1.0 < 0.5) & road
+        colour[solid | dashed | zebra] = PAINT
+        column = (x / TILE_CELL_M).astype(np.int32) % TILE
+        row = (y / TILE_CELL_M).astype(np.int32) % TILE
+        return colour + self.tile[row, column][..., None]
