@@ -1,0 +1,76 @@
+"""A user's graphsurgeon function as a pass."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable
+
+import onnx_graphsurgeon as gs
+import onnx_ir as ir
+
+from me2e_compress.errors import PassError
+from me2e_compress.graph import digest
+from me2e_compress.graph.surgeon import from_graphsurgeon, to_graphsurgeon
+from me2e_compress.passes.base import Context, PassResult
+
+NodeKey = tuple[str, str, tuple[str | None, ...], tuple[str | None, ...]]
+
+
+@dataclasses.dataclass(frozen=True)
+class SurgeonFunction:
+    """Run a function over the graph as onnx-graphsurgeon sees it.
+
+    Modules, origins and other metadata, which graphsurgeon does not hold, come back
+    afterwards; new nodes belong to the module of their neighbours. In the function,
+    call ``fold_constants`` and ``cleanup`` with ``recurse_functions=False``.
+
+    Given:
+        a = Relu(x)  ;  y = Relu(a)     and a function that drops the second Relu
+    Result:
+        y = Relu(x)                     with the past of the first
+
+    Attributes:
+        function: takes the graph, changes it or returns another; None means the one
+            that it was given.
+        name: what reports call the pass.
+        exact: whether it promises the same outputs.
+        changes_interface: whether it may change inputs and outputs.
+    """
+
+    function: Callable[[gs.Graph], gs.Graph | None]
+    name: str
+    exact: bool = False
+    changes_interface: bool = False
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Run the function on a copy.
+
+        Raises:
+            PassError: the function returned something that is not a graph.
+            GraphError: what it made of the graph is not a model.
+        """
+        handed = to_graphsurgeon(model)
+        given = self.function(handed)
+        if given is not None and not isinstance(given, gs.Graph):
+            raise PassError(
+                f"{self.name} returned a {type(given).__name__}, not a graph or None"
+            )
+        result = from_graphsurgeon(
+            handed if given is None else given, model, by=self.name
+        )
+        if digest(result) == digest(model):
+            return PassResult(model, 0)
+        before, after = _nodes(model), _nodes(result)
+        edited = (before - after).total() + (after - before).total()
+        return PassResult(result, max(1, edited))
+
+
+def _nodes(model: ir.Model) -> "Counter[NodeKey]":
+    return Counter(
+        (
+            node.domain,
+            node.op_type,
+            tuple(None if value is None else value.name for value in node.inputs),
+            tuple(value.name for value in node.outputs),
+        )
+        for node in model.graph.all_nodes()
+    )

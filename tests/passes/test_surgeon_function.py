@@ -1,0 +1,88 @@
+import dataclasses
+
+import numpy as np
+import onnx_graphsurgeon as gs
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.errors import PassError
+from me2e_compress.graph import provenance
+from me2e_compress.graph.provenance import Provenance
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.passes.surgeon_function import SurgeonFunction
+
+CONTEXT = Context(
+    ModuleMap.parse('[modules.neck]\nrole = "feature"\npatterns = ["neck"]', "one")
+)
+
+
+@pytest.fixture
+def model() -> ir.Model:
+    made = ir.from_onnx_text(
+        '<ir_version: 8, opset_import: ["": 17]>'
+        "g (float[2] x) => (float[2] y) { a = Relu(x) b = Relu(a) y = Neg(b) }"
+    )
+    for node, module in zip(made.graph, ("neck", "det", "planner"), strict=True):
+        node.name = f"n_{node.outputs[0].name}"
+        provenance.stamp(node, Provenance(module, (node.name,)))
+    return made
+
+
+def drop_second_relu(surgeon: gs.Graph) -> None:
+    first, second, last = surgeon.nodes
+    last.inputs = first.outputs
+    second.outputs.clear()
+    surgeon.cleanup(recurse_functions=False)
+
+
+def test_it_is_a_frozen_dataclass_that_does_what_the_function_does(
+    model: ir.Model,
+) -> None:
+    current = SurgeonFunction(drop_second_relu, "drop-second-relu")
+    result = current.run(model, CONTEXT)
+    assert [node.name for node in result.model.graph] == ["n_a", "n_y"]
+    assert [provenance.module_of(n) for n in result.model.graph] == ["neck", "planner"]
+    assert result.changes == 3
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        current.name = "other"  # type: ignore[misc]
+
+
+def test_the_model_that_it_was_given_stays(model: ir.Model) -> None:
+    before = graph.digest(model)
+    SurgeonFunction(drop_second_relu, "drop-second-relu").run(model, CONTEXT)
+    assert graph.digest(model) == before
+
+
+def test_a_returned_graph_counts_and_new_nodes_join_their_neighbours(
+    model: ir.Model,
+) -> None:
+    def insert(surgeon: gs.Graph) -> gs.Graph:
+        twin = surgeon.copy()
+        last = twin.nodes[-1]
+        added = gs.Variable("added", np.float32, [2])
+        new = gs.Node("Abs", "mine", inputs=[last.inputs[0]], outputs=[added])
+        twin.nodes = [*twin.nodes, new]
+        last.inputs[0] = added
+        return twin
+
+    result = SurgeonFunction(insert, "insert-abs").run(model, CONTEXT)
+    by_name = {node.name: provenance.read(node) for node in result.model.graph}
+    assert by_name["mine"] == Provenance("det", ("n_b",), ("insert-abs",))
+    assert by_name["n_y"] == Provenance("planner", ("n_y",))
+
+
+def test_a_function_that_does_nothing_changes_nothing(model: ir.Model) -> None:
+    result = SurgeonFunction(lambda surgeon: None, "idle").run(model, CONTEXT)
+    assert result.changes == 0
+    assert result.model is model
+
+
+def test_a_function_that_returns_something_else_is_refused(model: ir.Model) -> None:
+    def count(surgeon: gs.Graph) -> int:
+        return len(surgeon.nodes)
+
+    current = SurgeonFunction(count, "count")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(PassError, match="count returned a int, not a graph or None"):
+        current.run(model, CONTEXT)
