@@ -1,0 +1,143 @@
+"""Take whole modules out of a graph."""
+
+import dataclasses
+from typing import ClassVar, Literal
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import provenance
+from me2e_compress.modules import Substitute
+from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.stand_ins import (
+    depends,
+    module_of,
+    replace_readers,
+    result_of,
+    shaped_like,
+    zeros_like,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class AblateModules:
+    """Remove modules; what read them reads a substitute, or zeros.
+
+    Given:   features -> occupancy -> plan
+    Result:  features,   zeros     -> plan
+
+    With ``fill="substitute"`` the substitutes of the module map go first: the result of
+    one scope takes the place of another's (without the map, the ego query keeps what it
+    knew of the agents). Whatever else leaves a dropped module is then zeros of its
+    shape. Everything that became dead is swept, in other modules too.
+
+    Attributes:
+        drop: the modules to remove.
+        fill: ``substitute`` re-wires as the module map says, ``zeros`` never does.
+        drop_outputs: True removes the graph outputs that only a dropped module makes;
+            False refuses to drop such a module.
+    """
+
+    name: ClassVar[str] = "ablate-modules"
+    exact: ClassVar[bool] = False
+    drop: tuple[str, ...]
+    fill: Literal["zeros", "substitute"] = "substitute"
+    drop_outputs: bool = False
+
+    @property
+    def changes_interface(self) -> bool:
+        """Whether outputs may go."""
+        return self.drop_outputs
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Re-wire, cut, sweep.
+
+        Raises:
+            ModuleMapError: the map has no such module.
+            PreconditionError: no node belongs to it, it makes a graph output (and
+                ``drop_outputs`` is False), it makes all of them, a value that leaves it
+                has no static shape, or a substitute does not fit.
+        """
+        known = [context.modules.module(name) for name in self.drop]
+        _require_nodes(model, self.drop)
+        graph.infer_shapes(model)
+        before = graph.node_count(model)
+        gone = self._cut_outputs(model)
+        notes = [f"output removed: {name}" for name in gone]
+        if self.fill == "substitute":
+            for module in known:
+                notes += [self._substitute(model, each) for each in module.substitutes]
+        graph.sweep(model)
+        for value in self._exits(model):
+            notes.append(f"{value.name} reads as zeros")
+            replace_readers(value, self._zeros(model.graph, value))
+        graph.sweep(model)
+        graph.sort(model)
+        removed = before - graph.node_count(model)
+        return PassResult(model, max(1, removed), (*notes, f"{removed} nodes removed"))
+
+    def _dropped(self, value: ir.Value) -> bool:
+        return module_of(value) in self.drop
+
+    def _readers(self, value: ir.Value) -> list[ir.Node]:
+        """List who reads a value, those that stay first: new nodes are theirs."""
+        return sorted(
+            value.consumers(), key=lambda n: provenance.module_of(n) in self.drop
+        )
+
+    def _zeros(self, where: ir.Graph, value: ir.Value) -> ir.Value:
+        return zeros_like(where, value, self._readers(value), self.name)
+
+    def _exits(self, model: ir.Model) -> list[ir.Value]:
+        return [
+            value
+            for node in model.graph
+            if provenance.module_of(node) in self.drop
+            for value in node.outputs
+            if any(provenance.module_of(n) not in self.drop for n in value.consumers())
+        ]
+
+    def _cut_outputs(self, model: ir.Model) -> list[str]:
+        owned = [value for value in model.graph.outputs if self._dropped(value)]
+        names = [str(value.name) for value in owned]
+        who, what = ", ".join(self.drop), ", ".join(names)
+        if owned and not self.drop_outputs:
+            raise PreconditionError(
+                f"{who} makes the outputs {what}: drop_outputs=true removes them too"
+            )
+        if len(owned) == len(model.graph.outputs):
+            raise PreconditionError(f"{who} makes every output: {what}")
+        for value in owned:
+            model.graph.outputs.remove(value)
+        return names
+
+    def _substitute(self, model: ir.Model, wanted: Substitute) -> str:
+        old = result_of(model, wanted.scope)
+        if self._dropped(old):
+            return f"{wanted.scope} is dropped itself: nothing stands in for it"
+        if wanted.by is None:
+            replace_readers(old, self._zeros(model.graph, old))
+            return f"{wanted.scope} reads as zeros"
+        new = result_of(model, wanted.by, like=old)
+        if self._dropped(new):
+            raise PreconditionError(
+                f"{wanted.by} cannot stand in for {wanted.scope}: it is of module"
+                f" {module_of(new)}, which is dropped too"
+            )
+        if depends(new, old):
+            raise PreconditionError(
+                f"{wanted.by} cannot stand in for {wanted.scope}: it reads its result"
+            )
+        readers = self._readers(old)
+        replace_readers(old, shaped_like(model.graph, new, old, readers, self.name))
+        return f"{wanted.scope} replaced by {wanted.by}"
+
+
+def _require_nodes(model: ir.Model, drop: tuple[str, ...]) -> None:
+    present = sorted({provenance.module_of(node) for node in model.graph} - {""})
+    for name in drop:
+        if name not in present:
+            raise PreconditionError(
+                f"no node belongs to module {name}; the graph has {', '.join(present)}"
+            )

@@ -1,0 +1,140 @@
+"""Write a plan into a graph as TensorRT reads it: explicit, symmetric QDQ.
+
+The rules (TensorRT 10 developer guide, "Explicit quantization", and what its ONNX
+parser accepts): zero points are 0; activations have one scale a tensor, weights one a
+channel; weights are stored as int8 behind a DequantizeLinear; biases and outputs have
+no QDQ; every reader of a tensor shares one pair.
+"""
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.calibration.observers import scale_of
+from me2e_compress.calibration.plan import Decision, QuantPlan
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.weights import quantize_weight
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import provenance
+
+MIN_OPSET = 13
+"""The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
+
+BY = "quantize-int8"
+
+
+def place_qdq(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
+    """Give a copy of a graph in which the plan's nodes read int8.
+
+    Args:
+        model: the float graph that was planned and calibrated; it stays as it is.
+        plan: what becomes int8.
+        ranges: of every activation that the plan reads.
+
+    Returns:
+        The copy: a QuantizeLinear and a DequantizeLinear for each of those activations
+        (int8, zero point 0, scale = max(|low|, |high|) / 127), and int8 initializers
+        behind a DequantizeLinear for the weights.
+
+    Raises:
+        PreconditionError: the graph is older than opset 13.
+    """
+    opset = model.opset_imports.get("", 0)
+    if opset < MIN_OPSET:
+        raise PreconditionError(
+            f"the graph is of opset {opset}: int8 with one scale a channel needs"
+            f" {MIN_OPSET} or later, export it so"
+        )
+    copy = model.clone()
+    writer = _Writer(copy.graph, ranges)
+    nodes = {str(node.outputs[0].name): node for node in copy.graph}
+    for decision in plan.chosen:
+        writer.apply(nodes[decision.output], decision)
+    return copy
+
+
+class _Writer:
+    """Writes pairs into one graph, each tensor and each weight once."""
+
+    def __init__(self, where: ir.Graph, ranges: Ranges) -> None:
+        self._graph = where
+        self._ranges = ranges
+        self._activations: dict[str, ir.Value] = {}
+        self._weights: dict[tuple[str, int], ir.Value] = {}
+        self._zero: ir.Value | None = None
+
+    def apply(self, node: ir.Node, decision: Decision) -> None:
+        """Let one node read int8."""
+        for index in decision.activations:
+            value = node.inputs[index]
+            if value is not None:
+                node.replace_input_with(index, self._activation(value, node))
+        if decision.weight is None or decision.axis is None:
+            return
+        weight = node.inputs[decision.weight]
+        if weight is not None:
+            fresh = self._weight(weight, decision.axis, node)
+            node.replace_input_with(decision.weight, fresh)
+            self._drop(weight)
+
+    def _activation(self, value: ir.Value, reader: ir.Node) -> ir.Value:
+        name = str(value.name)
+        if name not in self._activations:
+            step = np.array(scale_of(*self._ranges.tensors[name]))
+            scale = self._constant(step, f"{name}_scale")
+            if self._zero is None:
+                self._zero = self._constant(np.array(0, np.int8), "int8_zero")
+            pair = [scale, self._zero]
+            quantize = _node("QuantizeLinear", [value, *pair], name, value, reader)
+            quantize.outputs[0].type = ir.TensorType(ir.DataType.INT8)
+            dequantize = _node(
+                "DequantizeLinear", [quantize.outputs[0], *pair], name, value, reader
+            )
+            producer = value.producer()
+            if producer is None:
+                self._graph.insert_before(self._graph[0], [quantize, dequantize])
+            else:
+                self._graph.insert_after(producer, [quantize, dequantize])
+            self._activations[name] = dequantize.outputs[0]
+        return self._activations[name]
+
+    def _weight(self, weight: ir.Value, axis: int, reader: ir.Node) -> ir.Value:
+        name = str(weight.name)
+        if (name, axis) not in self._weights:
+            array = graph.array_of(weight)
+            if array is None:
+                raise PreconditionError(f"{name}: planned as a weight, but computed")
+            integers, scales = quantize_weight(array.astype(np.float32), axis)
+            inputs = [
+                self._constant(integers, f"{name}_int8"),
+                self._constant(scales, f"{name}_scale"),
+                self._constant(np.zeros(len(scales), np.int8), f"{name}_zero"),
+            ]
+            dequantize = _node("DequantizeLinear", inputs, name, weight, reader)
+            dequantize.attributes.add(ir.AttrInt64("axis", axis))
+            self._graph.insert_before(reader, dequantize)
+            self._weights[name, axis] = dequantize.outputs[0]
+        return self._weights[name, axis]
+
+    def _constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
+        return graph.add_constant(self._graph, array, name)
+
+    def _drop(self, weight: ir.Value) -> None:
+        if weight.uses() or weight.is_graph_output():
+            return
+        producer = weight.producer()
+        if producer is not None:
+            self._graph.remove(producer, safe=True)
+        elif weight.is_initializer():
+            del self._graph.initializers[str(weight.name)]
+
+
+def _node(
+    op: str, inputs: list[ir.Value], name: str, like: ir.Value, reader: ir.Node
+) -> ir.Node:
+    node = ir.node(op, inputs, name=f"{name}_{op}")
+    output = node.outputs[0]
+    output.name, output.shape, output.type = node.name, like.shape, like.type
+    provenance.inherit(node, [reader], by=BY)
+    return node
