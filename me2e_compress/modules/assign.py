@@ -67,9 +67,9 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
        whose weight lost its name goes by the bias added to it. An initializer that
        scopes of several modules read was merged by the exporter and decides nothing;
     2. *scope*: the torch module whose forward made it, see :func:`scope_of`;
-    3. *neighbour*: the nearest node that has a module: the producer that comes last
-       in the graph, else the consumer that comes first. Constants go by their
-       consumer. What hangs on nothing goes with the node before it.
+    3. *neighbour*: the one module that all its results go to; else the nearest node
+       that has a module, the producer first, then the consumer: see :func:`spread`.
+       Constants go by their consumers.
 
     Raises:
         ModuleMapError: a required pattern matches nothing, or none at all does.
