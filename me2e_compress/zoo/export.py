@@ -1,6 +1,7 @@
 """Write a stack of the zoo as ONNX."""
 
 import importlib.util
+import io
 import os
 import tempfile
 import warnings
@@ -61,10 +62,13 @@ def export(
             f"cannot export {stack} at opset {opset}: {OPSETS[0]} to {OPSETS[-1]} work"
         )
     model = build(stack, opset=opset, seed=seed, heads=heads)
+    graph = trace(spec, model, opset)
+    for key, value in spec.metadata(heads).items():
+        graph.metadata_props.add(key=key, value=value)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
         draft = Path(folder) / path.name
-        draft.write_bytes(trace(spec, model, opset).SerializeToString())
+        draft.write_bytes(graph.SerializeToString())
         os.replace(draft, path)
     return path
 
@@ -88,13 +92,11 @@ def build(
 
 
 def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
-    """Trace a module with example inputs and return the checked graph.
+    """Trace a module with example inputs and return the graph.
 
     Raises:
         GraphError: The exporter wrote another opset than it was asked for.
     """
-    import io
-
     import torch
 
     buffer = io.BytesIO()
@@ -113,8 +115,6 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
     written = {entry.domain: entry.version for entry in graph.opset_import}
     if written != {"": opset}:
         raise GraphError(f"{spec.name}: asked for opset {opset}, torch wrote {written}")
-    for key, value in spec.metadata().items():
-        graph.metadata_props.add(key=key, value=value)
     return graph
 
 

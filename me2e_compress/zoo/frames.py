@@ -25,7 +25,6 @@ SENSOR_NOISE = 2.0
 """Standard deviation of pixel noise, in 1 / 255."""
 
 
-
 def write_frames(
     stack: str,
     folder: Path,
@@ -117,10 +116,11 @@ def _normalise(
 
 
 def _can_bus(world: World, step: int) -> NDArray[np.float32]:
-    """[18]: 0-2 metres moved since the last frame (world), 3-6 quaternion, 7 speed,
-    10-12 acceleration, 13-15 angular rate, 16 yaw (rad), 17 change of yaw (deg).
+    """What the vehicle says of its motion, [18] float32.
 
-    The changes are zero at the start of a scene.
+    0-2 metres moved since the last frame (world axes), 3-6 quaternion, 7 speed, 10-12
+    acceleration, 13-15 angular rate, 16 yaw in radians, 17 change of yaw in degrees;
+    the changes are zero at the start of a scene.
     """
     now, before = world.ego(step * FRAME_S), world.ego(max(step - 1, 0) * FRAME_S)
     turned = now.yaw - before.yaw

@@ -29,8 +29,7 @@ class Stack:
         recurrent: Output that answers each recurrent input.
         plan: Name of the output that is the plan.
         plan_deltas: The plan is metres a step, not positions.
-        default_mode: Row of the plan that is driven without a command (in VAD's one-hot
-            order right, left, straight).
+        default_mode: Row of the plan that is driven without a command, by heads.
         image: How the image input is normalised.
     """
 
@@ -40,16 +39,16 @@ class Stack:
     recurrent: Mapping[str, str]
     plan: str
     plan_deltas: bool
-    default_mode: int
+    default_mode: Mapping[str, int]
     image: ImageNorm
 
-    def metadata(self) -> dict[str, str]:
+    def metadata(self, heads: str) -> dict[str, str]:
         """What the exported file says of itself, as ONNX metadata properties."""
         plan = {
             "output": self.plan,
             "deltas": self.plan_deltas,
             "command_input": None,
-            "default_mode": self.default_mode,
+            "default_mode": self.default_mode[heads],
         }
         image = {
             "input": "img",
@@ -87,12 +86,13 @@ VAD_TINY = Stack(
     recurrent={"prev_bev": "bev_embed"},
     plan="ego_fut_preds",
     plan_deltas=True,
-    default_mode=2,
+    default_mode={"nuscenes": 2, "bench2drive": 3},
     image=ImageNorm(
         mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), order="RGB"
     ),
 )
-"""hustvl/VAD, VAD_tiny_e2e.py: image statistics of ImageNet, three commands."""
+"""hustvl/VAD, VAD_tiny_e2e.py: image statistics of ImageNet; commands right, left and
+straight. Bench2DriveZoo: six road options, of which the fourth follows the lane."""
 
 STACKS: dict[str, Stack] = {stack.name: stack for stack in (VAD_TINY,)}
 

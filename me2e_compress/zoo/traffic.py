@@ -12,8 +12,9 @@ Range = tuple[float, float]
 def draw_world(rng: np.random.Generator) -> World:
     """A road with 8 to 12 vehicles, parked ones, buildings, people and cones."""
     bend = float(rng.uniform(-0.008, 0.008))
+    speed_mps = float(rng.uniform(3, 10))
     boxes = [
-        *(_vehicle(rng, bend) for _ in range(int(rng.integers(8, 13)))),
+        *(_vehicle(rng, bend, speed_mps) for _ in range(int(rng.integers(8, 13)))),
         *(_parked(rng, bend) for _ in range(int(rng.integers(4, 8)))),
         *(_building(rng, bend) for _ in range(int(rng.integers(10, 15)))),
         *(_small(rng, bend) for _ in range(int(rng.integers(5, 9)))),
@@ -25,7 +26,7 @@ def draw_world(rng: np.random.Generator) -> World:
         crossing_m=float(rng.uniform(8, 40)),
         tile=tile,
         boxes=tuple(boxes),
-        speed_mps=float(rng.uniform(3, 10)),
+        speed_mps=speed_mps,
         accel_mps2=float(rng.uniform(-0.7, 0.7)),
         lane_m=0.0,
     )
@@ -41,7 +42,8 @@ def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, floa
     return float(red), float(green), float(blue)
 
 
-def _vehicle(rng: np.random.Generator, bend: float) -> Box:
+def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Box:
+    """One that drives; in the lane of the ego vehicle about as fast as that."""
     lane = int(rng.integers(0, LANES)) - LANES // 2
     ahead = lane != 0 or rng.random() < 0.7
     along = float(rng.uniform(9, 60) if ahead else rng.uniform(-50, -9))
@@ -57,7 +59,7 @@ def _vehicle(rng: np.random.Generator, bend: float) -> Box:
         width=2.3 if truck else float(rng.uniform(1.7, 1.95)),
         height=float(rng.uniform(2.6, 3.4) if truck else rng.uniform(1.4, 1.8)),
         colour=_colour(rng, (30, 235)),
-        speed_mps=float(rng.uniform(4, 11)),
+        speed_mps=ego_mps if lane == 0 else float(rng.uniform(4, 11)),
         window_m=None if truck else 1.6,
     )
 
@@ -74,9 +76,7 @@ def _building(rng: np.random.Generator, bend: float) -> Box:
     offset = side * (float(rng.uniform(11, 20)) + depth / 2)
     x, y, yaw = _place(bend, float(rng.uniform(-55, 80)), offset)
     length, height = float(rng.uniform(9, 24)), float(rng.uniform(5, 17))
-    return Box(
-        x, y, yaw, length, depth, height, _colour(rng, (90, 210)), window_m=2.8
-    )
+    return Box(x, y, yaw, length, depth, height, _colour(rng, (90, 210)), window_m=2.8)
 
 
 def _small(rng: np.random.Generator, bend: float) -> Box:

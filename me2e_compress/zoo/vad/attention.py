@@ -16,6 +16,9 @@ MASKED_LOGIT = -1.0e4
 """Softmax makes it 0, and unlike minus infinity it fits float16 and any observer."""
 
 
+HEAD_SCALE = (EMBED // ATTENTION_HEADS) ** -0.5
+
+
 class PackedAttention(nn.Module):
     """Scaled dot-product attention with the q, k and v projections in one tensor."""
 
@@ -47,7 +50,7 @@ class PackedAttention(nn.Module):
                 (query, key, value), weights, biases, strict=True
             )
         )
-        logits = torch.matmul(q * q.shape[-1] ** -0.5, k.transpose(-2, -1))
+        logits = torch.matmul(q * HEAD_SCALE, k.transpose(-2, -1))
         if ignore is not None:
             logits = logits.masked_fill(ignore[:, None, None], MASKED_LOGIT)
         mixed = torch.matmul(logits.softmax(-1), v).transpose(1, 2).flatten(2)

@@ -97,9 +97,10 @@ class CameraAttention(nn.Module):
         weights = weights.expand(cameras, cells, heads, 1, points)
         locations = at[:, :, None, None] + offsets
         locations = locations.view(cameras, cells, heads, 1, points, 2)
-        return deformable_attention(
-            value, self.hw, locations, weights, self.sampling
-        )
+        return deformable_attention(value, self.hw, locations, weights, self.sampling)
+
+
+ONE = torch.tensor(1.0)
 
 
 class SpatialCrossAttention(nn.Module):
@@ -125,7 +126,7 @@ class SpatialCrossAttention(nn.Module):
             [1, cells, 256], with the residual.
         """
         seen = self.deformable_attention(query, tokens, at) * visible
-        count = visible.sum(0, keepdim=True).clamp(min=1.0)
+        count = torch.maximum(visible.sum(0, keepdim=True), ONE)
         return query + self.output_proj(seen.sum(0, keepdim=True) / count)
 
 
@@ -224,5 +225,3 @@ class GridPosition(nn.Module):
         columns = self.col_embed.weight.unsqueeze(0).expand(height, -1, -1)
         rows = self.row_embed.weight.unsqueeze(1).expand(-1, width, -1)
         return torch.cat([columns, rows], -1).flatten(0, 1).unsqueeze(0)
-
-

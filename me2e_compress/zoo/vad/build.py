@@ -1,7 +1,5 @@
 """A VAD-tiny that is ready to run."""
 
-import torch
-
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo.vad.config import HEADS, HeadsName, Sampling
 from me2e_compress.zoo.vad.initialise import initialise

@@ -10,14 +10,14 @@ from me2e_compress.zoo.vad.attention import (
 )
 from me2e_compress.zoo.vad.config import BEV_HW, EMBED, LAYERS, Sampling
 
-EPSILON = 1.0e-5
-"""Keeps the inverse sigmoid finite (deformable DETR)."""
+EPSILON = torch.tensor(1.0e-5)
+"""Keeps the inverse sigmoid finite (deformable DETR). A tensor: the exporter would
+write a Python number as float64."""
 
 
 def inverse_sigmoid(x: Tensor) -> Tensor:
-    """Logit of x, which is clamped to [1e-5, 1 - 1e-5]."""
-    x = x.clamp(0.0, 1.0)
-    return torch.log(x.clamp(min=EPSILON) / (1 - x).clamp(min=EPSILON))
+    """Logit of x in 0..1, kept away from both ends by `EPSILON`."""
+    return torch.log(torch.maximum(x, EPSILON) / torch.maximum(1 - x, EPSILON))
 
 
 class DecoderLayer(nn.Module):

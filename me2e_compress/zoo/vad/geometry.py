@@ -8,13 +8,12 @@ from torch import Tensor
 from me2e_compress.zoo.vad.config import BEV_HW, PC_RANGE, ROTATION_CENTRE, Sampling
 from me2e_compress.zoo.vad.sampling import sample
 
-MIN_DEPTH = 1.0e-5
-"""Metres (BEVFormer, ``point_sampling``)."""
+MIN_DEPTH = torch.tensor(1.0e-5)
+"""Metres (BEVFormer, ``point_sampling``). A tensor: the exporter would write a Python
+number as float64."""
 
 
-def pillars(
-    hw: tuple[int, int], pc_range: tuple[float, ...], heights: int
-) -> Tensor:
+def pillars(hw: tuple[int, int], pc_range: tuple[float, ...], heights: int) -> Tensor:
     """Points above the cell centres: [heights, cells, 4, 1], x y z 1 in metres."""
     low, high = torch.tensor(pc_range[:3]), torch.tensor(pc_range[3:])
     counts = (heights, hw[0], hw[1])
@@ -41,7 +40,7 @@ def project(
     """
     seen = torch.matmul(lidar2img[0][:, None, None], points.unsqueeze(0)).squeeze(-1)
     depth = seen[..., 2:3]
-    uv = seen[..., :2] / depth.clamp(min=MIN_DEPTH)
+    uv = seen[..., :2] / torch.maximum(depth, MIN_DEPTH)
     u, v = uv[..., 0:1] / image_hw[1], uv[..., 1:2] / image_hw[0]
     inside = (depth > MIN_DEPTH) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
     visible = inside.to(uv.dtype).amax(1)

@@ -93,7 +93,9 @@ class MotionHead(PerceptionHead):
     def lanes(self, vectors: Map) -> tuple[Tensor, Tensor]:
         """One query [1, 100, 256] and one position [1, 100, 2] a map vector."""
         with region("map"):
-            return self.lane_encoder(vectors.queries), nearest_points(vectors.points[-1])
+            return self.lane_encoder(vectors.queries), nearest_points(
+                vectors.points[-1]
+            )
 
     def forecast(
         self, agents: Agents, vectors: Map, lanes: tuple[Tensor, Tensor]

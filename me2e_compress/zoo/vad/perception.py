@@ -122,9 +122,7 @@ class PerceptionHead(nn.Module):
             torch.stack(scores), torch.stack(boxes), queries[-1], at[-1][..., :2]
         )
 
-    def _map(
-        self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]
-    ) -> Map:
+    def _map(self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]) -> Map:
         grouped = [q.view(1, VECTORS, VECTOR_POINTS, EMBED) for q in queries]
         scores = [
             branch(query.mean(2))

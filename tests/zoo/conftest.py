@@ -1,0 +1,43 @@
+"""One export and one torch model for all tests of the zoo."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from me2e_compress.zoo.export import build, export
+from me2e_compress.zoo.frames import Frame, frames
+from me2e_compress.zoo.stacks import VAD_TINY
+
+if TYPE_CHECKING:
+    from me2e_compress.zoo.vad.stack import VadTiny
+
+
+@pytest.fixture(scope="session")
+def vad_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The exported reference stack, seed 0."""
+    return export("vad-tiny", tmp_path_factory.mktemp("zoo") / "vad-tiny.onnx")
+
+
+@pytest.fixture(scope="session")
+def vad_torch() -> "VadTiny":
+    """The same in torch."""
+    from me2e_compress.zoo.vad.stack import VadTiny
+
+    model = build("vad-tiny")
+    assert isinstance(model, VadTiny)
+    return model
+
+
+@pytest.fixture(scope="session")
+def scenes() -> list[Frame]:
+    """Two scenes of two frames, of a seed that no calibration saw."""
+    return list(frames(VAD_TINY, 4, seed=7, scene_length=2))
+
+
+@pytest.fixture(scope="session")
+def no_bev() -> NDArray[np.float32]:
+    """The recurrent state at the start of a scene."""
+    return np.zeros(VAD_TINY.inputs["prev_bev"], np.float32)

@@ -1,0 +1,102 @@
+from collections import Counter
+from pathlib import Path
+
+import onnx
+import pytest
+import torch
+from torch import nn
+
+from me2e_compress.errors import GraphError
+from me2e_compress.zoo import truth
+from me2e_compress.zoo.counter import MacCounter
+from me2e_compress.zoo.regions import listening, region
+from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.truth import NOT_COMPUTE, Truth
+
+MODULES = ["backbone", "bev_encoder", "det", "map", "motion", "neck", "planner"]
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Truth:
+    return truth.record("vad-tiny")
+
+
+def test_every_compute_node_has_a_module(recorded: Truth, vad_tiny: Path) -> None:
+    nodes = onnx.load(vad_tiny, load_external_data=False).graph.node
+    compute = [node.name for node in nodes if node.op_type not in NOT_COMPUTE]
+    assert sorted(recorded.modules) == sorted(compute)
+    assert sorted(set(recorded.modules.values())) == MODULES
+
+
+@pytest.mark.parametrize(
+    ("start", "module"),
+    [
+        ("/img_backbone/", "backbone"),
+        ("/img_neck/", "neck"),
+        ("/pts_bbox_head/transformer/encoder/", "bev_encoder"),
+        ("/pts_bbox_head/transformer/decoder/", "det"),
+        ("/pts_bbox_head/transformer/map_decoder/", "map"),
+        ("/pts_bbox_head/lane_encoder/", "map"),
+        ("/pts_bbox_head/motion_map_decoder/", "motion"),
+        ("/pts_bbox_head/agent_fus_mlp/", "planner"),
+    ],
+)
+def test_scopes_and_truth_agree(recorded: Truth, start: str, module: str) -> None:
+    found = {m for name, m in recorded.modules.items() if name.startswith(start)}
+    assert found == {module}
+
+
+def test_glue_of_the_head_is_told_apart(recorded: Truth) -> None:
+    """Names say only /pts_bbox_head; the truth says more."""
+    glue = Counter(
+        module
+        for name, module in recorded.modules.items()
+        if name.startswith("/pts_bbox_head/") and name.count("/") == 2
+    )
+    assert sorted(glue) == ["bev_encoder", "det", "map", "motion", "planner"]
+
+
+def test_macs_of_the_backbone_are_those_of_resnet_50(recorded: Truth) -> None:
+    """4.087 G a 224 x 224 image without the classifier, six images 384 x 640."""
+    expected = 4.087e9 * (384 * 640) / (224 * 224) * 6
+    assert recorded.macs["backbone"] == pytest.approx(expected, rel=2e-3)
+    assert recorded.macs["neck"] == 6 * 240 * (2048 * 256 + 9 * 256 * 256)
+    assert sorted(recorded.macs) == MODULES
+
+
+def test_regions_are_silent_unless_heard() -> None:
+    heard = []
+    with region("motion"):
+        heard.append("inside")
+    assert heard == ["inside"]
+
+
+def test_counter_counts_products_only() -> None:
+    counts: list[int] = []
+    layer = nn.Linear(3, 5)
+    with torch.no_grad(), MacCounter(counts.append):
+        torch.relu(layer(torch.ones(7, 3)))
+        torch.matmul(torch.ones(2, 4, 6), torch.ones(2, 6, 8))
+    assert counts == [7 * 3 * 5, 2 * 4 * 6 * 8]
+
+
+def test_products_outside_of_every_region_are_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(truth, "example", lambda spec: (torch.ones(1, 3),))
+    with pytest.raises(GraphError, match="multiplies outside of every region"):
+        truth.count_macs(VAD_TINY, nn.Linear(3, 5))
+
+
+def test_listeners_nest_and_leave() -> None:
+    heard: list[str] = []
+
+    def listener(module: str) -> "nn.Module":
+        heard.append(module)
+        raise LookupError(module)
+
+    with pytest.raises(LookupError), listening(listener), region("det"):  # type: ignore[arg-type]
+        pass
+    with region("map"):
+        pass
+    assert heard == ["det"]

@@ -1,0 +1,150 @@
+from collections import Counter
+
+import pytest
+import torch
+from torch import nn
+
+from me2e_compress.zoo.vad.config import HeadsName
+from me2e_compress.zoo.vad.stack import VadTiny
+
+PARTS = {
+    "backbone": ("img_backbone.",),
+    "neck": ("img_neck.",),
+    "bev_encoder": (
+        "bev_embedding.",
+        "positional_encoding.",
+        "transformer.encoder.",
+        "transformer.can_bus_mlp.",
+        "transformer.level_embeds",
+        "transformer.cams_embeds",
+    ),
+    "det": (
+        "transformer.decoder.",
+        "transformer.reference_points.",
+        "query_embedding.",
+        "cls_branches.",
+        "reg_branches.",
+    ),
+    "map": (
+        "transformer.map_decoder.",
+        "transformer.map_reference_points.",
+        "map_instance_embedding.",
+        "map_pts_embedding.",
+        "map_cls_branches.",
+        "map_reg_branches.",
+    ),
+    "motion": (
+        "motion_decoder.",
+        "motion_mode_query.",
+        "pos_mlp_sa.",
+        "lane_encoder.",
+        "motion_map_decoder.",
+        "pos_mlp.",
+        "traj_branches.",
+        "traj_cls_branches.",
+    ),
+    "planner": (
+        "ego_query.",
+        "ego_agent_decoder.",
+        "ego_agent_pos_mlp.",
+        "ego_map_decoder.",
+        "ego_map_pos_mlp.",
+        "agent_fus_mlp.",
+        "ego_fut_decoder.",
+    ),
+    "code_weights": ("code_weights", "map_code_weights"),
+}
+
+NUSCENES = {
+    "backbone": 23_508_032,
+    "neck": 1_114_624,
+    "bev_encoder": 4_650_496,
+    "det": 3_013_983,
+    "map": 2_910_001,
+    "motion": 2_216_077,
+    "planner": 2_452_772,
+    "code_weights": 14,
+}
+BENCH2DRIVE = NUSCENES | {
+    "det": NUSCENES["det"] - 3 * 257,
+    "map": NUSCENES["map"] + 3 * 3 * 257,
+    "planner": NUSCENES["planner"] + 3 * 12 * 513,
+}
+
+
+def part_of(name: str) -> str:
+    short = name.removeprefix("pts_bbox_head.")
+    (part,) = [part for part, starts in PARTS.items() if short.startswith(starts)]
+    return part
+
+
+@pytest.mark.parametrize(
+    ("heads", "parts", "total"),
+    [
+        ("nuscenes", NUSCENES, 39_865_999),
+        ("bench2drive", BENCH2DRIVE, 39_886_009),
+    ],
+)
+def test_parameters_are_the_published_ones(
+    heads: HeadsName, parts: dict[str, int], total: int
+) -> None:
+    counts: Counter[str] = Counter()
+    for name, parameter in VadTiny(heads).named_parameters():
+        counts[part_of(name)] += parameter.numel()
+    assert dict(counts) == parts
+    assert counts.total() == total
+
+
+def test_published_scopes_exist() -> None:
+    names = dict(VadTiny().named_modules())
+    for scope in (
+        "img_backbone.layer1.0.conv1",
+        "img_backbone.layer4.0.downsample.0",
+        "img_neck.lateral_convs.0.conv",
+        "img_neck.fpn_convs.0.conv",
+        "pts_bbox_head.transformer.encoder.layers.0.attentions.1.deformable_attention",
+        "pts_bbox_head.transformer.decoder.layers.2.attentions.1.value_proj",
+        "pts_bbox_head.transformer.map_decoder.layers.2.ffns.0.layers.0.0",
+        "pts_bbox_head.transformer.can_bus_mlp.norm",
+        "pts_bbox_head.ego_map_decoder.layers.0.attentions.0.attn",
+        "pts_bbox_head.lane_encoder.layer_seq.lmlp_2.linear",
+        "pts_bbox_head.cls_branches.2.6",
+        "pts_bbox_head.traj_branches.0.4",
+    ):
+        assert scope in names
+
+
+def test_no_tensor_is_constant(vad_torch: VadTiny) -> None:
+    constant = [
+        name
+        for name, tensor in vad_torch.state_dict().items()
+        if tensor.numel() > 1 and not bool((tensor != tensor.flatten()[0]).any())
+    ]
+    assert constant == []
+
+
+def test_tensors_are_pairwise_distinct(vad_torch: VadTiny) -> None:
+    seen: dict[bytes, str] = {}
+    for name, tensor in vad_torch.state_dict().items():
+        if name.endswith("num_batches_tracked"):
+            continue
+        other = seen.setdefault(tensor.numpy().tobytes(), name)
+        assert other == name
+
+
+def test_attention_blocks_have_the_published_sizes() -> None:
+    layer = VadTiny().pts_bbox_head.transformer.encoder.layers[0]
+    sizes = [_size(block) for block in (*layer.attentions, layer.ffns[0], layer)]
+    assert sizes == [230_080, 180_928, 262_912, 675_456]
+
+
+def _size(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_same_seed_same_bytes(vad_torch: VadTiny) -> None:
+    from me2e_compress.zoo.vad.build import build
+
+    again = build(seed=0).state_dict()
+    for name, tensor in vad_torch.state_dict().items():
+        assert torch.equal(tensor, again[name]), name
