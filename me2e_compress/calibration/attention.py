@@ -2,17 +2,18 @@
 
 import dataclasses
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import onnx_ir as ir
 
-from me2e_compress.calibration.products import is_product
 from me2e_compress.graph import static_shape
 
 FUSED = frozenset(
     {"Attention", "GroupQueryAttention", "MultiHeadAttention", "PackedAttention"}
 )
 """Operators that are attention as a whole (ONNX 23, com.microsoft)."""
+
+_PRODUCTS = ("Einsum", "Gemm", "MatMul")
 
 _LAYOUT = frozenset(
     {
@@ -50,7 +51,9 @@ class Attention:
         return max(self.queries, self.keys)
 
 
-def find_attention(model: ir.Model) -> dict[ir.Node, Attention]:
+def find_attention(
+    model: ir.Model, constants: Collection[ir.Value]
+) -> dict[ir.Node, Attention]:
     """Map every product that takes part in an attention to that attention.
 
     From each softmax one walk goes back to the product of queries and keys and one
@@ -61,10 +64,15 @@ def find_attention(model: ir.Model) -> dict[ir.Node, Attention]:
 
     Sampling weights of deformable attention come from a linear layer, not from such a
     product, and are not attention here.
+
+    Args:
+        model: the graph, shapes inferred.
+        constants: values that no input changes: what multiplies one of them from the
+            left is a layer, not an attention.
     """
     found: dict[ir.Node, Attention] = {}
-    back = _Walk(_SCORES, forward=False)
-    ahead = _Walk(_WEIGHTS, forward=True)
+    back = _Walk(_SCORES, constants, forward=False)
+    ahead = _Walk(_WEIGHTS, constants, forward=True)
     for weights, scores in _softmaxes(model.graph):
         queries_by_keys = back.products(scores)
         if not queries_by_keys:
@@ -78,8 +86,15 @@ def find_attention(model: ir.Model) -> dict[ir.Node, Attention]:
 class _Walk:
     """Walks that share what they have seen: a node entered before is not entered."""
 
-    def __init__(self, through: frozenset[str], *, forward: bool) -> None:
+    def __init__(
+        self,
+        through: frozenset[str],
+        constants: Collection[ir.Value],
+        *,
+        forward: bool,
+    ) -> None:
         self._through = through
+        self._constants = constants
         self._forward = forward
         self._seen: dict[ir.Node, list[ir.Node]] = {}
 
@@ -91,7 +106,7 @@ class _Walk:
                 if node in self._seen:
                     if self._seen[node] is not mine:
                         mine += self._seen[node]
-                elif is_product(node):
+                elif self._is_product(node):
                     mine.append(node)
                 elif node.op_type in self._through:
                     self._seen[node] = mine
@@ -99,6 +114,18 @@ class _Walk:
                     queue.extend(end for end in ends if end is not None)
         mine[:] = dict.fromkeys(mine)
         return mine
+
+    def _is_product(self, node: ir.Node) -> bool:
+        """Say whether a node multiplies by a matrix that is computed, not a weight.
+
+        The left one may be constant: learned queries that have not met the scene yet.
+        """
+        return (
+            node.op_type in _PRODUCTS
+            and node.domain in ("", "ai.onnx")
+            and node.inputs[1] is not None
+            and node.inputs[1] not in self._constants
+        )
 
     def _next(self, value: ir.Value) -> Iterable[ir.Node]:
         if self._forward:

@@ -11,6 +11,7 @@ from me2e_compress.calibration.attention import find_attention
 from me2e_compress.calibration.rules import WEIGHTED, Facts, Rule, paper_rules
 from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.graph import provenance, static_shape
+from me2e_compress.runtime.evaluate import constant_values
 
 INT8 = "int8"
 FLOAT = "float"
@@ -77,12 +78,13 @@ def make_plan(
     """Decide for every node; one look at each, so linear in the graph.
 
     Args:
-        model: the float graph: modules stamped on its nodes, shapes inferred, constants
-            folded.
+        model: the float graph: modules stamped on its nodes, shapes inferred.
         scheme: which modules are to be int8.
         rules: asked in order; None for :func:`paper_rules`.
     """
-    facts = Facts(frozenset(scheme.modules), find_attention(model))
+    constants = constant_values(model)
+    attention = find_attention(model, constants)
+    facts = Facts(frozenset(scheme.modules), constants, attention)
     asked = paper_rules() if rules is None else tuple(rules)
     main = model.graph
     return QuantPlan(

@@ -5,13 +5,13 @@ named here. A rule set is a tuple of rules: leave one out to switch it off.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Protocol
 
 import onnx_ir as ir
 
 from me2e_compress.calibration.attention import FUSED, Attention
-from me2e_compress.calibration.products import extent, is_constant
+from me2e_compress.calibration.products import extent
 from me2e_compress.graph import provenance
 
 CONVOLUTIONS = ("Conv", "ConvTranspose")
@@ -25,10 +25,13 @@ class Facts:
 
     Attributes:
         modules: which are to be int8.
+        constants: the values that no input changes: weights, and what is computed
+            from weights alone.
         attention: the products that take part in an attention.
     """
 
     modules: frozenset[str]
+    constants: Collection[ir.Value]
     attention: Mapping[ir.Node, Attention]
 
 
@@ -90,15 +93,19 @@ class Weight:
         types = {each.dtype for each in (left, right) if each is not None}
         if not types <= {ir.DataType.FLOAT, None}:
             return "not float32"
-        if is_constant(left) and node in facts.attention:
+        if left in facts.constants and right in facts.constants:
+            return "both operands are constant: computed once, when the graph is loaded"
+        if left in facts.constants and node in facts.attention:
             return "the queries are constant"
-        if is_constant(left):
+        if left in facts.constants:
             return "the left operand is constant: coordinate arithmetic, not a layer"
-        if is_constant(right) or (node.op_type == "MatMul" and node in facts.attention):
+        if right in facts.constants:
             return None
-        if node.op_type == "MatMul":
-            return "both operands are computed, and no softmax follows: not a layer"
-        return "the weight is computed"
+        if node.op_type != "MatMul":
+            return "the weight is computed"
+        if node in facts.attention:
+            return None
+        return "both operands are computed, and no softmax follows: not a layer"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +144,7 @@ class MatrixVector:
         """Object if one side of the product is a single row or column."""
         if node.op_type in CONVOLUTIONS:
             return None
-        size = extent(node)
+        size = extent(node, weight=node.inputs[1] in facts.constants)
         if not size.is_vector:
             return None
         return f"{size.rows} rows by {size.columns} columns: a matrix-vector product"

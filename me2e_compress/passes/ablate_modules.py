@@ -16,6 +16,7 @@ from me2e_compress.passes.stand_ins import (
     replace_readers,
     result_of,
     shaped_like,
+    within,
     zeros_like,
 )
 
@@ -35,6 +36,8 @@ class AblateModules:
     Attributes:
         drop: the modules to remove.
         fill: ``substitute`` re-wires as the module map says, ``zeros`` never does.
+        keep: scopes of dropped modules that stay, because another module reads them
+            (``*.lane_encoder``).
         drop_outputs: True removes the graph outputs that only a dropped module makes;
             False refuses to drop such a module.
     """
@@ -43,6 +46,7 @@ class AblateModules:
     exact: ClassVar[bool] = False
     drop: tuple[str, ...]
     fill: Literal["zeros", "substitute"] = "substitute"
+    keep: tuple[str, ...] = ()
     drop_outputs: bool = False
 
     @property
@@ -61,6 +65,8 @@ class AblateModules:
         """
         known = [context.modules.module(name) for name in self.drop]
         _require_nodes(model, self.drop)
+        for pattern in self.keep:
+            result_of(model, pattern)
         graph.infer_shapes(model)
         before = graph.node_count(model)
         gone = self._cut_outputs(model)
@@ -77,14 +83,17 @@ class AblateModules:
         removed = before - graph.node_count(model)
         return PassResult(model, max(1, removed), (*notes, f"{removed} nodes removed"))
 
+    def _goes(self, node: ir.Node | None) -> bool:
+        if node is None or provenance.module_of(node) not in self.drop:
+            return False
+        return not any(within(node, pattern) for pattern in self.keep)
+
     def _dropped(self, value: ir.Value) -> bool:
-        return module_of(value) in self.drop
+        return self._goes(value.producer())
 
     def _readers(self, value: ir.Value) -> list[ir.Node]:
         """List who reads a value, those that stay first: new nodes are theirs."""
-        return sorted(
-            value.consumers(), key=lambda n: provenance.module_of(n) in self.drop
-        )
+        return sorted(value.consumers(), key=self._goes)
 
     def _zeros(self, where: ir.Graph, value: ir.Value) -> ir.Value:
         return zeros_like(where, value, self._readers(value), self.name)
@@ -93,9 +102,9 @@ class AblateModules:
         return [
             value
             for node in model.graph
-            if provenance.module_of(node) in self.drop
+            if self._goes(node)
             for value in node.outputs
-            if any(provenance.module_of(n) not in self.drop for n in value.consumers())
+            if not all(self._goes(reader) for reader in value.consumers())
         ]
 
     def _cut_outputs(self, model: ir.Model) -> list[str]:

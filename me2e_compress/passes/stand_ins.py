@@ -9,13 +9,21 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
-from me2e_compress.modules import exits
+from me2e_compress.modules import Pattern, exits, scope_of
+
+_INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
 
 
 def module_of(value: ir.Value) -> str:
     """Name the module that makes a value; empty for inputs and initializers."""
     producer = value.producer()
     return "" if producer is None else provenance.module_of(producer)
+
+
+def within(node: ir.Node, scope: str) -> bool:
+    """Say whether a node was made in a scope, e.g. ``*.lane_encoder``."""
+    path = tuple(part for part in scope_of(node).split(".") if part)
+    return Pattern(scope).reach(path) is not None
 
 
 def result_of(model: ir.Model, scope: str, like: ir.Value | None = None) -> ir.Value:
@@ -67,6 +75,23 @@ def depends(value: ir.Value, on: ir.Value) -> bool:
     return False
 
 
+def is_shape_arithmetic(value: ir.Value) -> bool:
+    """Say whether integers come from shapes and constants alone, not from data."""
+    queue, seen = [value], {value}
+    while queue:
+        current = queue.pop()
+        if current.is_graph_input() or current.dtype not in _INTEGERS:
+            return False
+        producer = current.producer()
+        if producer is None or producer.op_type in ("Shape", "Size"):
+            continue
+        for each in producer.inputs:
+            if each is not None and each not in seen:
+                seen.add(each)
+                queue.append(each)
+    return True
+
+
 def replace_readers(old: ir.Value, new: ir.Value) -> None:
     """Let the nodes that read one value read another; graph outputs keep theirs."""
     maker = new.producer()
@@ -87,8 +112,13 @@ def zeros_like(
         by: name of the pass.
 
     Raises:
-        PreconditionError: the shape is not static.
+        PreconditionError: the shape is not static, or the value is itself a shape.
     """
+    if is_shape_arithmetic(value):
+        raise PreconditionError(
+            f"{value.name} is arithmetic on shapes, which no module owns: run"
+            " fold-constants first"
+        )
     shape = graph.static_shape(value)
     if shape is None or value.dtype is None:
         raise PreconditionError(

@@ -6,6 +6,8 @@ channel; weights are stored as int8 behind a DequantizeLinear; biases and output
 no QDQ; every reader of a tensor shares one pair.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
@@ -17,6 +19,8 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.weights import quantize_weight
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
+from me2e_compress.runtime.evaluate import evaluate_constants
+from me2e_compress.runtime.frames import Array
 
 MIN_OPSET = 13
 """The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
@@ -47,18 +51,39 @@ def place_qdq(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
             f" {MIN_OPSET} or later, export it so"
         )
     copy = model.clone()
-    writer = _Writer(copy.graph, ranges)
     nodes = {str(node.outputs[0].name): node for node in copy.graph}
+    computed = evaluate_constants(model, _computed_weights(nodes, plan))
+    writer = _Writer(copy.graph, ranges, computed)
     for decision in plan.chosen:
         writer.apply(nodes[decision.output], decision)
+    graph.sweep(copy)
     return copy
+
+
+def _computed_weights(nodes: Mapping[str, ir.Node], plan: QuantPlan) -> list[str]:
+    """Name the weights that are computed from initializers: transposed, sliced."""
+    weights = (
+        nodes[decision.output].inputs[decision.weight]
+        for decision in plan.chosen
+        if decision.weight is not None
+    )
+    return list(
+        dict.fromkeys(
+            str(weight.name)
+            for weight in weights
+            if weight is not None and weight.producer() is not None
+        )
+    )
 
 
 class _Writer:
     """Writes pairs into one graph, each tensor and each weight once."""
 
-    def __init__(self, where: ir.Graph, ranges: Ranges) -> None:
+    def __init__(
+        self, where: ir.Graph, ranges: Ranges, computed: Mapping[str, Array]
+    ) -> None:
         self._graph = where
+        self._computed = computed
         self._ranges = ranges
         self._activations: dict[str, ir.Value] = {}
         self._weights: dict[tuple[str, int], ir.Value] = {}
@@ -76,7 +101,6 @@ class _Writer:
         if weight is not None:
             fresh = self._weight(weight, decision.axis, node)
             node.replace_input_with(decision.weight, fresh)
-            self._drop(weight)
 
     def _activation(self, value: ir.Value, reader: ir.Node) -> ir.Value:
         name = str(value.name)
@@ -102,10 +126,7 @@ class _Writer:
     def _weight(self, weight: ir.Value, axis: int, reader: ir.Node) -> ir.Value:
         name = str(weight.name)
         if (name, axis) not in self._weights:
-            array = graph.array_of(weight)
-            if array is None:
-                raise PreconditionError(f"{name}: planned as a weight, but computed")
-            integers, scales = quantize_weight(array.astype(np.float32), axis)
+            integers, scales = quantize_weight(self._array(weight), axis)
             inputs = [
                 self._constant(integers, f"{name}_int8"),
                 self._constant(scales, f"{name}_scale"),
@@ -120,14 +141,13 @@ class _Writer:
     def _constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
         return graph.add_constant(self._graph, array, name)
 
-    def _drop(self, weight: ir.Value) -> None:
-        if weight.uses() or weight.is_graph_output():
-            return
-        producer = weight.producer()
-        if producer is not None:
-            self._graph.remove(producer, safe=True)
-        elif weight.is_initializer():
-            del self._graph.initializers[str(weight.name)]
+    def _array(self, weight: ir.Value) -> npt.NDArray[np.float32]:
+        name = str(weight.name)
+        if name in self._computed:
+            return self._computed[name].astype(np.float32)
+        if weight.const_value is None:
+            raise PreconditionError(f"{name} is planned as a weight, but is none")
+        return weight.const_value.numpy().astype(np.float32)
 
 
 def _node(

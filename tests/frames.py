@@ -1,0 +1,22 @@
+"""Write recordings for tests."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+
+def record(
+    folder: Path,
+    frames: Sequence[Mapping[str, npt.NDArray[np.generic]]],
+    scenes: Sequence[int] = (0,),
+) -> Path:
+    """Write frames and scenes.json into a new folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, arrays in enumerate(frames):
+        with (folder / f"{index:06d}.npz").open("wb") as stream:
+            np.savez(stream, **arrays)  # type: ignore[arg-type]
+    (folder / "scenes.json").write_text(json.dumps({"scenes": list(scenes)}))
+    return folder

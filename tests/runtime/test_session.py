@@ -1,0 +1,145 @@
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.runtime.evaluate import constant_values, evaluate_constants
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import Session, can_run, replay, run_once
+
+COUNTER = """
+<ir_version: 9, opset_import: ["" : 17]>
+counter (float[1,2] x, float[1,2] memory) => (float[1,2] y, float[1,2] memory_out) {
+    memory_out = Add(x, memory)
+    y = Identity(memory_out)
+}
+"""
+
+PLUGIN = """
+<ir_version: 9, opset_import: ["" : 17, "vendor" : 1]>
+plugin (float[4] x) => (float[4] y) {
+    [turn] y = vendor.Rotate(x)
+}
+"""
+
+
+@pytest.fixture
+def counter() -> ir.Model:
+    return ir.from_onnx_text(COUNTER)
+
+
+def ones(index: int, starts: bool) -> Frame:
+    return Frame(index, starts, {"x": np.ones((1, 2), np.float32)})
+
+
+def test_state_is_fed_forward_and_reset_where_a_scene_starts(counter: ir.Model) -> None:
+    frames = [ones(0, True), ones(1, False), ones(2, False), ones(3, True)]
+
+    sums = [values["y"][0, 0] for values in replay(Session(counter), frames)]
+
+    assert sums == [1, 2, 3, 1]
+
+
+def test_a_scene_may_open_with_a_state_of_its_own(counter: ir.Model) -> None:
+    start = {**ones(0, True).arrays, "memory": np.full((1, 2), 10, np.float32)}
+    later = {**ones(1, False).arrays, "memory": np.full((1, 2), 99, np.float32)}
+
+    frames = [Frame(0, True, start), Frame(1, False, later)]
+    sums = [values["y"][0, 0] for values in replay(Session(counter), frames)]
+
+    assert sums == [11, 12]
+
+
+def test_metadata_decides_what_is_fed_back(counter: ir.Model) -> None:
+    counter.metadata_props["me2e.recurrent"] = "{}"
+
+    with pytest.raises(FramesError, match=r"frame 0: input memory is missing.* x"):
+        list(replay(Session(counter), [ones(0, True)]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[", "not JSON"),
+        ('["memory"]', "is not {input: output}"),
+        ('{"memory": "nowhere"}', "nowhere.*outputs y, memory_out"),
+        ('{"missing": "y"}', "missing.*inputs x, memory"),
+    ],
+)
+def test_metadata_that_pairs_nothing_is_refused(
+    counter: ir.Model, text: str, message: str
+) -> None:
+    counter.metadata_props["me2e.recurrent"] = text
+
+    with pytest.raises(GraphError, match=message):
+        Session(counter)
+
+
+def test_state_of_open_shape_needs_a_first_value() -> None:
+    model = ir.from_onnx_text(COUNTER.replace("float[1,2]", "float[n,2]"))
+
+    with pytest.raises(GraphError, match="memory .*must stand in the frame that opens"):
+        list(replay(Session(model), [ones(0, True)]))
+
+
+def test_an_unknown_operator_is_named(counter: ir.Model) -> None:
+    plugin = ir.from_onnx_text(PLUGIN)
+
+    assert can_run(counter) is None
+    assert can_run(plugin) == "onnxruntime has no operator vendor::Rotate (node 'turn')"
+    with pytest.raises(GraphError, match="vendor::Rotate"):
+        Session(plugin)
+
+
+def test_a_wrong_shape_is_an_error_of_the_frame(counter: ir.Model) -> None:
+    wrong = {"x": np.ones((1, 3), np.float32), "memory": np.ones((1, 2), np.float32)}
+
+    with pytest.raises(FramesError, match="Got: 3 Expected: 2"):
+        Session(counter).run(wrong)
+
+
+def test_a_file_and_the_graph_in_memory_run_alike(
+    counter: ir.Model, tmp_path: Path
+) -> None:
+    path = tmp_path / "counter.onnx"
+    graph.save(counter, path)
+    feeds = {name: np.ones((1, 2), np.float32) for name in ("x", "memory")}
+
+    np.testing.assert_array_equal(
+        Session(path).run(feeds)["y"], Session(counter).run(feeds)["y"]
+    )
+
+
+def test_a_graph_with_weights_on_disk_runs(tmp_path: Path) -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    add (float[2] x) => (float[2] y) <float[2] w = {1.0, 2.0}> { y = Add(x, w) }
+    """
+    path = tmp_path / "add.onnx"
+    graph.save(ir.from_onnx_text(text), path, external=True)
+
+    y = run_once(graph.load(path), {"x": np.zeros(2, np.float32)})["y"]
+
+    np.testing.assert_array_equal(y, [1, 2])
+
+
+def test_what_no_input_changes_is_constant_and_can_be_computed() -> None:
+    model = ir.from_onnx_text("""
+    <ir_version: 9, opset_import: ["" : 17]>
+    layer (float[1,2] x) => (float[1,3] y, float[2] noise)
+    <float[3,2] w = {1.0, 2.0, 3.0, 4.0, 5.0, 6.0}> {
+        turned = Transpose(w)
+        y = MatMul(x, turned)
+        noise = RandomNormal<shape=[2]>()
+    }
+    """)
+
+    names = {value.name for value in constant_values(model)}
+
+    assert names == {"w", "turned"}
+    np.testing.assert_array_equal(
+        evaluate_constants(model, ["turned"])["turned"], [[1, 3, 5], [2, 4, 6]]
+    )
