@@ -1,0 +1,112 @@
+"""Remove what does nothing, or is there twice."""
+
+import dataclasses
+from collections import Counter
+from typing import ClassVar
+
+import onnx_ir as ir
+import onnx_ir.passes.common as common
+
+from me2e_compress import graph as graphs
+from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.edits import bypass, graphs_of, is_read, remove_dead
+from me2e_compress.passes.eliminate_redundant import sharing
+from me2e_compress.passes.eliminate_redundant.branches import inline_branch
+from me2e_compress.passes.eliminate_redundant.identities import identity_of
+from me2e_compress.passes.eliminate_redundant.merges import Site, merge
+
+__all__ = ["EliminateRedundant"]
+
+ROUNDS = 32
+"""Each round works on what the last one changed; real graphs need three or four."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EliminateRedundant:
+    """Remove nodes that change nothing, merge pairs, share what is equal.
+
+    Given:   x -> Identity -> Transpose -> Transpose -> y;  Add(a, b), Add(b, a)
+    Result:  x -> y;  one Add
+
+    Exact to the bit: x + 0.0 stays, since it turns -0.0 into +0.0.
+
+    Attributes:
+        across_modules: share equal nodes of different modules too; by default they
+            stay apart, so that a module can be taken out of the graph later. Equal
+            initializers are shared in any case.
+    """
+
+    name: ClassVar[str] = "eliminate-redundant"
+    exact: ClassVar[bool] = True
+    changes_interface: ClassVar[bool] = False
+    across_modules: bool = False
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Apply the rules until none applies, then drop what nothing reads."""
+        graphs.infer_shapes(model)
+        tally: Counter[str] = Counter()
+        tally["unread"] += remove_dead(model.graph)
+        for _ in range(ROUNDS):
+            before = tally.total()
+            for body in graphs_of(model.graph):
+                self._round(body, model.opset_imports, tally)
+            tally["unread"] += remove_dead(model.graph)
+            if tally.total() == before:
+                break
+        tally["functions and opsets"] += _remove_unused(model)
+        return PassResult(model, tally.total(), _notes(tally))
+
+    def _round(
+        self, body: ir.Graph, opsets: dict[str, int], tally: Counter[str]
+    ) -> None:
+        opset = opsets.get("", opsets.get("ai.onnx", 0))
+        site = Site(body, opset, self.name)
+        tally["initializers"] += sharing.share_initializers(body)
+        work = dict.fromkeys(reversed(list(body)))
+        while work:
+            node, _ = work.popitem()
+            if node.graph is body:
+                work.update(dict.fromkeys(self._visit(node, site, tally)))
+        tally["equal nodes"] += sharing.share_nodes(
+            body, self.name, across_modules=self.across_modules
+        )
+
+    def _visit(
+        self, node: ir.Node, site: Site, tally: Counter[str]
+    ) -> list[ir.Node]:
+        """Try the rules on one node; give the nodes to look at again."""
+        if not any(is_read(value) for value in node.outputs):
+            makers = list(node.predecessors())
+            site.graph.remove(node, safe=True)
+            tally["unread"] += 1
+            return makers
+        inlined = inline_branch(node, self.name)
+        if inlined is not None:
+            tally["branches"] += 1
+            return inlined
+        same = identity_of(node, site.opset)
+        if same is not None and bypass(node.outputs[0], same):
+            site.graph.remove(node, safe=True)
+            tally["identities"] += 1
+            return [use.node for use in same.uses()]
+        merged = merge(node, site)
+        if merged is None:
+            return []
+        tally["merged pairs"] += 1
+        return [merged, *merged.successors(), *merged.predecessors()]
+
+
+def _remove_unused(model: ir.Model) -> int:
+    def count() -> int:
+        bodies = (model, *model.functions.values())
+        return len(model.functions) + sum(len(one.opset_imports) for one in bodies)
+
+    before = count()
+    common.RemoveUnusedFunctionsPass()(model)
+    common.RemoveUnusedOpsetsPass()(model)
+    return before - count()
+
+
+def _notes(tally: Counter[str]) -> tuple[str, ...]:
+    found = [f"{count} {what}" for what, count in tally.items() if count]
+    return ("removed: " + ", ".join(found),) if found else ()

@@ -1,0 +1,73 @@
+"""An If whose condition is known is one of its branches."""
+
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, provenance, replace_value
+from me2e_compress.graph.rewrite import can_replace
+from me2e_compress.passes.edits import graphs_of
+
+
+def inline_branch(node: ir.Node, by: str) -> list[ir.Node] | None:
+    """Put the branch that will be taken in an If's place; give its nodes.
+
+    Where a branch hands on a value from outside as a graph output, the If stays.
+    """
+    graph = node.graph
+    chosen = array_of(node.inputs[0]) if node.inputs else None
+    if node.op_type != "If" or chosen is None or not isinstance(graph, ir.Graph):
+        return None
+    branch = node.attributes[
+        "then_branch" if chosen.reshape(-1)[0] else "else_branch"
+    ].as_graph()
+    results = list(branch.outputs)
+    if len(set(results)) < len(results):
+        return None
+    for old, new in zip(node.outputs, results, strict=True):
+        if old.is_graph_output() and new.producer() is None:
+            return None
+        if new.producer() is not None and new.graph is not branch:
+            if not can_replace(old, new):
+                return None
+    nodes = list(branch)
+    _move(branch, node, graph, by)
+    for old, new in zip(node.outputs, results, strict=True):
+        replace_value(old, new)
+    graph.remove(node, safe=True)
+    return nodes
+
+
+def _move(branch: ir.Graph, node: ir.Node, graph: ir.Graph, by: str) -> None:
+    names = _names(graph)
+    weights = list(branch.initializers.values())
+    nodes = list(branch)
+    branch.outputs.clear()
+    branch.initializers.clear()
+    branch.remove(nodes)
+    for value in weights:
+        value.name = _fresh(value.name or "weight", names)
+        if value.const_value is not None:
+            value.const_value.name = value.name
+        graph.register_initializer(value)
+    for inner in nodes:
+        for value in inner.outputs:
+            if value.name:
+                value.name = _fresh(value.name, names)
+        provenance.inherit(inner, (inner, node), by=by)
+    graph.insert_before(node, nodes)
+
+
+def _names(graph: ir.Graph) -> set[str]:
+    names = {value.name or "" for value in graph.inputs}
+    for body in graphs_of(graph):
+        names.update(body.initializers)
+        names.update(value.name or "" for node in body for value in node.outputs)
+    return names
+
+
+def _fresh(name: str, names: set[str]) -> str:
+    unique, count = name, 0
+    while unique in names:
+        count += 1
+        unique = f"{name}_{count}"
+    names.add(unique)
+    return unique

@@ -1,0 +1,231 @@
+"""Nodes that give back what they are given.
+
+Each rule names the value that a node's first output equals, bit for bit, or None.
+Adding +0.0 is no identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
+subtracting +0.0.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, static_shape
+from me2e_compress.passes.edits import Array, is_read, is_standard
+
+Rule = Callable[[ir.Node, int], ir.Value | None]
+
+OLDEST_OPSET = 7
+"""Broadcasting, Dropout and BatchNormalization followed other rules before."""
+
+
+def identity_of(node: ir.Node, opset: int) -> ir.Value | None:
+    """Name the value that a node only repeats; None if it does something."""
+    if not is_standard(node) or opset < OLDEST_OPSET or not node.outputs:
+        return None
+    rule = RULES.get(node.op_type)
+    if rule is None or any(is_read(value) for value in node.outputs[1:]):
+        return None
+    return rule(node, opset)
+
+
+def same_shape(one: ir.Value | None, other: ir.Value | None) -> bool:
+    """Say whether two values surely have the same shape."""
+    shape = static_shape(one)
+    return shape is not None and shape == static_shape(other)
+
+
+def _always(node: ir.Node, opset: int) -> ir.Value | None:
+    return node.inputs[0]
+
+
+def _if_same_shape(node: ir.Node, opset: int) -> ir.Value | None:
+    return node.inputs[0] if same_shape(node.inputs[0], node.outputs[0]) else None
+
+
+def _if_alone(node: ir.Node, opset: int) -> ir.Value | None:
+    return node.inputs[0] if len(node.inputs) == 1 else None
+
+
+def _split(node: ir.Node, opset: int) -> ir.Value | None:
+    return node.inputs[0] if len(node.outputs) == 1 else None
+
+
+def _dropout(node: ir.Node, opset: int) -> ir.Value | None:
+    if len(node.inputs) < 3 or node.inputs[2] is None:
+        return node.inputs[0]
+    training = array_of(node.inputs[2])
+    return node.inputs[0] if training is not None and not training.any() else None
+
+
+def _cast(node: ir.Node, opset: int) -> ir.Value | None:
+    source = node.inputs[0]
+    if source is None or source.dtype is None:
+        return None
+    return source if source.dtype == node.attributes.get_int("to", 0) else None
+
+
+def _cast_like(node: ir.Node, opset: int) -> ir.Value | None:
+    source, like = node.inputs
+    if source is None or like is None or source.dtype is None:
+        return None
+    return source if source.dtype == like.dtype else None
+
+
+def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
+    perm = node.attributes.get("perm")
+    order = list(perm.as_ints()) if perm is not None else None
+    if order is not None and order == sorted(order):
+        return node.inputs[0]
+    if moves_nothing(node) and same_shape(node.inputs[0], node.outputs[0]):
+        return node.inputs[0]
+    return None
+
+
+def moves_nothing(node: ir.Node) -> bool:
+    """Say whether a Transpose only moves axes of size 1, as a Reshape would."""
+    shape = static_shape(node.inputs[0])
+    if shape is None:
+        return False
+    perm = node.attributes.get("perm")
+    order = list(perm.as_ints()) if perm is not None else range(len(shape))[::-1]
+    real = [axis for axis in order if shape[axis] != 1]
+    return real == sorted(real)
+
+
+def _slice(node: ir.Node, opset: int) -> ir.Value | None:
+    if len(node.inputs) > 4 and node.inputs[4] is not None:
+        steps = array_of(node.inputs[4])
+        if steps is None or not np.all(steps == 1):
+            return None
+    return _if_same_shape(node, opset)
+
+
+def _pad(node: ir.Node, opset: int) -> ir.Value | None:
+    if "pads" in node.attributes:
+        return None if any(node.attributes["pads"].as_ints()) else node.inputs[0]
+    pads = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
+    return node.inputs[0] if pads is not None and not pads.any() else None
+
+
+def _clip(node: ir.Node, opset: int) -> ir.Value | None:
+    inner = _repeats(node, opset)
+    if inner is not None or opset < 11:
+        return inner
+    return None if any(node.inputs[1:]) else node.inputs[0]
+
+
+def _repeats(node: ir.Node, opset: int) -> ir.Value | None:
+    """Relu of Relu, Abs of Abs, ...: what is done twice is done."""
+    source = node.inputs[0]
+    inner = None if source is None else source.producer()
+    if inner is None or inner.op_type != node.op_type or inner.domain != node.domain:
+        return None
+    if tuple(inner.inputs[1:]) != tuple(node.inputs[1:]):
+        return None
+    return source if _attributes(inner) == _attributes(node) else None
+
+
+def _attributes(node: ir.Node) -> list[tuple[str, object]]:
+    return sorted((name, attr.value) for name, attr in node.attributes.items())
+
+
+def _undoes(node: ir.Node, opset: int) -> ir.Value | None:
+    """Not of Not, Neg of Neg: what is undone was not done."""
+    source = node.inputs[0]
+    inner = None if source is None else source.producer()
+    if inner is None or inner.op_type != node.op_type or inner.domain != node.domain:
+        return None
+    return inner.inputs[0]
+
+
+def _neutral(test: Callable[[Array], bool], *, either: bool) -> Rule:
+    """Build the rule of a binary operator with a neutral element."""
+
+    def rule(node: ir.Node, opset: int) -> ir.Value | None:
+        for kept, other in ((0, 1), (1, 0))[: 2 if either else 1]:
+            array = array_of(node.inputs[other])
+            source = node.inputs[kept]
+            if array is None or source is None or not array.size or not test(array):
+                continue
+            if source.dtype == node.outputs[0].dtype and _spreads(source, array, node):
+                return source
+        return None
+
+    return rule
+
+
+def _spreads(source: ir.Value, array: Array, node: ir.Node) -> bool:
+    """Say whether broadcasting the array leaves the other operand's shape."""
+    if same_shape(source, node.outputs[0]):
+        return True
+    return array.size == 1 and source.shape is not None and array.ndim <= len(
+        source.shape
+    )
+
+
+def _zero_added(array: Array) -> bool:
+    if array.dtype.kind in "iu":
+        return not array.any()
+    return array.dtype.kind == "f" and bool(np.all((array == 0) & np.signbit(array)))
+
+
+def _zero_taken(array: Array) -> bool:
+    if array.dtype.kind in "iu":
+        return not array.any()
+    return array.dtype.kind == "f" and bool(np.all((array == 0) & ~np.signbit(array)))
+
+
+def _one(array: Array) -> bool:
+    return array.dtype.kind in "iuf" and bool(np.all(array == 1))
+
+
+def _where(node: ir.Node, opset: int) -> ir.Value | None:
+    chosen = array_of(node.inputs[0])
+    if chosen is None or not chosen.size:
+        return None
+    if chosen.all() and same_shape(node.inputs[1], node.outputs[0]):
+        return node.inputs[1]
+    if not chosen.any() and same_shape(node.inputs[2], node.outputs[0]):
+        return node.inputs[2]
+    return None
+
+
+RULES: dict[str, Rule] = {
+    "Abs": _repeats,
+    "Add": _neutral(_zero_added, either=True),
+    "And": _neutral(lambda array: bool(array.all()), either=True),
+    "Cast": _cast,
+    "CastLike": _cast_like,
+    "Ceil": _repeats,
+    "Clip": _clip,
+    "Concat": _if_alone,
+    "Div": _neutral(_one, either=False),
+    "Dropout": _dropout,
+    "Expand": _if_same_shape,
+    "Flatten": _if_same_shape,
+    "Floor": _repeats,
+    "Identity": _always,
+    "Max": _if_alone,
+    "Mean": _if_alone,
+    "Min": _if_alone,
+    "Mul": _neutral(_one, either=True),
+    "Neg": _undoes,
+    "Not": _undoes,
+    "Or": _neutral(lambda array: not array.any(), either=True),
+    "Pad": _pad,
+    "Pow": _neutral(_one, either=False),
+    "Relu": _repeats,
+    "Reshape": _if_same_shape,
+    "Round": _repeats,
+    "Sign": _repeats,
+    "Slice": _slice,
+    "Split": _split,
+    "Squeeze": _if_same_shape,
+    "Sub": _neutral(_zero_taken, either=False),
+    "Sum": _if_alone,
+    "Tile": _if_same_shape,
+    "Transpose": _transpose,
+    "Unsqueeze": _if_same_shape,
+    "Where": _where,
+}

@@ -1,0 +1,258 @@
+"""Two nodes in a row that one node can do, exactly.
+
+Each rule rewrites the graph around a node and gives the node to look at again (where
+it came to nothing: itself, unread now), or None where nothing was to do.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, provenance, static_shape
+from me2e_compress.passes.edits import (
+    bypass,
+    constant_value,
+    is_standard,
+    put,
+    single_reader,
+)
+from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
+
+VIEWS = frozenset({"Flatten", "Reshape", "Squeeze", "Unsqueeze"})
+
+BROADCASTING = frozenset(
+    "Add And Div Equal Greater GreaterOrEqual Less LessOrEqual Max Min Mul Or Pow Sub"
+    " Where Xor".split()
+)
+
+WIDENS: dict[ir.DataType, str] = {
+    ir.DataType.BOOL: "UINT8 INT8 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
+    ir.DataType.UINT8: "UINT16 UINT32 UINT64 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
+    ir.DataType.INT8: "INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
+    ir.DataType.INT16: "INT32 INT64 FLOAT DOUBLE",
+    ir.DataType.INT32: "INT64 DOUBLE",
+    ir.DataType.UINT32: "INT64 UINT64 DOUBLE",
+    ir.DataType.FLOAT16: "FLOAT DOUBLE",
+    ir.DataType.FLOAT: "DOUBLE",
+}
+"""The types that hold every value of a type: a Cast there loses nothing."""
+
+
+@dataclasses.dataclass
+class Site:
+    """Where rules work: a graph, and constants made for it so far."""
+
+    graph: ir.Graph
+    opset: int
+    by: str
+    shapes: dict[tuple[int, ...], ir.Value] = dataclasses.field(default_factory=dict)
+
+    def shape(self, sizes: tuple[int, ...]) -> ir.Value:
+        """Give the initializer that holds a shape; one for every equal shape."""
+        value = self.shapes.get(sizes)
+        if value is None or value.graph is not self.graph:
+            name = "shape_" + "x".join(str(size) for size in sizes)
+            value = constant_value(self.graph, np.array(sizes, np.int64), name)
+            self.shapes[sizes] = value
+        return value
+
+
+Rule = Callable[[ir.Node, Site], ir.Node | None]
+
+
+def merge(node: ir.Node, site: Site) -> ir.Node | None:
+    """Merge a node with the one before it, if one node can do both."""
+    if not is_standard(node):
+        return None
+    if node.op_type in BROADCASTING:
+        return _drop_expand(node, site)
+    if node.op_type in VIEWS or node.op_type == "Transpose":
+        return _views(node, site) or (
+            _transposes(node, site) if node.op_type == "Transpose" else None
+        )
+    rule = RULES.get(node.op_type)
+    return None if rule is None else rule(node, site)
+
+
+def _before(node: ir.Node, index: int = 0) -> ir.Node | None:
+    """Give the standard node that makes an input, in the same graph."""
+    value = node.inputs[index]
+    inner = None if value is None else value.producer()
+    if inner is None or not is_standard(inner) or inner.graph is not node.graph:
+        return None
+    return inner
+
+
+def _is_view(node: ir.Node) -> bool:
+    if node.op_type == "Transpose":
+        return moves_nothing(node)
+    return node.op_type in VIEWS
+
+
+def _views(node: ir.Node, site: Site) -> ir.Node | None:
+    """Reshape, Flatten, Squeeze and Unsqueeze in a row are one Reshape, or nothing."""
+    inner, sizes = _before(node), static_shape(node.outputs[0])
+    if inner is None or sizes is None or 0 in sizes or site.opset < 5:
+        return None
+    if not _is_view(node) or not _is_view(inner):
+        return None
+    source = inner.inputs[0]
+    if source is None:
+        return None
+    if static_shape(source) == sizes and bypass(node.outputs[0], source):
+        return node
+    if single_reader(inner.outputs[0]) is None:
+        return None
+    shape = site.shape(sizes)
+    return put(node, "Reshape", [source, shape], by=site.by, sources=[inner])
+
+
+def _transposes(node: ir.Node, site: Site) -> ir.Node | None:
+    inner = _before(node)
+    if inner is None or inner.op_type != "Transpose":
+        return None
+    outer_perm, inner_perm = _perm(node), _perm(inner)
+    if outer_perm is None or inner_perm is None:
+        return None
+    perm = [inner_perm[axis] for axis in outer_perm]
+    source = inner.inputs[0]
+    if source is None:
+        return None
+    if perm == sorted(perm) and bypass(node.outputs[0], source):
+        return node
+    if single_reader(inner.outputs[0]) is None:
+        return None
+    return put(
+        node,
+        "Transpose",
+        [source],
+        by=site.by,
+        sources=[inner],
+        attributes={"perm": perm},
+    )
+
+
+def _perm(node: ir.Node) -> list[int] | None:
+    perm = node.attributes.get("perm")
+    if perm is not None:
+        return [int(axis) for axis in perm.as_ints()]
+    shape = node.inputs[0].shape if node.inputs[0] is not None else None
+    return None if shape is None else list(range(len(shape)))[::-1]
+
+
+def _casts(node: ir.Node, site: Site) -> ir.Node | None:
+    inner = _before(node)
+    if inner is None or inner.op_type != "Cast" or inner.inputs[0] is None:
+        return None
+    source, middle = inner.inputs[0].dtype, inner.outputs[0].dtype
+    if source is None or middle is None:
+        return None
+    if middle.name not in WIDENS.get(source, "").split():
+        return None
+    if single_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
+        return None
+    attributes: dict[str, int | float | str | list[int]] = {
+        "to": node.attributes.get_int("to", 0)
+    }
+    return put(
+        node, "Cast", inner.inputs[:1], by=site.by, sources=[inner], attributes=attributes
+    )
+
+
+def _slices(node: ir.Node, site: Site) -> ir.Node | None:
+    """Slices of different axes are one Slice."""
+    inner = _before(node)
+    if inner is None or inner.op_type != "Slice" or site.opset < 10:
+        return None
+    if single_reader(inner.outputs[0]) is None:
+        return None
+    first, second = _window(inner), _window(node)
+    if first is None or second is None or set(first[2]) & set(second[2]):
+        return None
+    name = node.outputs[0].name or ""
+    inputs = [
+        constant_value(site.graph, np.array([*one, *two], np.int64), f"{name}_{part}")
+        for part, one, two in zip(
+            ("starts", "ends", "axes", "steps"), first, second, strict=True
+        )
+    ]
+    if all(step == 1 for step in (*first[3], *second[3])):
+        del site.graph.initializers[inputs.pop().name or ""]
+    return put(node, "Slice", [inner.inputs[0], *inputs], by=site.by, sources=[inner])
+
+
+def _window(node: ir.Node) -> list[list[int]] | None:
+    """Give starts, ends, axes (from the front) and steps, if all are constant."""
+    rank = None if node.outputs[0].shape is None else len(node.outputs[0].shape)
+    given = [array_of(value) for value in node.inputs[1:]]
+    if rank is None or len(given) < 2 or any(array is None for array in given[:2]):
+        return None
+    for array, value in zip(given[2:], node.inputs[3:], strict=True):
+        if array is None and value is not None:
+            return None
+    lists = [None if array is None else array.tolist() for array in given]
+    starts, ends = lists[0], lists[1]
+    axes = lists[2] if len(lists) > 2 and lists[2] is not None else range(len(starts))
+    steps = lists[3] if len(lists) > 3 and lists[3] is not None else [1] * len(starts)
+    return [starts, ends, [axis % rank for axis in axes], steps]
+
+
+def _concats(node: ir.Node, site: Site) -> ir.Node | None:
+    axis = node.attributes.get_int("axis", 0)
+    inputs: list[ir.Value | None] = []
+    inner_nodes: list[ir.Node] = []
+    for index, value in enumerate(node.inputs):
+        inner = _before(node, index)
+        if (
+            inner is not None
+            and inner.op_type == "Concat"
+            and inner.attributes.get_int("axis", 0) == axis
+            and single_reader(inner.outputs[0]) is node
+        ):
+            inputs.extend(inner.inputs)
+            inner_nodes.append(inner)
+        else:
+            inputs.append(value)
+    if not inner_nodes:
+        return None
+    return put(
+        node,
+        "Concat",
+        inputs,
+        by=site.by,
+        sources=inner_nodes,
+        attributes={"axis": axis},
+    )
+
+
+def _drop_expand(node: ir.Node, site: Site) -> ir.Node | None:
+    """An Expand (or a Tile that only repeats) before what broadcasts anyway."""
+    target = static_shape(node.outputs[0])
+    if target is None or site.opset < 8:
+        return None
+    for index, value in enumerate(node.inputs):
+        inner = _before(node, index)
+        if inner is None or inner.op_type not in ("Expand", "Tile"):
+            continue
+        source = inner.inputs[0]
+        small, large = static_shape(source), static_shape(value)
+        if small is None or large is None or not _broadcasts(small, large):
+            continue
+        others = [static_shape(other) for other in node.inputs]
+        others[index] = small
+        shapes = [shape for shape in others if shape is not None]
+        if len(shapes) == len(others) and np.broadcast_shapes(*shapes) == target:
+            node.replace_input_with(index, source)
+            provenance.inherit(node, (node, inner), by=site.by)
+            return node
+    return None
+
+
+def _broadcasts(small: tuple[int, ...], large: tuple[int, ...]) -> bool:
+    pairs = zip(small[::-1], large[::-1], strict=False)
+    return len(small) <= len(large) and all(one in (1, two) for one, two in pairs)
+
+
+RULES: dict[str, Rule] = {"Cast": _casts, "Concat": _concats, "Slice": _slices}

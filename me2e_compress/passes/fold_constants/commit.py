@@ -1,0 +1,88 @@
+"""Write into the graph what folding found."""
+
+import onnx_ir as ir
+
+from me2e_compress.graph import replace_value
+from me2e_compress.passes.edits import Array, constant_value, put
+from me2e_compress.passes.fold_constants.choice import Choice
+
+
+def lift_constants(graph: ir.Graph, name: str) -> int:
+    """Turn Constant nodes into initializers of the same name; count them."""
+    count = 0
+    for node in graph:
+        if node.op_type != "Constant" or node.domain not in ("", "ai.onnx"):
+            continue
+        value = node.outputs[0]
+        if "sparse_value" in node.attributes or value.is_graph_output():
+            continue
+        tensor = ir.convenience.get_const_tensor(value)
+        if tensor is None:
+            continue
+        graph.remove(node)
+        weight = ir.Value(
+            name=value.name,
+            shape=ir.Shape(tensor.shape),
+            type=ir.TensorType(tensor.dtype),
+            const_value=tensor,
+        )
+        value.replace_all_uses_with(weight)
+        graph.register_initializer(weight)
+        count += 1
+    return count
+
+
+def commit(
+    graph: ir.Graph, choice: Choice, arrays: dict[ir.Value, Array], name: str
+) -> list[ir.Value]:
+    """Put initializers in the place of the chosen values and drop their makers.
+
+    A folded tensor takes the name of the value it replaces. A graph output cannot be
+    an initializer for every runtime: an Identity hands it on. Gives the initializers.
+    """
+    stored = _Store(graph)
+    place = {
+        value: (one, index)
+        for one in choice.gone
+        for index, value in enumerate(one.nodes[0].outputs)
+    }
+    for value in choice.values:
+        one, index = place[value]
+        weight = stored.add(arrays[value], value.name or "")
+        for node in one.nodes:
+            equal = node.outputs[index]
+            if equal.is_graph_output():
+                _answer(graph, node, equal, weight, name)
+            else:
+                equal.replace_all_uses_with(weight)
+    for one in reversed(choice.gone):
+        graph.remove([node for node in one.nodes if node.graph is graph], safe=True)
+    return list(stored.known.values())
+
+
+class _Store:
+    """Gives equal small arrays one initializer."""
+
+    def __init__(self, graph: ir.Graph) -> None:
+        self.graph = graph
+        self.known: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
+
+    def add(self, array: Array, name: str) -> ir.Value:
+        key = (str(array.dtype), array.shape, array.tobytes())
+        if key not in self.known:
+            self.known[key] = constant_value(self.graph, array, name)
+        return self.known[key]
+
+
+def _answer(
+    graph: ir.Graph, node: ir.Node, value: ir.Value, weight: ir.Value, name: str
+) -> None:
+    if len(node.outputs) == 1:
+        put(node, "Identity", [weight], by=name)
+        return
+    answer = ir.node("Identity", [weight], num_outputs=1, name=f"{node.name}_answer")
+    graph.insert_after(node, answer)
+    answer.metadata_props.update(node.metadata_props)
+    new = answer.outputs[0]
+    new.name, new.type, new.shape = value.name, value.type, value.shape
+    replace_value(value, new)

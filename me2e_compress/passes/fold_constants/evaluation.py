@@ -1,0 +1,147 @@
+"""Compute constant expressions with onnxruntime: all at once, or one by one."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+import onnxruntime
+from onnxruntime.capi import onnxruntime_pybind11_state as failures
+
+from me2e_compress.graph import array_of
+from me2e_compress.passes.edits import NATIVE, Array
+from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
+
+FAILURES = (
+    failures.Fail,
+    failures.InvalidArgument,
+    failures.InvalidGraph,
+    failures.NotImplemented,
+    failures.RuntimeException,
+)
+SILENT = 4
+"""onnxruntime's log level "fatal": what cannot be evaluated is said in the notes."""
+
+
+def evaluate(
+    values: Sequence[ir.Value], known: Knowledge, opsets: Mapping[str, int]
+) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
+    """Compute values; give them, and the nodes that the runtime would not run.
+
+    One session over everything that leads to the values; where that fails, a session
+    a node, so that one unsupported operator does not spoil the rest.
+    """
+    needed = _needed(values, known)
+    if not needed:
+        return {}, []
+    try:
+        return _run(needed, list(values), known.arrays, known, opsets), []
+    except FAILURES:
+        return _one_by_one(needed, values, known, opsets)
+
+
+def _one_by_one(
+    needed: Sequence[Expression],
+    values: Sequence[ir.Value],
+    known: Knowledge,
+    opsets: Mapping[str, int],
+) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
+    done: dict[ir.Value, Any] = dict(known.arrays)
+    refused: list[ir.Node] = []
+    for one in needed:
+        outputs = [value for value in one.nodes[0].outputs if value.name]
+        inputs = [value for value in one.inputs if value is not None]
+        if any(value in known.maker and value not in done for value in inputs):
+            continue
+        try:
+            done.update(_run([one], outputs, done, known, opsets))
+        except FAILURES:
+            refused.extend(one.nodes)
+    found = {value: done[value] for value in values if value in done}
+    return found, refused
+
+
+def _needed(values: Sequence[ir.Value], known: Knowledge) -> list[Expression]:
+    wanted = {known.maker[value] for value in values}
+    for one in reversed(known.expressions):
+        if one in wanted:
+            wanted.update(
+                known.maker[value]
+                for value in one.inputs
+                if value in known.maker and value not in known.arrays
+            )
+    return [one for one in known.expressions if one in wanted]
+
+
+def _run(
+    expressions: Sequence[Expression],
+    values: Sequence[ir.Value],
+    arrays: Mapping[ir.Value, Any],
+    known: Knowledge,
+    opsets: Mapping[str, int],
+) -> dict[ir.Value, Any]:
+    names: dict[ir.Value, str] = {}
+    feeds: dict[str, Any] = {}
+    nodes = [_node(one, names, feeds, arrays) for one in expressions]
+    model = onnx.helper.make_model(
+        onnx.helper.make_graph(
+            nodes,
+            "constants",
+            [_port(name, array) for name, array in feeds.items()],
+            [onnx.ValueInfoProto(name=names[value]) for value in values],
+        ),
+        opset_imports=[onnx.helper.make_opsetid(*item) for item in opsets.items()],
+        ir_version=8,
+    )
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = (
+        onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    )
+    options.intra_op_num_threads = 1
+    options.log_severity_level = SILENT
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+    run = onnxruntime.RunOptions()
+    run.log_severity_level = SILENT
+    outputs = session.run([names[value] for value in values], feeds, run)
+    return dict(zip(values, outputs, strict=True))
+
+
+def _node(
+    one: Expression,
+    names: dict[ir.Value, str],
+    feeds: dict[str, Any],
+    arrays: Mapping[ir.Value, Any],
+) -> onnx.NodeProto:
+    """Write one expression's node, with names of its own; note what must be fed."""
+    proto = ir.serde.serialize_node(one.nodes[0])
+    del proto.input[:], proto.output[:], proto.metadata_props[:]
+    for value in one.inputs:
+        if value is None:
+            proto.input.append("")
+            continue
+        if value not in names:
+            names[value] = f"v{len(names)}"
+            array = arrays.get(value)
+            feeds[names[value]] = array_of(value) if array is None else array
+        proto.input.append(names[value])
+    for value in one.nodes[0].outputs:
+        if value.name:
+            names[value] = f"v{len(names)}"
+        proto.output.append(names[value] if value.name else "")
+    return proto
+
+
+def _port(name: str, array: Array) -> onnx.ValueInfoProto:
+    kind = onnx.helper.np_dtype_to_tensor_dtype(np.dtype(array.dtype))
+    return onnx.helper.make_tensor_value_info(name, kind, array.shape)
+
+
+def is_storable(value: object) -> bool:
+    """Say whether an evaluated value can be an initializer."""
+    return (
+        isinstance(value, np.ndarray)
+        and ir.DataType.from_numpy(value.dtype) in NATIVE
+    )

@@ -1,0 +1,250 @@
+"""One forward sweep: which values of a graph are known before it runs."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, static_shape
+from me2e_compress.passes.edits import NATIVE, Array, has_subgraph, is_standard
+from me2e_compress.passes.fold_constants import table
+from me2e_compress.passes.fold_constants.inference import infer_node
+
+SMALL = 1024
+"""Arrays up to so many elements are computed at once: shapes and indices are."""
+
+NEVER = frozenset(
+    {
+        "Bernoulli",
+        "Constant",
+        "DequantizeLinear",
+        "DynamicQuantizeLinear",
+        "Multinomial",
+        "QuantizeLinear",
+        "RandomNormal",
+        "RandomNormalLike",
+        "RandomUniform",
+        "RandomUniformLike",
+    }
+)
+"""Random operators, and quantization, which says how to run and not what to compute."""
+
+COMPUTE = frozenset(
+    {"Conv", "ConvTranspose", "Einsum", "Gemm", "GridSample", "MatMul", "Softmax"}
+)
+"""Operators through which folding turns a computation into a weight."""
+
+
+@dataclasses.dataclass(eq=False)
+class Expression:
+    """Equal nodes that read nothing but constants; the first speaks for all.
+
+    Attributes:
+        nodes: the nodes, in graph order.
+        inputs: what the first reads, each value replaced by its first equal.
+    """
+
+    nodes: list[ir.Node]
+    inputs: tuple[ir.Value | None, ...]
+
+
+@dataclasses.dataclass
+class Knowledge:
+    """What is known about the values of one graph.
+
+    Attributes:
+        arrays: the values that are known as arrays, initializers included.
+        expressions: the constant nodes, in graph order, equal ones together.
+        maker: the expression that makes a value.
+        first: for a value made twice, the first that equals it.
+    """
+
+    arrays: dict[ir.Value, Array]
+    expressions: list[Expression]
+    maker: dict[ir.Value, Expression]
+    first: dict[ir.Value, ir.Value]
+
+    def canonical(self, value: ir.Value) -> ir.Value:
+        """Give the first value equal to this one."""
+        return self.first.get(value, value)
+
+
+class Sweep:
+    """Walks one graph in order and gathers its constant expressions."""
+
+    def __init__(
+        self,
+        opsets: Mapping[str, int],
+        refused: set[ir.Node],
+        fresh: set[ir.Value],
+        *,
+        through_compute: bool,
+        trust_shapes: bool,
+    ) -> None:
+        """Set up.
+
+        Args:
+            opsets: the model's.
+            refused: nodes that nobody here can evaluate.
+            fresh: initializers that ONNX's own inference has not seen yet.
+            through_compute: whether convolutions, products and the like may be constant.
+            trust_shapes: False inside loops, where a shape may change every round.
+        """
+        self.opsets = opsets
+        self.opset = opsets.get("", opsets.get("ai.onnx", 0))
+        self.refused = refused
+        self.through_compute = through_compute
+        self.trust_shapes = trust_shapes
+        self.known = Knowledge({}, [], {}, {})
+        self.learnt = set(fresh)
+        self.keys: dict[object, Expression] = {}
+
+    def run(self, graph: ir.Graph) -> Knowledge:
+        """Visit every node once, producers before readers."""
+        for node in graph:
+            if self._is_shape(node) or self._is_constant(node):
+                self._infer(node)
+                self._add(node)
+            elif self._touched(node):
+                self._infer(node)
+        return self.known
+
+    def _is_shape(self, node: ir.Node) -> bool:
+        return (
+            self.trust_shapes
+            and is_standard(node)
+            and node.op_type in ("Shape", "Size")
+            and node not in self.refused
+            and static_shape(node.inputs[0]) is not None
+        )
+
+    def _is_constant(self, node: ir.Node) -> bool:
+        if node in self.refused or node.op_type in NEVER or not is_standard(node):
+            return False
+        if node.op_type in COMPUTE and not self.through_compute:
+            return False
+        if node.op_type == "Dropout" and not _is_inference(node, self.opset):
+            return False
+        if has_subgraph(node) or not node.inputs or _is_answer(node):
+            return False
+        return all(value is None or self._known(value) for value in node.inputs)
+
+    def _known(self, value: ir.Value) -> bool:
+        if value in self.known.maker:
+            return True
+        if value.is_graph_input() or not value.is_initializer():
+            return False
+        if value.const_value is None or value.const_value.dtype not in NATIVE:
+            return False
+        if value not in self.known.arrays and value.const_value.size <= SMALL:
+            array = array_of(value)
+            if array is not None:
+                self.known.arrays[value] = array
+        return True
+
+    def _touched(self, node: ir.Node) -> bool:
+        if all(value.shape is not None and value.shape.is_static() for value in node.outputs):
+            return False
+        return any(
+            value in self.learnt or value in self.known.maker
+            for value in node.inputs
+            if value is not None
+        )
+
+    def _infer(self, node: ir.Node) -> None:
+        outputs = node.outputs
+        if all(static_shape(v) is not None and v.type is not None for v in outputs):
+            return
+        for value in node.inputs:
+            if value is not None:
+                self._known(value)
+        if infer_node(node, self.known.arrays, self.opsets):
+            self.learnt.update(outputs)
+
+    def _add(self, node: ir.Node) -> None:
+        """Enter a constant node, beside its equals if it has any."""
+        if not all(_is_native(value) for value in node.outputs if value.name):
+            return
+        small = self._evaluate(node)
+        inputs = tuple(
+            None if value is None else self.known.canonical(value)
+            for value in node.inputs
+        )
+        key = _key(node, inputs)
+        equal = self.keys.get(key)
+        if equal is None:
+            equal = Expression([], inputs)
+            self.keys[key] = equal
+            self.known.expressions.append(equal)
+        equal.nodes.append(node)
+        for first, value in zip(equal.nodes[0].outputs, node.outputs, strict=True):
+            self.known.maker[value] = equal
+            if value is not first:
+                self.known.first[value] = first
+            if small is not None:
+                self.known.arrays[value] = small
+                if value.shape is None and not value.is_graph_output():
+                    value.shape = ir.Shape(small.shape)
+
+    def _evaluate(self, node: ir.Node) -> Array | None:
+        if len(node.outputs) != 1:
+            return None
+        if node.op_type in ("Shape", "Size"):
+            shape = static_shape(node.inputs[0])
+            return None if shape is None else _shape(node, shape)
+        expected = static_shape(node.outputs[0])
+        if expected is None or math.prod(expected) > SMALL:
+            return None
+        inputs = [
+            None if value is None else self.known.arrays.get(value)
+            for value in node.inputs
+        ]
+        if any(
+            array is None and value is not None
+            for array, value in zip(inputs, node.inputs, strict=True)
+        ):
+            return None
+        result = table.evaluate(node, inputs, self.opset)
+        return result if result is None or result.shape == expected else None
+
+
+def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
+    if node.op_type == "Size":
+        return np.array(math.prod(shape), dtype=np.int64)
+    start = node.attributes.get_int("start", 0)
+    end = node.attributes.get_int("end", len(shape))
+    rank = len(shape)
+    start = min(max(start + rank if start < 0 else start, 0), rank)
+    end = min(max(end + rank if end < 0 else end, 0), rank)
+    return np.array(shape[start:end], dtype=np.int64)
+
+
+def _is_answer(node: ir.Node) -> bool:
+    """Say whether a node only hands an initializer on to a graph output."""
+    if node.op_type != "Identity" or not node.outputs[0].is_graph_output():
+        return False
+    return node.inputs[0] is not None and node.inputs[0].is_initializer()
+
+
+def _is_native(value: ir.Value) -> bool:
+    if isinstance(value.type, ir.SequenceType | ir.OptionalType):
+        return value.type.elem_type.dtype in NATIVE
+    return value.dtype in NATIVE
+
+
+def _is_inference(node: ir.Node, opset: int) -> bool:
+    return opset >= 7 and (len(node.inputs) < 3 or node.inputs[2] is None)
+
+
+def _key(node: ir.Node, inputs: tuple[ir.Value | None, ...]) -> object:
+    attributes = [
+        ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
+            deterministic=True
+        )
+        for name in sorted(node.attributes)
+    ]
+    return (node.op_type, inputs, len(node.outputs), tuple(attributes))
+
+
