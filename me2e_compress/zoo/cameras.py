@@ -4,13 +4,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from me2e_compress.zoo.world import Box, Pose, World
 
-Array = NDArray[np.float32]
+Array = NDArray[np.floating[Any]]
 
 SCALE = 0.4
 """VAD-tiny sees 1600 x 900 images at this scale."""

@@ -15,11 +15,11 @@ COUNTED = (aten.convolution, aten.mm, aten.addmm, aten.bmm, aten.baddbmm)
 FLOPS_PER_MAC = 2
 
 
-class MacCounter(TorchDispatchMode):
+class MacCounter(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Tell a function the multiply-accumulates of every product that runs inside."""
 
     def __init__(self, add: Callable[[int], None]) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self._add = add
 
     def __torch_dispatch__(

@@ -1,7 +1,6 @@
 """Write a stack of the zoo as ONNX."""
 
 import importlib.util
-import io
 import os
 import tempfile
 import warnings
@@ -87,8 +86,10 @@ def build(
         raise MissingExtraError("torch", "zoo")
     from me2e_compress.zoo.vad.build import build as build_vad
 
-    sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
-    return build_vad(seed=seed, heads=heads, sampling=sampling)
+    native = opset >= GRID_SAMPLE_OPSET
+    return build_vad(
+        seed=seed, heads=heads, sampling="operator" if native else "gather"
+    )
 
 
 def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
@@ -99,19 +100,23 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
     """
     import torch
 
-    buffer = io.BytesIO()
-    with _quiet_exporter(), torch.no_grad():
+    with (
+        tempfile.TemporaryDirectory(prefix="me2e-trace-") as folder,
+        _quiet_exporter(),
+        torch.no_grad(),
+    ):
+        file = Path(folder) / "traced.onnx"
         torch.onnx.export(
             model,
             example(spec),
-            buffer,
+            file,
             dynamo=False,
             opset_version=opset,
             do_constant_folding=False,
             input_names=list(spec.inputs),
             output_names=list(spec.outputs),
         )
-    graph = onnx.load_from_string(buffer.getvalue())
+        graph = onnx.load(file)
     written = {entry.domain: entry.version for entry in graph.opset_import}
     if written != {"": opset}:
         raise GraphError(f"{spec.name}: asked for opset {opset}, torch wrote {written}")

@@ -88,18 +88,17 @@ def frames(spec: Stack, n: int, seed: int, scene_length: int = 8) -> Iterator[Fr
     if n < 1 or scene_length < 1:
         raise FramesError(f"{n} frames in scenes of {scene_length}: both must be >= 1")
     lidar2img = np.stack([camera.lidar2img() for camera in rig()])[None]
-    for index in range(n):
-        scene, step = divmod(index, scene_length)
-        if step == 0:
-            world = draw_world(np.random.default_rng([seed, scene]))
-        noise = np.random.default_rng([seed, scene, step + 1])
-        seconds = step * FRAME_S
-        seen = render(world, world.ego(seconds), world.boxes_at(seconds))
-        yield {
-            "img": _normalise(spec, seen, noise),
-            "lidar2img": lidar2img,
-            "can_bus": _can_bus(world, step),
-        }
+    for scene, start in enumerate(range(0, n, scene_length)):
+        world = draw_world(np.random.default_rng([seed, scene]))
+        for step in range(min(scene_length, n - start)):
+            noise = np.random.default_rng([seed, scene, step + 1])
+            seconds = step * FRAME_S
+            seen = render(world, world.ego(seconds), world.boxes_at(seconds))
+            yield {
+                "img": _normalise(spec, seen, noise),
+                "lidar2img": lidar2img,
+                "can_bus": _can_bus(world, step),
+            }
 
 
 def _normalise(
@@ -108,7 +107,8 @@ def _normalise(
     """[6, h, w, 3] RGB pixels to the image input, padded with zeros below."""
     grain = noise.normal(0, SENSOR_NOISE, seen.shape[:3])[..., None]
     pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
-    mean, std = np.float32(spec.image.mean), np.float32(spec.image.std)
+    mean = np.array(spec.image.mean, np.float32)
+    std = np.array(spec.image.std, np.float32)
     out = np.zeros(spec.inputs["img"], np.float32)
     height, width = seen.shape[1:3]
     out[0, :, :, :height, :width] = ((pixels - mean) / std).transpose(0, 3, 1, 2)

@@ -8,6 +8,9 @@ from me2e_compress.zoo.world import LANE_M, LANES, TILE, Box, World
 
 Range = tuple[float, float]
 
+TINT = 22.0
+"""Standard deviation of a colour around its grey, in 1 / 255."""
+
 
 def draw_world(rng: np.random.Generator) -> World:
     """A road with 8 to 12 vehicles, parked ones, buildings, people and cones."""
@@ -38,7 +41,8 @@ def _place(bend: float, along: float, aside: float) -> tuple[float, float, float
 
 
 def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, float]:
-    red, green, blue = rng.uniform(*bounds, 3)
+    """Mostly grey, as cars and houses are."""
+    red, green, blue = np.clip(rng.uniform(*bounds) + rng.normal(0, TINT, 3), 0, 255)
     return float(red), float(green), float(blue)
 
 

@@ -1,3 +1,4 @@
+import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -130,15 +131,15 @@ def test_opsets_that_do_not_work_are_refused(tmp_path: Path, opset: int) -> None
 def test_another_opset_in_the_file_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    load = onnx.load_from_string
+    load = onnx.load
 
-    def other(data: bytes) -> onnx.ModelProto:
-        model = load(data)
+    def other(file: Path) -> onnx.ModelProto:
+        model = load(file)
         model.opset_import[0].version = 18
         return model
 
     monkeypatch.setattr(exporting, "build", lambda stack, **_: torch.nn.ReLU())
-    monkeypatch.setattr(exporting.onnx, "load_from_string", other)
+    monkeypatch.setattr(onnx, "load", other)
     monkeypatch.setattr(exporting, "find", lambda name: TINY)
     with pytest.raises(GraphError, match="asked for opset 17, torch wrote"):
         export("tiny", tmp_path / "x.onnx")
@@ -151,6 +152,6 @@ def test_unknown_stack(tmp_path: Path) -> None:
 
 
 def test_without_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exporting.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"me2e-compress\[zoo\]"):
         export("vad-tiny", tmp_path / "x.onnx")

@@ -108,7 +108,7 @@ def test_front_camera_looks_ahead_and_left_is_left() -> None:
 
 def test_pose_round_trip() -> None:
     pose = Pose(3.0, -2.0, 0.7)
-    right, ahead = np.float32([1.5]), np.float32([8.0])
+    right, ahead = np.array([1.5], np.float32), np.array([8], np.float32)
     back = pose.to_lidar(*pose.to_world(right, ahead))
     assert back[0] == pytest.approx(right, abs=1e-5)
     assert back[1] == pytest.approx(ahead, abs=1e-5)

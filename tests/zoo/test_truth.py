@@ -1,4 +1,6 @@
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import onnx
@@ -91,12 +93,14 @@ def test_products_outside_of_every_region_are_an_error(
 def test_listeners_nest_and_leave() -> None:
     heard: list[str] = []
 
-    def listener(module: str) -> "nn.Module":
+    @contextmanager
+    def listener(module: str) -> Iterator[None]:
         heard.append(module)
-        raise LookupError(module)
+        yield
+        heard.append(f"end of {module}")
 
-    with pytest.raises(LookupError), listening(listener), region("det"):  # type: ignore[arg-type]
+    with listening(listener), region("det"), region("map"):
         pass
-    with region("map"):
+    with region("motion"):
         pass
-    assert heard == ["det"]
+    assert heard == ["det", "map", "end of map", "end of det"]

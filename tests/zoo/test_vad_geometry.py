@@ -1,4 +1,5 @@
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -65,12 +66,13 @@ def test_half_pillar_projects_to_the_pixel() -> None:
 
 @pytest.mark.parametrize("mode", ["bilinear", "nearest"])
 @pytest.mark.parametrize("seed", range(3))
-def test_gathers_say_the_same_as_grid_sample(mode: str, seed: int) -> None:
+def test_gathers_say_the_same_as_grid_sample(
+    mode: Literal["bilinear", "nearest"], seed: int
+) -> None:
     generator = torch.Generator().manual_seed(seed)
     image = torch.randn(2, 3, 5, 7, generator=generator)
     grid = torch.rand(2, 6, 4, 2, generator=generator) * 3 - 1.5
-    kind = "bilinear" if mode == "bilinear" else "nearest"
-    gathered = sample(image, grid, "gather", kind)
+    gathered = sample(image, grid, "gather", mode)
     operator = functional.grid_sample(image, grid, mode=mode, align_corners=False)
     assert torch.allclose(gathered, operator, atol=1e-5)
 

@@ -1,7 +1,8 @@
 from collections import Counter
+from pathlib import Path
 
+import onnx
 import pytest
-import torch
 from torch import nn
 
 from me2e_compress.zoo.vad.config import HeadsName
@@ -134,7 +135,8 @@ def test_tensors_are_pairwise_distinct(vad_torch: VadTiny) -> None:
 
 def test_attention_blocks_have_the_published_sizes() -> None:
     layer = VadTiny().pts_bbox_head.transformer.encoder.layers[0]
-    sizes = [_size(block) for block in (*layer.attentions, layer.ffns[0], layer)]
+    blocks = ("attentions.0", "attentions.1", "ffns.0", "")
+    sizes = [_size(layer.get_submodule(block)) for block in blocks]
     assert sizes == [230_080, 180_928, 262_912, 675_456]
 
 
@@ -142,9 +144,8 @@ def _size(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def test_same_seed_same_bytes(vad_torch: VadTiny) -> None:
-    from me2e_compress.zoo.vad.build import build
-
-    again = build(seed=0).state_dict()
-    for name, tensor in vad_torch.state_dict().items():
-        assert torch.equal(tensor, again[name]), name
+def test_same_seed_same_bytes(vad_torch: VadTiny, vad_tiny: Path) -> None:
+    """The export was built by itself, so its weights are a second draw."""
+    weights = vad_torch.state_dict()
+    for tensor in onnx.load(vad_tiny).graph.initializer:
+        assert tensor.raw_data == weights[tensor.name].numpy().tobytes(), tensor.name

@@ -94,7 +94,8 @@ class FeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[..., 256] -> [..., 256]."""
-        return x + self.layers(x)
+        out: Tensor = x + self.layers(x)
+        return out
 
 
 def deformable_attention(
@@ -164,4 +165,5 @@ class DecoderAttention(nn.Module):
         weights = weights.view(batch, queries, ATTENTION_HEADS, 1, self.points)
         locations = at[:, :, None, None, None, :] + offsets / self.size_xy
         out = deformable_attention(value, self.hw, locations, weights, self.sampling)
-        return query + self.output_proj(out)
+        read: Tensor = self.output_proj(out)
+        return query + read

@@ -34,7 +34,8 @@ class Bottleneck(nn.Module):
         x = self.relu(self.bn1(self.conv1(x)))
         x = self.relu(self.bn2(self.conv2(x)))
         x = self.bn3(self.conv3(x)) + shortcut
-        return self.relu(x)
+        out: Tensor = self.relu(x)
+        return out
 
 
 class ResNet50(nn.Module):
@@ -59,4 +60,5 @@ class ResNet50(nn.Module):
         x = self.maxpool(self.relu(self.bn1(self.conv1(images))))
         for number in range(1, len(STAGES) + 1):
             x = self.get_submodule(f"layer{number}")(x)
-        return x
+        out: Tensor = x
+        return out

@@ -57,7 +57,8 @@ class TemporalSelfAttention(nn.Module):
         weights = weights.permute(0, 3, 1, 2, 4).flatten(0, 1).unsqueeze(3)
         locations = at[:, :, None, None, None, :] + offsets / self.size_xy
         out = deformable_attention(value, BEV_HW, locations, weights, self.sampling)
-        return query + self.output_proj(out.mean(0, keepdim=True))
+        read: Tensor = self.output_proj(out.mean(0, keepdim=True))
+        return query + read
 
 
 class CameraAttention(nn.Module):
@@ -127,7 +128,8 @@ class SpatialCrossAttention(nn.Module):
         """
         seen = self.deformable_attention(query, tokens, at) * visible
         count = torch.maximum(visible.sum(0, keepdim=True), ONE)
-        return query + self.output_proj(seen.sum(0, keepdim=True) / count)
+        read: Tensor = self.output_proj(seen.sum(0, keepdim=True) / count)
+        return query + read
 
 
 class EncoderLayer(nn.Module):
@@ -160,6 +162,9 @@ class EncoderLayer(nn.Module):
 
 class BevEncoder(nn.Module):
     """Three `EncoderLayer`s over a grid of cells."""
+
+    pillars: Tensor
+    cells: Tensor
 
     def __init__(self, sampling: Sampling) -> None:
         super().__init__()

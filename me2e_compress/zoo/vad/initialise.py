@@ -26,14 +26,16 @@ from me2e_compress.zoo.vad.stack import VadTiny
 GAINS = (
     (r"ego_(agent|map)_decoder.*attn\.out_proj", 4.0),
     (r"attn\.out_proj", 1.5),
+    (r"transformer\..*attn\.in_proj_weight", 1.0),
     (r"attn\.in_proj_weight", 1.2),
+    (r"decoder\..*attentions\.1\.output_proj", 1.5),
     (r"attentions\.0\.output_proj", 1.0),
     (r"deformable_attention\.value_proj|attentions\.1\.value_proj", 2.0),
     (r"attentions\.1\.output_proj", 2.5),
     (r"sampling_offsets", 0.6),
     (r"attention_weights|reference_points", 1.2),
     (r"pos_mlp", 2.0),
-    (r"reg_branches\.\d\.4", 0.15),
+    (r"reg_branches\.\d\.4", 0.05),
     (r"ffns\.0\.layers\.1", 0.7),
     (r"ego_fut_decoder\.4", 1.0),
 )
@@ -48,7 +50,7 @@ BIAS_STD = 0.1
 RESIDUAL_SCALE = 0.35
 """Of the last normalisation of a residual block, so that 16 blocks do not explode."""
 
-CALIBRATION_FRAMES = 2
+CALIBRATION_FRAMES = 4
 CALIBRATION_STRIDE = 2
 """Every second pixel is enough for the statistics of a channel."""
 

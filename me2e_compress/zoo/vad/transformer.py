@@ -28,6 +28,8 @@ class CanBusEncoder(nn.Sequential):
 class PerceptionTransformer(nn.Module):
     """Everything between camera features and decoded queries."""
 
+    cells: Tensor
+
     def __init__(self, sampling: Sampling) -> None:
         super().__init__()
         self.sampling: Sampling = sampling
@@ -91,11 +93,11 @@ class PerceptionTransformer(nn.Module):
         with region("bev_encoder"):
             bev = self.bev(features, *cells, lidar2img, can_bus, prev_bev)
         with region("det"):
-            pos, query = agents.unsqueeze(0).split(EMBED, dim=2)
+            pos, query = agents.unsqueeze(0).chunk(2, dim=2)
             at = self.reference_points(pos).sigmoid()
             found = self.decoder(query, pos, bev, at, branches[0])
         with region("map"):
-            pos, query = points.unsqueeze(0).split(EMBED, dim=2)
+            pos, query = points.unsqueeze(0).chunk(2, dim=2)
             at = self.map_reference_points(pos).sigmoid()
             mapped = self.map_decoder(query, pos, bev, at, branches[1])
         return bev, found, mapped
