@@ -5,7 +5,6 @@ their names, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the
 frame of every scene.
 """
 
-import functools
 import hashlib
 import itertools
 import json
@@ -66,7 +65,7 @@ class CalibrationSet:
             raise FramesError(f"{path}: not a readable .npz ({error})") from error
         return Frame(index, index in self.scenes, arrays)
 
-    @functools.cached_property
+    @property
     def fingerprint(self) -> str:
         """A number that changes with the content, the order or the scenes.
 

@@ -3,29 +3,19 @@
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
-from onnxruntime.capi import onnxruntime_pybind11_state as native
 
 from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.native import REFUSALS, InvalidArgument
 from me2e_compress.runtime.recurrence import Port, recurrence
 from me2e_compress.runtime.supported import can_run
-
-_REFUSALS = (
-    native.Fail,
-    native.InvalidArgument,
-    native.InvalidGraph,
-    native.InvalidProtobuf,
-    native.NoModel,
-    native.NoSuchFile,
-    native.NotImplemented,
-    native.RuntimeException,
-)
 
 __all__ = ["Port", "Session", "can_run", "replay", "run_once"]
 
@@ -109,10 +99,11 @@ class Session:
             )
         names = list(self.outputs) if outputs is None else list(outputs)
         try:
-            values = self._ort.run(names, {name: feeds[name] for name in self.inputs})
-        except native.InvalidArgument as error:
+            fed = {name: feeds[name] for name in self.inputs}
+            values = cast("list[Array]", self._ort.run(names, fed))
+        except InvalidArgument as error:
             raise FramesError(f"these inputs do not fit: {_line(error)}") from error
-        except _REFUSALS as error:
+        except REFUSALS as error:
             raise GraphError(f"onnxruntime failed: {_line(error)}") from error
         return dict(zip(names, values, strict=True))
 
@@ -198,7 +189,7 @@ def _needs_file(model: ir.Model) -> bool:
 def _build(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
     try:
         return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-    except _REFUSALS as error:
+    except REFUSALS as error:
         raise GraphError(
             f"onnxruntime cannot run this graph: {_line(error)}"
         ) from error

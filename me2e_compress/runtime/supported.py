@@ -1,11 +1,8 @@
 """What onnxruntime's CPU can run, asked without building a session."""
 
-import functools
-
 import onnx_ir as ir
-from onnxruntime.capi import onnxruntime_pybind11_state as native
 
-STANDARD = ("", "ai.onnx")
+from me2e_compress.runtime.native import operators
 
 
 def can_run(model: ir.Model) -> str | None:
@@ -14,12 +11,13 @@ def can_run(model: ir.Model) -> str | None:
     A known operator may still lack a kernel for its element type; only building a
     :class:`~me2e_compress.runtime.session.Session` finds that.
     """
+    known = operators()
     unknown = {
         f"{node.domain or 'ai.onnx'}::{node.op_type}": node
         for graph in (*model.graphs(), *model.functions.values())
         for node in graph
         if node.op_identifier() not in model.functions
-        and (_domain(node.domain), node.op_type) not in _known()
+        and (_domain(node.domain), node.op_type) not in known
     }
     if not unknown:
         return None
@@ -28,12 +26,4 @@ def can_run(model: ir.Model) -> str | None:
 
 
 def _domain(name: str) -> str:
-    return "" if name in STANDARD else name
-
-
-@functools.cache
-def _known() -> frozenset[tuple[str, str]]:
-    return frozenset(
-        (_domain(schema.domain), schema.name)
-        for schema in native.get_all_operator_schema()
-    )
+    return "" if name == "ai.onnx" else name

@@ -43,7 +43,10 @@ def test_frames_that_fit_pass_the_check(tmp_path: Path, model: ir.Model) -> None
     ("change", "message"),
     [
         ({"y": np.zeros(1, np.float32)}, "000001.npz: y is no input; .*x, command"),
-        ({"x": np.zeros((1, 3), np.float32)}, r"x has shape \[1, 3\], expected \[1,2\]"),
+        (
+            {"x": np.zeros((1, 3), np.float32)},
+            r"x has shape \[1, 3\], expected \[1,2\]",
+        ),
         ({"x": np.zeros((1, 2))}, "000001.npz: x is float64, expected float32"),
         (
             {"x": np.array([[0, np.nan]], np.float32)},
@@ -114,7 +117,10 @@ def test_the_fingerprint_follows_content_and_scenes_not_the_place(
 
     same = seal("a", [1, 2])
     assert seal("b", [1, 2]) == same
-    assert len({same, seal("c", [2, 1]), seal("d", [1, 3]), seal("e", [1, 2], (0, 1))}) == 4
+    assert (
+        len({same, seal("c", [2, 1]), seal("d", [1, 3]), seal("e", [1, 2], (0, 1))})
+        == 4
+    )
 
 
 def test_synthetic_frames_fit_and_follow_the_seed(model: ir.Model) -> None:

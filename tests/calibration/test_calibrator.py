@@ -1,0 +1,181 @@
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from onnxruntime.quantization import calibrate as peer
+
+from me2e_compress import graph
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.observers import MaxMin, scale_of
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.taps import tap
+from me2e_compress.errors import FramesError, GraphError, RecipeError
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.session import Session, replay
+from tests.frames import record
+from tests.nets import conv_attention, image
+
+TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
+
+
+class Reader(peer.CalibrationDataReader):  # type: ignore[misc]
+    """Feeds the other tool what a replay feeds ours."""
+
+    def __init__(self, frames: list[dict[str, np.ndarray]]) -> None:
+        self._frames: Iterator[dict[str, np.ndarray]] = iter(frames)
+
+    def get_next(self) -> Any:
+        return next(self._frames, None)
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> CalibrationSet:
+    return CalibrationSet(record(tmp_path / "f", [image(i) for i in range(4)], (0, 2)))
+
+
+def test_ranges_are_those_of_onnxruntime_to_the_bit(
+    frames: CalibrationSet, tmp_path: Path
+) -> None:
+    model = conv_attention()
+    path = tmp_path / "net.onnx"
+    graph.save(model, path)
+    tool = peer.create_calibrator(
+        path,
+        ["Conv", "Relu", "Add", "MatMul", "Softmax", "Transpose"],
+        augmented_model_path=str(tmp_path / "augmented.onnx"),
+        calibrate_method=peer.CalibrationMethod.MinMax,
+    )
+    zeros: dict[str, Array] = {"memory": np.zeros((1, 8, 64), np.float32)}
+    memory = zeros
+    plain = Session(model, threads=1, optimize=False)
+    states = []
+    for each, after in zip(frames, replay(plain, frames), strict=True):
+        states.append({**(zeros if each.starts_scene else memory), **each.arrays})
+        memory = {"memory": after["memory_out"]}
+    tool.collect_data(Reader(states))
+    theirs = tool.compute_data().data
+
+    ours = Calibrator(threads=1, optimize=False).run(model, TENSORS, frames)
+
+    for name in TENSORS:
+        low, high = (end.item() for end in theirs[name].range_value)
+        assert ours.tensors[name] == (low, high), name
+
+
+def test_state_is_fed_forward_and_reset_between_scenes(tmp_path: Path) -> None:
+    one = [{"image": image(0)["image"]}] * 4
+    together = CalibrationSet(record(tmp_path / "a", one, (0,)))
+    apart = CalibrationSet(record(tmp_path / "b", one, (0, 1, 2, 3)))
+    model = conv_attention()
+
+    def highest(frames: CalibrationSet) -> float:
+        return Calibrator(threads=1).run(model, ["seen"], frames).tensors["seen"][1]
+
+    # memory after n equal frames adds 1/2 + 1/4 + 1/8 of what one frame shows
+    assert highest(together) == pytest.approx(highest(apart) * 1.875, rel=1e-5)
+
+
+@pytest.mark.parametrize("at", [0, 7, 150])
+@pytest.mark.parametrize(("bad", "word"), [(np.nan, "NaN"), (np.inf, "infinite")])
+def test_what_is_not_a_number_is_found_wherever_it_hides(
+    tmp_path: Path, at: int, bad: float, word: str
+) -> None:
+    second = image(1)
+    second["image"].flat[at] = bad
+    frames = CalibrationSet(record(tmp_path, [image(0), second]))
+
+    with pytest.raises(FramesError, match=f"frame 1 makes tensor image {word}"):
+        Calibrator(threads=1).run(conv_attention(), ["image"], frames)
+
+
+def test_dead_tensors_are_named(tmp_path: Path) -> None:
+    dark = {"image": np.zeros((1, 3, 8, 8), np.float32)}
+    frames = CalibrationSet(record(tmp_path, [dark]))
+
+    found = Calibrator(threads=1).run(conv_attention(), ["image", "a"], frames)
+
+    assert found.dead == ("image",)
+
+
+def test_an_unknown_tensor_or_method_is_an_error(frames: CalibrationSet) -> None:
+    with pytest.raises(GraphError, match="no tensor nowhere"):
+        Calibrator().run(conv_attention(), ["nowhere"], frames)
+    with pytest.raises(RecipeError, match=r"no calibration method entropy; .*max-min"):
+        Calibrator("entropy").run(conv_attention(), ["a"], frames)
+
+
+def test_gauges_stand_right_behind_what_they_watch() -> None:
+    model = conv_attention()
+    ops = [node.op_type for node in tap(model, ["a"]).graph]
+
+    assert ops[:4] == ["Conv", "ReduceMin", "Reshape", "ReduceMax"]
+    assert len(model.graph) == 10
+
+
+@pytest.fixture
+def ranges(frames: CalibrationSet) -> Ranges:
+    return Calibrator(threads=1).run(conv_attention(), ["a"], frames)
+
+
+def test_saved_ranges_come_back(ranges: Ranges, tmp_path: Path) -> None:
+    ranges.save(tmp_path / "r.json")
+
+    assert Ranges.load(tmp_path / "r.json") == ranges
+    assert [each.name for each in tmp_path.glob("*.json")] == ["r.json"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model": "other"}, "stale: of graph other"),
+        ({"source": "other"}, "stale: of frames other"),
+        ({"method": "entropy"}, "of method entropy, asked for max-min"),
+        ({"tensors": {}}, "lack a and 0 more of 1"),
+    ],
+)
+def test_stale_ranges_are_refused(
+    ranges: Ranges, change: dict[str, object], message: str
+) -> None:
+    stale = dataclasses.replace(ranges, **change)  # type: ignore[arg-type]
+
+    with pytest.raises(FramesError, match=message):
+        stale.check(
+            model=ranges.model, tensors=("a",), method="max-min", source=ranges.source
+        )
+
+
+def test_fresh_ranges_are_taken(ranges: Ranges) -> None:
+    ranges.check(model=graph.digest(conv_attention()), tensors=("a",), method="max-min")
+
+
+@pytest.mark.parametrize("content", ["[", "{}", '{"tensors": 1}'])
+def test_a_file_that_holds_no_ranges_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "r.json"
+    path.write_text(content)
+
+    with pytest.raises(FramesError, match=r"r\.json: not ranges"):
+        Ranges.load(path)
+    with pytest.raises(FramesError, match="no such ranges"):
+        Ranges.load(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "scale"),
+    [(-1.27, 0.5, 0.01), (0.0, 12.7, 0.1), (-254.0, 254.0, 2.0), (0.0, 0.0, 1.0)],
+)
+def test_the_scale_covers_the_larger_side(
+    low: float, high: float, scale: float
+) -> None:
+    assert scale_of(low, high) == np.float32(scale)
+
+
+def test_max_min_is_static_not_a_moving_average() -> None:
+    seen = MaxMin()
+    for low, high in ((-1, 2), (-3, 1), (0, 0)):
+        seen.update(np.array([low], np.float32), np.array([high], np.float32))
+
+    assert [ends.tolist() for ends in seen.result()] == [[-3], [2]]

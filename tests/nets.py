@@ -1,0 +1,77 @@
+"""Small graphs with modules, for tests of calibration, targets and passes."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.graph import provenance
+from me2e_compress.graph.provenance import Provenance
+from me2e_compress.modules import ModuleMap
+
+CONV_ATTENTION = """
+<ir_version: 9, opset_import: ["" : 17]>
+net (float[1,3,8,8] image, float[1,8,64] memory,
+     float[8,3,3,3] w, float[8] b, float[8,8] l, float[] half)
+    => (float[1,64,8] y, float[1,8,64] memory_out) <int64[3] tokens = {1, 8, 64}> {
+    ["/backbone/Conv"] a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(image, w, b)
+    ["/backbone/Relu"] r = Relu(a)
+    ["/backbone/Reshape"] flat = Reshape(r, tokens)
+    ["/head/Add"] seen = Add(flat, memory)
+    ["/head/Transpose"] q = Transpose<perm=[0,2,1]>(seen)
+    ["/head/QK"] scores = MatMul(q, seen)
+    ["/head/Softmax"] p = Softmax<axis=-1>(scores)
+    ["/head/AV"] mixed = MatMul(p, q)
+    ["/head/Linear"] y = MatMul(mixed, l)
+    ["/head/Mul"] memory_out = Mul(seen, half)
+}
+"""
+
+MODULES = ModuleMap.parse(
+    """
+    [modules.backbone]
+    role = "feature"
+    patterns = ["backbone"]
+    [modules.head]
+    role = "prediction"
+    patterns = ["head"]
+    """,
+    "net",
+)
+
+
+def conv_attention(seed: int = 0) -> ir.Model:
+    """A convolution, an attention of 64 tokens, a linear layer and a memory."""
+    generator = np.random.default_rng(seed)
+    shapes = {"w": (8, 3, 3, 3), "b": (8,), "l": (8, 8)}
+    weights = {n: generator.standard_normal(shape) for n, shape in shapes.items()}
+    return net(CONV_ATTENTION, {**weights, "half": np.array(0.5)})
+
+
+def net(text: str, weights: Mapping[str, npt.NDArray[np.floating]]) -> ir.Model:
+    """Read a graph, make weights of some inputs, stamp modules, infer shapes.
+
+    A node belongs to the module that its name begins with, else to ``head``.
+    """
+    model = ir.from_onnx_text(text)
+    for value in list(model.graph.inputs):
+        name = str(value.name)
+        if name in weights:
+            model.graph.inputs.remove(value)
+            array = weights[name].astype(np.float32)
+            value.const_value = ir.tensor(array, name=name)
+            model.graph.register_initializer(value)
+    for node in model.graph.all_nodes():
+        name = node.name or ""
+        module = name.split("/")[1] if name.startswith("/") else "head"
+        provenance.stamp(node, Provenance(module, (name,)))
+    graph.infer_shapes(model)
+    return model
+
+
+def image(seed: int) -> dict[str, npt.NDArray[np.float32]]:
+    """One input of :func:`conv_attention`, its memory left out."""
+    array = np.random.default_rng(seed).standard_normal((1, 3, 8, 8))
+    return {"image": array.astype(np.float32)}

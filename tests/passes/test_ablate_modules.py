@@ -1,0 +1,203 @@
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import ModuleMapError, PreconditionError
+from me2e_compress.graph import provenance
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.passes.base import Context
+from me2e_compress.runtime.session import run_once
+from tests.nets import net
+
+STACK = """
+<ir_version: 9, opset_import: ["" : 17]>
+stack (float[1,4] camera) => (float[1,4] plan, float[1,2,2] lanes)
+<int64[3] square = {1, 2, 2}, int64[2] flat = {1, 4}> {
+    ["/backbone/Relu"] f = Relu(camera)
+    ["/agents/Abs"] agents = Abs(f)
+    ["/map/Neg"] m = Neg(f)
+    ["/map/Reshape"] lanes = Reshape(m, square)
+    ["/planner/look/Reshape"] seen = Reshape(lanes, flat)
+    ["/planner/look/Exp"] ego_map = Exp(seen)
+    ["/planner/meet/Sqrt"] met = Sqrt(agents)
+    ["/planner/Add"] plan = Add(ego_map, met)
+}
+"""
+
+MAP = """
+[modules.backbone]
+role = "feature"
+patterns = ["backbone"]
+[modules.agents]
+role = "prediction"
+patterns = ["agents"]
+[modules.map]
+role = "prediction"
+patterns = ["map"]
+%s
+[modules.planner]
+role = "prediction"
+patterns = ["planner"]
+"""
+
+CAMERA = np.array([[-1, 0, 4, 9]], np.float32)
+
+
+def context(substitutes: str = "") -> Context:
+    return Context(ModuleMap.parse(MAP % substitutes, "stack"))
+
+
+def substitute(scope: str, by: str | None = None) -> str:
+    stand_in = "" if by is None else f', by = "{by}"'
+    return f'substitutes = [{{ scope = "{scope}"{stand_in} }}]'
+
+
+@pytest.fixture
+def stack() -> ir.Model:
+    return net(STACK, {})
+
+
+def plan_of(model: ir.Model) -> list[float]:
+    plan: list[float] = run_once(model, {"camera": CAMERA})["plan"][0].tolist()
+    return plan
+
+
+def ops(model: ir.Model) -> list[str]:
+    return [node.op_type for node in model.graph]
+
+
+def test_readers_of_a_dropped_module_read_zeros(stack: ir.Model) -> None:
+    result = AblateModules(drop=("agents",)).run(stack, context())
+
+    assert "Abs" not in ops(result.model)
+    assert plan_of(result.model) == np.exp(np.array([0, 0, -4, -9], "f")).tolist()
+    assert "agents reads as zeros" in result.notes
+    assert not provenance.missing(result.model)
+
+
+def test_outputs_of_a_dropped_module_are_kept_from_harm(stack: ir.Model) -> None:
+    with pytest.raises(PreconditionError, match=r"map makes the outputs lanes: .*true"):
+        AblateModules(drop=("map",)).run(stack, context())
+
+
+def test_outputs_go_where_that_was_asked_for(stack: ir.Model) -> None:
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    result = chosen.run(stack, context())
+
+    assert [value.name for value in result.model.graph.outputs] == ["plan"]
+    assert plan_of(result.model) == [1, 1, 3, 4]
+    assert "output removed: lanes" in result.notes
+    assert chosen.changes_interface
+    assert not AblateModules(drop=("map",)).changes_interface
+
+
+def test_a_substitute_takes_the_place_of_a_scope(stack: ir.Model) -> None:
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    result = chosen.run(stack, context(substitute("*.look", "*.meet")))
+
+    assert ops(result.model) == ["Relu", "Abs", "Sqrt", "Add"]
+    assert plan_of(result.model) == [0, 0, 4, 6]
+    assert "*.look replaced by *.meet" in result.notes
+
+
+def test_a_substitute_without_by_reads_as_zeros(stack: ir.Model) -> None:
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    result = chosen.run(stack, context(substitute("*.look")))
+
+    assert plan_of(result.model) == [0, 0, 2, 3]
+
+
+def test_fill_zeros_leaves_substitutes_aside(stack: ir.Model) -> None:
+    chosen = AblateModules(drop=("map",), fill="zeros", drop_outputs=True)
+
+    result = chosen.run(stack, context(substitute("*.look", "*.meet")))
+
+    assert plan_of(result.model) == [1, 1, 3, 4]
+
+
+def test_a_substitute_of_the_same_elements_is_reshaped(stack: ir.Model) -> None:
+    text = STACK.replace("met = Sqrt(agents)", "met0 = Sqrt(agents)").replace(
+        '["/planner/Add"]', '["/planner/meet/Reshape"] met = Reshape(met0, long)\n'
+        '["/planner/Add"]'
+    )  # fmt: skip
+    text = text.replace("int64[2] flat", "int64[3] long = {1, 1, 4}, int64[2] flat")
+    text = text.replace("float[1,4] plan", "float[1,1,4] plan")
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    result = chosen.run(net(text, {}), context(substitute("*.look", "*.meet")))
+
+    run = run_once(result.model, {"camera": CAMERA})["plan"]
+    np.testing.assert_array_equal(run, [[[0, 0, 4, 6]]])
+
+
+@pytest.mark.parametrize(
+    ("scope", "by", "message"),
+    [
+        ("*.nowhere", "*.meet", r"no value leaves a scope \*\.nowhere"),
+        ("*.look", "*.nowhere", r"no value leaves a scope \*\.nowhere"),
+        ("*.look", "map", "nothing that leaves map fits ego_map"),
+        ("agents", "*.meet", "cannot stand in for agents: it reads its result"),
+    ],
+)
+def test_a_substitute_that_does_not_fit_is_refused(
+    stack: ir.Model, scope: str, by: str, message: str
+) -> None:
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    with pytest.raises(PreconditionError, match=message):
+        chosen.run(stack, context(substitute(scope, by)))
+
+
+def test_a_dropped_substitute_is_refused(stack: ir.Model) -> None:
+    chosen = AblateModules(drop=("map", "agents"), drop_outputs=True)
+
+    with pytest.raises(PreconditionError, match="of module agents, which is dropped"):
+        chosen.run(stack, context(substitute("*.look", "agents")))
+
+
+def test_a_kept_scope_stays(stack: ir.Model) -> None:
+    chosen = AblateModules(drop=("planner",), keep=("planner",))
+
+    result = chosen.run(stack, context())
+
+    assert len(result.model.graph) == 8
+    with pytest.raises(PreconditionError, match=r"no value leaves a scope \*\.lane"):
+        AblateModules(drop=("agents",), keep=("*.lane",)).run(stack, context())
+
+
+def test_dropping_everything_that_is_an_output_is_refused(stack: ir.Model) -> None:
+    chosen = AblateModules(drop=("map", "planner"), drop_outputs=True)
+
+    with pytest.raises(PreconditionError, match="makes every output: plan, lanes"):
+        chosen.run(stack, context())
+
+
+def test_unknown_and_absent_modules_are_named(stack: ir.Model) -> None:
+    with pytest.raises(ModuleMapError, match=r"occ: .*backbone, agents, map, planner"):
+        AblateModules(drop=("occ",)).run(stack, context())
+    once = AblateModules(drop=("agents",)).run(stack, context()).model
+    with pytest.raises(PreconditionError, match=r"module agents; .*backbone, map, pl"):
+        AblateModules(drop=("agents",)).run(once, context())
+
+
+def test_shapes_must_be_static() -> None:
+    open_stack = net(STACK.replace("float[1,4] camera", "float[n,4] camera"), {})
+
+    with pytest.raises(PreconditionError, match=r"agents has shape .*fold-constants"):
+        AblateModules(drop=("agents",)).run(open_stack, context())
+
+
+def test_arithmetic_on_shapes_is_not_zeroed() -> None:
+    text = STACK.replace(
+        '["/planner/look/Reshape"] seen = Reshape(lanes, flat)',
+        '["/map/Shape"] size = Shape(f)\n'
+        '["/planner/look/Reshape"] seen = Reshape(f, size)',
+    )
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    with pytest.raises(PreconditionError, match="size is arithmetic on shapes"):
+        chosen.run(net(text, {}), context())

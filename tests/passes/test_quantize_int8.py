@@ -1,0 +1,135 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import (
+    FramesError,
+    ModuleMapError,
+    PreconditionError,
+    RecipeError,
+)
+from me2e_compress.metrics.fidelity import compare
+from me2e_compress.passes.base import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.runtime.session import Session
+from tests.frames import record
+from tests.nets import MODULES, conv_attention, image
+
+TENSORS = ("image", "q", "seen", "p", "mixed")
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> CalibrationSet:
+    return CalibrationSet(record(tmp_path / "f", [image(i) for i in range(4)], (0, 2)))
+
+
+@pytest.fixture
+def context(frames: CalibrationSet) -> Context:
+    return Context(MODULES, frames)
+
+
+def test_the_quantized_graph_runs_and_stays_close(
+    context: Context, frames: CalibrationSet
+) -> None:
+    model = conv_attention()
+
+    result = QuantizeInt8().run(model, context)
+    found = compare(Session(model), Session(result.model), frames)
+
+    assert result.changes == 4
+    # 8 bits give about 6 dB each; two attention products and two layers cost some
+    assert all(20 < each.sqnr_db < 60 for each in found.outputs)
+
+
+def test_notes_say_what_was_decided_by_which_rule(context: Context) -> None:
+    notes = QuantizeInt8(attention_limit=8).run(conv_attention(), context).notes
+
+    assert "scheme full: backbone, head" in notes
+    assert "2 of 10 nodes int8; by rule: attention-length 2, layer 2" in notes
+    assert "2 tensors calibrated on 4 frames" in notes
+
+
+@pytest.mark.parametrize(
+    ("options", "changes"),
+    [
+        ({"scheme": "feature-ext"}, 1),
+        ({"scheme": "prediction"}, 3),
+        ({"modules": ("backbone",)}, 1),
+        ({"modules": ("backbone", "head")}, 4),
+    ],
+)
+def test_schemes_and_modules_choose(
+    context: Context, options: dict[str, object], changes: int
+) -> None:
+    chosen = QuantizeInt8(**options)  # type: ignore[arg-type]
+
+    assert chosen.run(conv_attention(), context).changes == changes
+
+
+def test_without_frames_there_is_no_calibration() -> None:
+    with pytest.raises(FramesError, match=r"needs recorded frames .* never made up"):
+        QuantizeInt8().run(conv_attention(), Context(MODULES))
+
+
+def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
+    once = QuantizeInt8().run(conv_attention(), context).model
+
+    with pytest.raises(PreconditionError, match="quantized already: QuantizeLinear"):
+        QuantizeInt8().run(once, context)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
+        ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
+        ({"method": "entropy"}, RecipeError, "no calibration method entropy"),
+    ],
+)
+def test_what_is_not_there_is_named(
+    context: Context, options: dict[str, object], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        QuantizeInt8(**options).run(conv_attention(), context)  # type: ignore[arg-type]
+
+
+def test_saved_ranges_give_the_same_graph_without_frames(
+    context: Context, frames: CalibrationSet, tmp_path: Path
+) -> None:
+    model = conv_attention()
+    path = tmp_path / "r.json"
+    Calibrator().run(model, TENSORS, frames).save(path)
+
+    measured = QuantizeInt8().run(conv_attention(), context).model
+    read = QuantizeInt8(ranges=str(path)).run(model, Context(MODULES)).model
+
+    assert graph.digest(read) == graph.digest(measured)
+
+
+def test_ranges_of_another_graph_are_refused(
+    frames: CalibrationSet, tmp_path: Path
+) -> None:
+    path = tmp_path / "r.json"
+    Calibrator().run(conv_attention(seed=1), TENSORS, frames).save(path)
+
+    with pytest.raises(FramesError, match="ranges are stale: of graph"):
+        QuantizeInt8(ranges=str(path)).run(conv_attention(), Context(MODULES))
+
+
+def test_frames_of_another_model_are_refused(tmp_path: Path) -> None:
+    other = CalibrationSet(record(tmp_path, [{"lidar": np.zeros(3, np.float32)}]))
+
+    with pytest.raises(FramesError, match=r"input image is missing.*lidar"):
+        QuantizeInt8().run(conv_attention(), Context(MODULES, other))
+
+
+def test_the_same_frames_give_the_same_graph(context: Context) -> None:
+    first, again = (
+        graph.digest(QuantizeInt8().run(conv_attention(), context).model)
+        for _ in range(2)
+    )
+    assert first == again
