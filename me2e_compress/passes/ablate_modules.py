@@ -44,15 +44,11 @@ class AblateModules:
 
     name: ClassVar[str] = "ablate-modules"
     exact: ClassVar[bool] = False
+    changes_interface: ClassVar[bool] = True
     drop: tuple[str, ...]
     fill: Literal["zeros", "substitute"] = "substitute"
     keep: tuple[str, ...] = ()
     drop_outputs: bool = False
-
-    @property
-    def changes_interface(self) -> bool:
-        """Whether outputs may go."""
-        return self.drop_outputs
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Re-wire, cut, sweep.

@@ -48,6 +48,7 @@ def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array
     if not names:
         return {}
     part = model.clone()
+    part.metadata_props.clear()  # it speaks of inputs and outputs that go
     made = {str(each.name): each for node in part.graph for each in node.outputs}
     part.graph.outputs.clear()
     part.graph.outputs.extend(made[name] for name in names)

@@ -137,6 +137,8 @@ def test_what_no_input_changes_is_constant_and_can_be_computed() -> None:
     }
     """)
 
+    model.metadata_props["me2e.recurrent"] = '{"x": "y"}'
+
     names = {value.name for value in constant_values(model)}
 
     assert names == {"w", "turned"}
