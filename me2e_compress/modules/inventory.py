@@ -19,8 +19,9 @@ class Weight:
         name: its name there.
         module: the module it counts for; None if nothing tells.
         elements: how many numbers it holds.
-        kind: what it is: "parameter", "batch-norm statistics", "batch-norm counter"
-            (state dict); "renamed weight", "constant", "integer constant" (file).
+        kind: in a state dict "batch-norm statistics", "batch-norm counter" or
+            "parameter", which other buffers are called too; in a file "renamed
+            weight", "constant" or "integer constant".
     """
 
     name: str

@@ -1,0 +1,50 @@
+"""VAD-tiny as the zoo exports it, and what the zoo knows of it."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import onnx_ir as ir
+import pytest
+import torch
+
+from me2e_compress import graph
+from me2e_compress.modules import Assignment, ModuleMap, assign
+from me2e_compress.zoo import truth
+from me2e_compress.zoo.export import export
+from me2e_compress.zoo.vad.stack import VadTiny
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """A stack of the zoo, read back.
+
+    Attributes:
+        model: the exported graph.
+        placed: what the map makes of it.
+        truth: what the trace knew.
+        parameters: elements of each parameter.
+        state_dict: elements of each parameter and persistent buffer.
+    """
+
+    model: ir.Model
+    placed: Assignment
+    truth: truth.Truth
+    parameters: Mapping[str, int]
+    state_dict: Mapping[str, int]
+
+
+@pytest.fixture(scope="session")
+def vad(tmp_path_factory: pytest.TempPathFactory) -> Reference:
+    """VAD-tiny with nuScenes heads, seed 0, opset 17."""
+    path: Path = tmp_path_factory.mktemp("modules") / "vad-tiny.onnx"
+    model = graph.load(export("vad-tiny", path))
+    with torch.device("meta"):
+        shapes = VadTiny()
+    return Reference(
+        model,
+        assign(model, ModuleMap.load("vad")),
+        truth.record("vad-tiny"),
+        {name: tensor.numel() for name, tensor in shapes.named_parameters()},
+        {name: tensor.numel() for name, tensor in shapes.state_dict().items()},
+    )

@@ -1,0 +1,194 @@
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import ModuleMapError
+from me2e_compress.graph import provenance
+from me2e_compress.modules import Assignment, ModuleMap, assign
+from me2e_compress.modules.assign import STAMP
+
+MAP = ModuleMap.parse(
+    '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'
+    '[modules.det]\nrole = "prediction"\noptional = ["det"]\n'
+    '[modules.plan]\nrole = "prediction"\noptional = ["plan"]',
+    "three",
+)
+
+
+def read(signature: str, body: str) -> ir.Model:
+    """Make a model; a weight written ``det__bias`` is called ``det.bias``."""
+    model = ir.from_onnx_text(
+        f'<ir_version: 8, opset_import: ["": 17]> g {signature} {{ {body} }}'
+    )
+    for weight in list(model.graph.initializers.values()):
+        weight.name = str(weight.name).replace("__", ".")
+    return model
+
+
+def placed(found: Assignment) -> dict[str | None, tuple[str, str]]:
+    return {
+        node.outputs[0].name: (place.module, place.rule)
+        for node, place in found.placements.items()
+    }
+
+
+def test_a_named_parameter_decides_before_the_scope() -> None:
+    model = read(
+        "(float[2] x) => (float[2] y) <float[2] det__weight = {1.0, 2.0}>",
+        '["/neck/Mul"] y = Mul(x, det__weight)',
+    )
+    assert placed(assign(model, MAP)) == {"y": ("det", "parameter")}
+
+
+def test_a_parameter_reaches_through_arithmetic_of_constants() -> None:
+    model = read(
+        "(float[1, 1] x) => (float[1, 1] y) <float[1, 1] det__w = {1.0}>",
+        '["/neck/T"] t = Transpose(det__w) c = Cast<to: int = 1>(t)'
+        ' ["/neck/M"] h = MatMul(x, c) ["/neck/R"] y = Relu(h)',
+    )
+    assert placed(assign(model, MAP)) == {
+        "t": ("det", "parameter"),
+        "c": ("det", "parameter"),
+        "h": ("det", "parameter"),
+        "y": ("neck", "scope"),
+    }
+
+
+def test_a_matmul_whose_weight_lost_its_name_goes_by_its_bias() -> None:
+    model = read(
+        "(float[1, 1] x) => (float[1, 1] y)"
+        " <float[1, 1] weight = {1.0}, float[1] plan__bias = {1.0}>",
+        '["/neck/MatMul"] h = MatMul(x, weight) ["/neck/Add"] y = Add(plan__bias, h)',
+    )
+    model.graph.initializers["weight"].name = "onnx::MatMul_123"
+    assert placed(assign(model, MAP)) == {
+        "h": ("plan", "parameter"),
+        "y": ("plan", "parameter"),
+    }
+
+
+def test_an_initializer_that_the_exporter_merged_decides_nothing() -> None:
+    model = read(
+        "(float[2] x) => (float[2] y) <float[2] det__bias = {0.0, 0.0}>",
+        '["/det/Add"] a = Add(x, det__bias) ["/plan/Add"] y = Add(a, det__bias)',
+    )
+    assert placed(assign(model, MAP)) == {
+        "a": ("det", "scope"),
+        "y": ("plan", "scope"),
+    }
+
+
+def test_glue_that_serves_one_module_is_of_it() -> None:
+    model = read(
+        "(float[2] x) => (float[2] y)",
+        '["/neck/Relu"] a = Relu(x) b = Neg(a) c = Abs(b) ["/det/Exp"] y = Exp(c)',
+    )
+    found = placed(assign(model, MAP))
+    assert found["b"] == found["c"] == ("det", "neighbour")
+
+
+def test_glue_that_serves_several_is_of_the_last_that_feeds_it() -> None:
+    model = read(
+        "(float[2] x) => (float[2] y, float[2] z)",
+        '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) c = Add(b, a) d = Abs(c)'
+        ' ["/plan/Exp"] y = Exp(d) ["/neck/Log"] z = Log(d)',
+    )
+    found = placed(assign(model, MAP))
+    assert found["c"] == found["d"] == ("det", "neighbour")
+
+
+def test_glue_that_leaves_the_graph_stays_with_its_producer() -> None:
+    model = read(
+        "(float[2] x) => (float[2] b, float[2] y)",
+        '["/det/Relu"] a = Relu(x) b = Neg(a) ["/plan/Exp"] y = Exp(b)',
+    )
+    assert placed(assign(model, MAP))["b"] == ("det", "neighbour")
+
+
+def test_a_shared_constant_goes_with_its_first_consumer() -> None:
+    model = read(
+        "(float[2] x) => (float[2] z)",
+        ' k = Constant<value_floats = [1.0, 2.0]>() ["/neck/Relu"] a = Relu(x)'
+        ' ["/det/Add"] y = Add(a, k) ["/plan/Add"] z = Add(y, k)',
+    )
+    assert placed(assign(model, MAP))["k"] == ("det", "neighbour")
+
+
+def test_nodes_in_branches_go_by_scope_or_with_what_holds_them() -> None:
+    model = read(
+        "(bool c, float[2] x) => (float[2] y)",
+        '["/det/If"] y = If(c) <'
+        'then_branch = t () => (float[2] a) { ["/plan/Relu"] a = Relu(x) },'
+        " else_branch = e () => (float[2] b) { b = Neg(x) }>",
+    )
+    found = placed(assign(model, MAP))
+    assert found["a"] == ("plan", "scope")
+    assert found["b"][1] == "neighbour"
+
+
+def test_what_hangs_on_nothing_goes_with_the_node_before_it() -> None:
+    model = read(
+        "(float[2] x, float[2] w) => (float[2] y, float[2] z)",
+        '["/det/Relu"] y = Relu(x) z = Neg(w)',
+    )
+    assert placed(assign(model, MAP))["z"] == ("det", "neighbour")
+
+
+def test_an_imported_graph_says_it_itself() -> None:
+    assert STAMP == provenance.MODULE
+    model = read("(float[2] x) => (float[2] y)", '["/det/Relu"] y = Relu(x)')
+    model.graph[0].metadata_props[STAMP] = "plan"
+    assert placed(assign(model, MAP)) == {"y": ("plan", "stamp")}
+
+
+def test_a_stamp_of_another_map_is_not_heard() -> None:
+    model = read("(float[2] x) => (float[2] y)", '["/det/Relu"] y = Relu(x)')
+    model.graph[0].metadata_props[STAMP] = "occ"
+    assert placed(assign(model, MAP)) == {"y": ("det", "scope")}
+
+
+def test_the_result_tells_nodes_and_rules() -> None:
+    model = read(
+        "(float[2] x) => (float[2] y)",
+        '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) y = Abs(b)',
+    )
+    found = assign(model, MAP)
+    assert found.rules() == {"scope": 2, "neighbour": 1}
+    assert [node.outputs[0].name for node in found.nodes("det")] == ["b", "y"]
+    assert found.module_of(model.graph[0]) == "neck"
+    assert found.rule_of(model.graph[2]) == "neighbour"
+
+
+def test_a_required_pattern_that_matches_nothing_is_an_error() -> None:
+    mine = ModuleMap.parse(
+        '[modules.det]\nrole = "prediction"\npatterns = ["det", "det.cls"]', "mine"
+    )
+    model = read("(float[2] x) => (float[2] y)", '["/det/reg/Relu"] y = Relu(x)')
+    with pytest.raises(ModuleMapError) as caught:
+        assign(model, mine)
+    assert str(caught.value) == (
+        "map mine: pattern 'det.cls' of module det matches no parameter and no scope;"
+        " there are det.reg"
+    )
+
+
+def test_a_required_pattern_may_match_and_lose() -> None:
+    mine = ModuleMap.parse(
+        '[modules.det]\nrole = "prediction"\npatterns = ["*.Head"]\n'
+        '[modules.plan]\nrole = "prediction"\npatterns = ["Head.plan"]',
+        "mine",
+    )
+    model = read("(float[2] x) => (float[2] y)", '["/Head/plan/Relu"] y = Relu(x)')
+    assert placed(assign(model, mine)) == {"y": ("plan", "scope")}
+
+
+def test_a_map_of_another_stack_names_what_there_is() -> None:
+    model = read(
+        "(float[2] x) => (float[2] y) <float[2] trunk__w = {1.0, 2.0}>",
+        '["/head/out/Mul"] y = Mul(x, trunk__w)',
+    )
+    with pytest.raises(ModuleMapError) as caught:
+        assign(model, MAP)
+    assert str(caught.value) == (
+        "map three: none of its patterns matches a parameter or a scope of this graph,"
+        " which has head.out, trunk.w"
+    )

@@ -1,0 +1,94 @@
+import onnx_ir as ir
+
+from me2e_compress.modules import (
+    Item,
+    ModuleMap,
+    Weight,
+    assign,
+    inventory,
+    itemise,
+)
+
+MAP = ModuleMap.parse(
+    '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'
+    '[modules.det]\nrole = "prediction"\noptional = ["det"]\n'
+    '[modules.occ]\nrole = "prediction"\noptional = ["occ"]',
+    "three",
+)
+
+
+def model() -> ir.Model:
+    made = ir.from_onnx_text(
+        '<ir_version: 8, opset_import: ["": 17]>'
+        "g (float[2] x) => (float[2] y)"
+        " <float[2] neck_w = {1.0, 2.0}, float[2] shared = {3.0, 4.0},"
+        "  int64[1] size = {2}, float[2] idle = {5.0, 6.0}> {"
+        ' ["/neck/Mul"] a = Mul(x, neck_w)'
+        ' ["/det/Add"] b = Add(a, shared) ["/det/Sub"] c = Sub(b, shared)'
+        ' ["/det/Reshape"] y = Reshape(c, size) }'
+    )
+    made.graph.initializers["neck_w"].name = "neck.w"
+    return made
+
+
+def two_each(node: ir.Node) -> int | None:
+    return 2
+
+
+def test_shared_weights_count_once_and_sizes_are_no_parameters() -> None:
+    graph = model()
+    found = itemise(graph, MAP, assign(graph, MAP).module_of, two_each)
+    assert found == (
+        Item("neck", nodes=1, parameters=2, weight_bytes=8, macs=2),
+        Item("det", nodes=3, parameters=2, weight_bytes=16, macs=6),
+        Item("occ", nodes=0, parameters=0, weight_bytes=0, macs=0),
+    )
+
+
+def test_macs_are_unknown_where_one_of_them_is() -> None:
+    graph = model()
+    placed = assign(graph, MAP).module_of
+
+    def unknown_sub(node: ir.Node) -> int | None:
+        return None if node.op_type == "Sub" else 1
+
+    macs = {item.module: item.macs for item in itemise(graph, MAP, placed, unknown_sub)}
+    assert macs == {"neck": 1, "det": None, "occ": 0}
+    assert all(item.macs is None for item in itemise(graph, MAP, placed))
+
+
+def test_int8_weights_are_parameters() -> None:
+    graph = model()
+    weight = graph.graph.initializers["neck.w"]
+    weight.const_value = ir.tensor([1, 2], dtype=ir.DataType.INT8)
+    neck = itemise(graph, MAP, assign(graph, MAP).module_of)[0]
+    assert (neck.parameters, neck.weight_bytes) == (2, 2)
+
+
+def test_inventory_tells_what_is_there_more_and_less() -> None:
+    graph = model()
+    graph.graph.initializers["shared"].name = "onnx::Add_12"
+    found = inventory(
+        graph,
+        MAP,
+        assign(graph, MAP).module_of,
+        {
+            "neck.w": 2,
+            "det.w": 4,
+            "idle": 3,
+            "neck.bn.running_mean": 2,
+            "neck.bn.num_batches_tracked": 1,
+        },
+    )
+    assert found.present == (Weight("neck.w", "neck", 2, "parameter"),)
+    assert found.missing == (
+        Weight("det.w", "det", 4, "parameter"),
+        Weight("idle", None, 3, "parameter"),
+        Weight("neck.bn.running_mean", "neck", 2, "batch-norm statistics"),
+        Weight("neck.bn.num_batches_tracked", "neck", 1, "batch-norm counter"),
+    )
+    assert found.extra == (
+        Weight("size", "det", 1, "integer constant"),
+        Weight("idle", None, 2, "constant"),
+        Weight("onnx::Add_12", "det", 2, "renamed weight"),
+    )
