@@ -6,6 +6,7 @@ of the same stack writes that into the scopes of the nodes. Both exports trace t
 code, so node *i* of the marked file is node *i* of the plain one.
 """
 
+import copy
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -39,8 +40,8 @@ class Truth:
     Attributes:
         modules: Module of every compute node (all but Constant and Identity), by node
             name in the plain export.
-        macs: Multiply-accumulates of one frame by module, counted by torch while it
-            ran: convolutions and matrix products only.
+        macs: Multiply-accumulates of one frame by module, counted by torch from the
+            shapes that its convolutions and matrix products meet; nothing else counts.
     """
 
     modules: Mapping[str, str]
@@ -126,6 +127,8 @@ def count_macs(spec: Stack, model: "nn.Module") -> dict[str, int]:
             raise GraphError(f"{spec.name} multiplies outside of every region")
         macs[stack[-1]] += count
 
+    shapes_only = copy.deepcopy(model).to("meta")
+    inputs = [tensor.to("meta") for tensor in example(spec)]
     with listening(enter), torch.no_grad(), MacCounter(add):
-        model(*example(spec))
+        shapes_only(*inputs)
     return dict(macs)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from me2e_compress.zoo.export import build, export
@@ -13,6 +14,12 @@ from me2e_compress.zoo.stacks import VAD_TINY
 
 if TYPE_CHECKING:
     from me2e_compress.zoo.vad.stack import VadTiny
+
+
+@pytest.fixture(scope="session", autouse=True)
+def two_threads() -> None:
+    """More would only wait for each other on a shared machine."""
+    torch.set_num_threads(2)
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """Reading a feature map at fractional positions."""
 
+import functools
 from typing import Literal
 
 import torch
@@ -47,13 +48,12 @@ def sample(
             (left, top + 1, (1 - right_part) * bottom_part),
             (left + 1, top + 1, right_part * bottom_part),
         ]
-    total = None
+    parts = []
     for column, row, weight in corners:
         inner_column = column.clamp(0, width - 1)
         inner_row = row.clamp(0, height - 1)
         inside = (inner_column == column) & (inner_row == row)
         index = start + (inner_row * width + inner_column).to(torch.int64)
-        part = rows[index] * (weight * inside.to(weight.dtype)).unsqueeze(-1)
-        total = part if total is None else total + part
-    assert total is not None
-    return total.permute(0, 3, 1, 2)
+        weight = weight * inside.to(weight.dtype)
+        parts.append(rows[index] * weight.unsqueeze(-1))
+    return functools.reduce(torch.add, parts).permute(0, 3, 1, 2)
