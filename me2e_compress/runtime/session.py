@@ -43,7 +43,8 @@ class Session:
         threads: threads within an operator; 0 lets onnxruntime take every core.
         optimize: False runs the nodes exactly as they stand (``ORT_DISABLE_ALL``).
         frugal: True runs nodes in the priority-based order, in which a reduction
-            written right after its producer frees that tensor at once.
+            written right after its producer frees that tensor at once, and without the
+            memory pattern, which reserves one block for everything that ever lives.
 
     Attributes:
         inputs: by name, what must be fed, in order.
@@ -74,6 +75,7 @@ class Session:
             )
         if frugal:
             options.execution_order = ort.ExecutionOrder.PRIORITY_BASED
+            options.enable_mem_pattern = False
         self._ort = _open(model, options)
         self.inputs = _ports(self._ort.get_inputs())
         self.outputs = _ports(self._ort.get_outputs())

@@ -1,0 +1,138 @@
+"""Every lossy pass on the stack of real size; about a minute on two cores."""
+
+import math
+
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.plan import make_plan, tensors_of
+from me2e_compress.calibration.scheme import QuantScheme
+from me2e_compress.graph import provenance
+from me2e_compress.metrics.fidelity import compare
+from me2e_compress.metrics.reaction import plan_reaction
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.passes.fold_constants import FoldConstants
+from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.runtime.session import Session
+from me2e_compress.zoo.export import export
+from me2e_compress.zoo.frames import frames as drive
+from me2e_compress.zoo.stacks import VAD_TINY
+from tests.frames import record
+
+WEIGHT_MB = 159.5
+"""39,865,999 float32 parameters."""
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> CalibrationSet:
+    """Two scenes of one frame."""
+    folder = tmp_path_factory.mktemp("frames")
+    recorded = [
+        {name: each[name] for name in each if name != "prev_bev"}
+        for each in drive(VAD_TINY, 2, seed=5, scene_length=1)
+    ]
+    return CalibrationSet(record(folder, recorded, (0, 1)))
+
+
+@pytest.fixture(scope="module")
+def context(frames: CalibrationSet) -> Context:
+    return Context(ModuleMap.load("vad"), frames)
+
+
+@pytest.fixture(scope="module")
+def folded(tmp_path_factory: pytest.TempPathFactory, context: Context) -> ir.Model:
+    path = export("vad-tiny", tmp_path_factory.mktemp("vad") / "vad.onnx")
+    model = graph.load(path)
+    graph.infer_shapes(model)
+    for each in (ImportNormalize(), FoldConstants()):
+        model = each.run(model, context).model
+    return model
+
+
+@pytest.fixture(scope="module")
+def reference(folded: ir.Model) -> Session:
+    return Session(folded, threads=2)
+
+
+@pytest.fixture(scope="module")
+def ranges(
+    folded: ir.Model, context: Context, tmp_path_factory: pytest.TempPathFactory
+) -> str:
+    """Ranges of everything that any scheme quantizes, measured once."""
+    model = folded.clone()
+    graph.infer_shapes(model)
+    plan = make_plan(model, QuantScheme.named("full", context.modules))
+    assert context.frames is not None
+    path = tmp_path_factory.mktemp("ranges") / "ranges.json"
+    Calibrator(threads=2).run(model, tensors_of(plan, model), context.frames).save(path)
+    return str(path)
+
+
+def seeing(result: ir.Model, context: Context) -> Session:
+    """Check that the plan still depends on the first camera."""
+    frames = context.frames
+    assert frames is not None
+    assert not provenance.missing(result)
+    session = Session(result, threads=2)
+    assert 0.05 <= plan_reaction(session, frames[0], frames[1]) < math.inf
+    return session
+
+
+@pytest.mark.parametrize(
+    ("scheme", "layers", "saved"),
+    # int8 stores a quarter: three bytes saved a parameter of the modules, less those
+    # that no layer holds (embeddings, biases, what stays float)
+    [("feature-ext", 85, 70.0), ("prediction", 110, 15.0), ("full", 195, 90.0)],
+)
+def test_schemes_shrink_the_file_and_keep_the_plan(
+    scheme: str,
+    layers: int,
+    saved: float,
+    folded: ir.Model,
+    reference: Session,
+    context: Context,
+    frames: CalibrationSet,
+    ranges: str,
+) -> None:
+    result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
+    session = seeing(result.model, context)
+    found = compare(reference, session, [frames[0]])
+
+    assert found.plan is not None
+    assert found.plan.max_m < 3.0
+    assert not any(math.isnan(each.sqnr_db) for each in found.outputs)
+    int8 = [n for n in result.model.graph if n.op_type == "DequantizeLinear"]
+    assert len(int8) >= layers
+    assert graph.size(result.model).weight_bytes / 1e6 < WEIGHT_MB - saved
+
+
+@pytest.mark.parametrize(
+    ("drop", "keep", "gone"),
+    [
+        (("map",), (), 3),
+        (("motion",), ("*.lane_encoder",), 2),
+        (("map", "motion"), (), 5),
+    ],
+)
+def test_ablated_stacks_see_and_read_no_zeros(
+    drop: tuple[str, ...],
+    keep: tuple[str, ...],
+    gone: int,
+    folded: ir.Model,
+    context: Context,
+) -> None:
+    chosen = AblateModules(drop=drop, keep=keep, drop_outputs=True)
+
+    result = chosen.run(folded.clone(), context)
+    seeing(result.model, context)
+
+    assert len(result.model.graph.outputs) == len(folded.graph.outputs) - gone
+    assert not any("reads as zeros" in note for note in result.notes)
+    left = {provenance.module_of(node) for node in result.model.graph}
+    assert left.isdisjoint(set(drop) - {"motion"} if keep else set(drop))
