@@ -1,6 +1,6 @@
 """The small edits that the exact passes share."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -65,7 +65,7 @@ def constant_value(graph: ir.Graph, array: Array, name: str) -> ir.Value:
     tensor = ir.tensor(np.ascontiguousarray(array).reshape(array.shape), name=unique)
     value = ir.Value(
         name=unique,
-        shape=ir.Shape(tensor.shape),
+        shape=ir.Shape(array.shape),
         type=ir.TensorType(tensor.dtype),
         const_value=tensor,
     )
@@ -80,7 +80,7 @@ def put(
     *,
     by: str,
     sources: Sequence[ir.Node] = (),
-    attributes: dict[str, int | float | str | Sequence[int]] | None = None,
+    attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
 ) -> ir.Node:
     """Put a standard operator in a node's place; it takes over output and name.
 

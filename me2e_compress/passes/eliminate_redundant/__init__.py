@@ -59,8 +59,7 @@ class EliminateRedundant:
     def _round(
         self, body: ir.Graph, opsets: dict[str, int], tally: Counter[str]
     ) -> None:
-        opset = opsets.get("", opsets.get("ai.onnx", 0))
-        site = Site(body, opset, self.name)
+        site = Site(body, opsets, self.name)
         tally["initializers"] += sharing.share_initializers(body)
         work = dict.fromkeys(reversed(list(body)))
         while work:
@@ -71,16 +70,14 @@ class EliminateRedundant:
             body, self.name, across_modules=self.across_modules
         )
 
-    def _visit(
-        self, node: ir.Node, site: Site, tally: Counter[str]
-    ) -> list[ir.Node]:
+    def _visit(self, node: ir.Node, site: Site, tally: Counter[str]) -> list[ir.Node]:
         """Try the rules on one node; give the nodes to look at again."""
         if not any(is_read(value) for value in node.outputs):
             makers = list(node.predecessors())
             site.graph.remove(node, safe=True)
             tally["unread"] += 1
             return makers
-        inlined = inline_branch(node, self.name)
+        inlined = inline_branch(node, site.opsets, self.name)
         if inlined is not None:
             tally["branches"] += 1
             return inlined
@@ -97,14 +94,16 @@ class EliminateRedundant:
 
 
 def _remove_unused(model: ir.Model) -> int:
-    def count() -> int:
-        bodies = (model, *model.functions.values())
-        return len(model.functions) + sum(len(one.opset_imports) for one in bodies)
-
-    before = count()
-    common.RemoveUnusedFunctionsPass()(model)
+    before = _count_declared(model)
+    functions = common.RemoveUnusedFunctionsPass()  # type: ignore[no-untyped-call]
+    functions(model)
     common.RemoveUnusedOpsetsPass()(model)
-    return before - count()
+    return before - _count_declared(model)
+
+
+def _count_declared(model: ir.Model) -> int:
+    inner = sum(len(body.opset_imports) for body in model.functions.values())
+    return len(model.functions) + len(model.opset_imports) + inner
 
 
 def _notes(tally: Counter[str]) -> tuple[str, ...]:

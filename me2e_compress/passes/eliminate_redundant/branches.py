@@ -1,16 +1,22 @@
 """An If whose condition is known is one of its branches."""
 
+from collections.abc import Mapping
+
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, provenance, replace_value
 from me2e_compress.graph.rewrite import can_replace
 from me2e_compress.passes.edits import graphs_of
+from me2e_compress.passes.fold_constants.inference import branch_fits
 
 
-def inline_branch(node: ir.Node, by: str) -> list[ir.Node] | None:
+def inline_branch(
+    node: ir.Node, opsets: Mapping[str, int], by: str
+) -> list[ir.Node] | None:
     """Put the branch that will be taken in an If's place; give its nodes.
 
-    Where a branch hands on a value from outside as a graph output, the If stays.
+    The If stays where its branch hands a value from outside on as a graph output, and
+    where a reader would refuse the branch's shape, which the If had kept from it.
     """
     graph = node.graph
     chosen = array_of(node.inputs[0]) if node.inputs else None
@@ -25,9 +31,11 @@ def inline_branch(node: ir.Node, by: str) -> list[ir.Node] | None:
     for old, new in zip(node.outputs, results, strict=True):
         if old.is_graph_output() and new.producer() is None:
             return None
-        if new.producer() is not None and new.graph is not branch:
-            if not can_replace(old, new):
-                return None
+        outside = new.producer() is not None and new.graph is not branch
+        if outside and not can_replace(old, new):
+            return None
+    if not branch_fits(node, branch, opsets):
+        return None
     nodes = list(branch)
     _move(branch, node, graph, by)
     for old, new in zip(node.outputs, results, strict=True):

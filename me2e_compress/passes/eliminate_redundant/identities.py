@@ -159,8 +159,8 @@ def _spreads(source: ir.Value, array: Array, node: ir.Node) -> bool:
     """Say whether broadcasting the array leaves the other operand's shape."""
     if same_shape(source, node.outputs[0]):
         return True
-    return array.size == 1 and source.shape is not None and array.ndim <= len(
-        source.shape
+    return (
+        array.size == 1 and source.shape is not None and array.ndim <= len(source.shape)
     )
 
 

@@ -5,7 +5,7 @@ it came to nothing: itself, unread now), or None where nothing was to do.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import onnx_ir as ir
@@ -23,8 +23,24 @@ from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
 VIEWS = frozenset({"Flatten", "Reshape", "Squeeze", "Unsqueeze"})
 
 BROADCASTING = frozenset(
-    "Add And Div Equal Greater GreaterOrEqual Less LessOrEqual Max Min Mul Or Pow Sub"
-    " Where Xor".split()
+    {
+        "Add",
+        "And",
+        "Div",
+        "Equal",
+        "Greater",
+        "GreaterOrEqual",
+        "Less",
+        "LessOrEqual",
+        "Max",
+        "Min",
+        "Mul",
+        "Or",
+        "Pow",
+        "Sub",
+        "Where",
+        "Xor",
+    }
 )
 
 WIDENS: dict[ir.DataType, str] = {
@@ -45,9 +61,14 @@ class Site:
     """Where rules work: a graph, and constants made for it so far."""
 
     graph: ir.Graph
-    opset: int
+    opsets: Mapping[str, int]
     by: str
     shapes: dict[tuple[int, ...], ir.Value] = dataclasses.field(default_factory=dict)
+
+    @property
+    def opset(self) -> int:
+        """The version of ONNX's own operators."""
+        return self.opsets.get("", self.opsets.get("ai.onnx", 0))
 
     def shape(self, sizes: tuple[int, ...]) -> ir.Value:
         """Give the initializer that holds a shape; one for every equal shape."""
@@ -153,11 +174,14 @@ def _casts(node: ir.Node, site: Site) -> ir.Node | None:
         return None
     if single_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
         return None
-    attributes: dict[str, int | float | str | list[int]] = {
-        "to": node.attributes.get_int("to", 0)
-    }
+    attributes = {"to": node.attributes.get_int("to", 0)}
     return put(
-        node, "Cast", inner.inputs[:1], by=site.by, sources=[inner], attributes=attributes
+        node,
+        "Cast",
+        inner.inputs[:1],
+        by=site.by,
+        sources=[inner],
+        attributes=attributes,
     )
 
 
@@ -185,17 +209,18 @@ def _slices(node: ir.Node, site: Site) -> ir.Node | None:
 
 def _window(node: ir.Node) -> list[list[int]] | None:
     """Give starts, ends, axes (from the front) and steps, if all are constant."""
-    rank = None if node.outputs[0].shape is None else len(node.outputs[0].shape)
-    given = [array_of(value) for value in node.inputs[1:]]
-    if rank is None or len(given) < 2 or any(array is None for array in given[:2]):
-        return None
-    for array, value in zip(given[2:], node.inputs[3:], strict=True):
+    rank = 0 if node.outputs[0].shape is None else len(node.outputs[0].shape)
+    given: list[list[int] | None] = []
+    for value in node.inputs[1:]:
+        array = array_of(value)
         if array is None and value is not None:
             return None
-    lists = [None if array is None else array.tolist() for array in given]
-    starts, ends = lists[0], lists[1]
-    axes = lists[2] if len(lists) > 2 and lists[2] is not None else range(len(starts))
-    steps = lists[3] if len(lists) > 3 and lists[3] is not None else [1] * len(starts)
+        given.append(None if array is None else [int(entry) for entry in array])
+    starts, ends, axes, steps = [*given, None, None, None, None][:4]
+    if not rank or starts is None or ends is None:
+        return None
+    axes = list(range(len(starts))) if axes is None else axes
+    steps = [1] * len(starts) if steps is None else steps
     return [starts, ends, [axis % rank for axis in axes], steps]
 
 

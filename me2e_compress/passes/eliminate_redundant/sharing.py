@@ -11,8 +11,15 @@ from me2e_compress.passes.edits import bypass, has_subgraph, is_standard
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
 
 RANDOM = frozenset(
-    "Bernoulli Dropout Multinomial RandomNormal RandomNormalLike RandomUniform"
-    " RandomUniformLike".split()
+    {
+        "Bernoulli",
+        "Dropout",
+        "Multinomial",
+        "RandomNormal",
+        "RandomNormalLike",
+        "RandomUniform",
+        "RandomUniformLike",
+    }
 )
 
 EDGE_BYTES = 64
@@ -94,5 +101,3 @@ def _content(value: ir.Value) -> bytes:
     if tensor is None or tensor.dtype == ir.DataType.STRING:
         return b""
     return hashlib.blake2b(tensor.tobytes(), digest_size=16).digest()
-
-

@@ -8,10 +8,12 @@ import onnx_ir as ir
 
 from me2e_compress import graph as graphs
 from me2e_compress.passes.base import Context, PassResult
-from me2e_compress.passes.edits import graphs_of, remove_dead
+from me2e_compress.passes.edits import Array, graphs_of, remove_dead
 from me2e_compress.passes.fold_constants import commit, evaluation
 from me2e_compress.passes.fold_constants.choice import choose
 from me2e_compress.passes.fold_constants.knowledge import Sweep
+from me2e_compress.passes.fold_constants.ranges import seat_ranges
+from me2e_compress.passes.import_normalize import constants
 
 __all__ = ["FoldConstants"]
 
@@ -19,6 +21,7 @@ __all__ = ["FoldConstants"]
 @dataclasses.dataclass
 class _Tally:
     lifted: int = 0
+    seated: int = 0
     folded: int = 0
     stored: int = 0
     kept: int = 0
@@ -49,14 +52,15 @@ class FoldConstants:
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
-        tally = _Tally()
-        for body in graphs_of(model.graph):
-            tally.lifted += commit.lift_constants(body, self.name)
+        tally = _Tally(lifted=constants.lift(model))
         graphs.infer_shapes(model)
+        for body in graphs_of(model.graph):
+            tally.seated += seat_ranges(body, model.opset_imports, self.name)
         for body in graphs_of(model.graph):
             self._fold(body, model.opset_imports, tally, trust=body is model.graph)
         dead = remove_dead(model.graph) if tally.folded else 0
-        return PassResult(model, tally.lifted + tally.folded + dead, _notes(tally))
+        changes = tally.lifted + tally.seated + tally.folded + dead
+        return PassResult(model, changes, _notes(tally))
 
     def _fold(
         self, body: ir.Graph, opsets: dict[str, int], tally: _Tally, *, trust: bool
@@ -88,7 +92,7 @@ class FoldConstants:
             tally.growth_bytes += choice.growth_bytes
 
 
-def _learn(asked: list[ir.Value], found: dict[ir.Value, object]) -> bool:
+def _learn(asked: list[ir.Value], found: dict[ir.Value, Array]) -> bool:
     """Record shapes that only evaluation could tell; True if there were any."""
     learnt = False
     for value in asked:
@@ -113,5 +117,3 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
         what = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))
         notes.append(f"onnxruntime cannot evaluate {what}: left as they are")
     return tuple(notes)
-
-

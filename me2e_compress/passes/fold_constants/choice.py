@@ -59,9 +59,7 @@ class _Market:
         self.readers = self._readers()
         self.lot = self._lots()
 
-    def clear(
-        self, strict: set[int], frozen: set[int]
-    ) -> tuple[Choice, set[int]]:
+    def clear(self, strict: set[int], frozen: set[int]) -> tuple[Choice, set[int]]:
         """Choose; name the lots that grow the file beyond what their nodes are worth.
 
         Args:

@@ -2,34 +2,9 @@
 
 import onnx_ir as ir
 
-from me2e_compress.graph import replace_value
+from me2e_compress.graph import provenance, replace_value
 from me2e_compress.passes.edits import Array, constant_value, put
 from me2e_compress.passes.fold_constants.choice import Choice
-
-
-def lift_constants(graph: ir.Graph, name: str) -> int:
-    """Turn Constant nodes into initializers of the same name; count them."""
-    count = 0
-    for node in graph:
-        if node.op_type != "Constant" or node.domain not in ("", "ai.onnx"):
-            continue
-        value = node.outputs[0]
-        if "sparse_value" in node.attributes or value.is_graph_output():
-            continue
-        tensor = ir.convenience.get_const_tensor(value)
-        if tensor is None:
-            continue
-        graph.remove(node)
-        weight = ir.Value(
-            name=value.name,
-            shape=ir.Shape(tensor.shape),
-            type=ir.TensorType(tensor.dtype),
-            const_value=tensor,
-        )
-        value.replace_all_uses_with(weight)
-        graph.register_initializer(weight)
-        count += 1
-    return count
 
 
 def commit(
@@ -48,7 +23,9 @@ def commit(
     }
     for value in choice.values:
         one, index = place[value]
-        weight = stored.add(arrays[value], value.name or "")
+        answers = any(node.outputs[index].is_graph_output() for node in one.nodes)
+        label = f"{value.name}_value" if answers else value.name or ""
+        weight = stored.add(arrays[value], label)
         for node in one.nodes:
             equal = node.outputs[index]
             if equal.is_graph_output():
@@ -80,9 +57,10 @@ def _answer(
     if len(node.outputs) == 1:
         put(node, "Identity", [weight], by=name)
         return
-    answer = ir.node("Identity", [weight], num_outputs=1, name=f"{node.name}_answer")
+    label = f"{node.name}_{node.outputs.index(value)}"
+    answer = ir.node("Identity", [weight], num_outputs=1, name=label)
     graph.insert_after(node, answer)
-    answer.metadata_props.update(node.metadata_props)
+    provenance.inherit(answer, [node], by=name)
     new = answer.outputs[0]
     new.name, new.type, new.shape = value.name, value.type, value.shape
     replace_value(value, new)

@@ -10,7 +10,7 @@ import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as failures
 
 from me2e_compress.graph import array_of
-from me2e_compress.passes.edits import NATIVE, Array
+from me2e_compress.passes.edits import Array
 from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
 
 FAILURES = (
@@ -137,11 +137,3 @@ def _node(
 def _port(name: str, array: Array) -> onnx.ValueInfoProto:
     kind = onnx.helper.np_dtype_to_tensor_dtype(np.dtype(array.dtype))
     return onnx.helper.make_tensor_value_info(name, kind, array.shape)
-
-
-def is_storable(value: object) -> bool:
-    """Say whether an evaluated value can be an initializer."""
-    return (
-        isinstance(value, np.ndarray)
-        and ir.DataType.from_numpy(value.dtype) in NATIVE
-    )

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import onnx
 import onnx_ir as ir
 
+from me2e_compress.graph import array_of
 from me2e_compress.passes.edits import Array, is_standard
 
 
@@ -15,40 +16,76 @@ def infer_node(
 
     What is recorded already stays: only outputs without a static shape are written.
     """
-    version = opsets.get("", opsets.get("ai.onnx", 0))
-    if not is_standard(node) or not onnx.defs.has(node.op_type, version):
-        return False
-    types, data = _inputs(node, known)
-    if types is None:
-        return False
-    schema = onnx.defs.get_schema(node.op_type, version)
     try:
-        found = onnx.shape_inference.infer_node_outputs(
-            schema,
-            ir.serde.serialize_node(node),
-            types,
-            data,
-            opset_imports=[onnx.helper.make_opsetid("", version)],
-        )
+        found = _ask(node, known, {}, opsets)
     except (onnx.shape_inference.InferenceError, onnx.checker.ValidationError):
         return False
     return _record(node, found)
 
 
-def _inputs(
-    node: ir.Node, known: Mapping[ir.Value, Array]
-) -> tuple[dict[str, onnx.TypeProto] | None, dict[str, onnx.TensorProto]]:
+def branch_fits(node: ir.Node, branch: ir.Graph, opsets: Mapping[str, int]) -> bool:
+    """Say whether an If's readers would be valid if they read a branch directly.
+
+    They may not: an If keeps the shapes of its branches from its readers, and one that
+    only ever runs by luck (a Range up to a vector of one element) is refused without.
+    """
+    instead = dict(zip(node.outputs, branch.outputs, strict=True))
+    readers = dict.fromkeys(use.node for value in instead for use in value.uses())
+    return all(_accepts(reader, instead, opsets) for reader in readers)
+
+
+def _accepts(
+    node: ir.Node, instead: Mapping[ir.Value, ir.Value], opsets: Mapping[str, int]
+) -> bool:
+    arrays = {
+        value: array
+        for value in node.inputs
+        if value is not None
+        and (array := array_of(_origin(instead.get(value, value)))) is not None
+    }
+    try:
+        _ask(node, arrays, instead, opsets)
+    except (onnx.shape_inference.InferenceError, onnx.checker.ValidationError):
+        return False
+    return True
+
+
+def _origin(value: ir.Value) -> ir.Value:
+    """Look through Identity nodes."""
+    maker = value.producer()
+    while maker is not None and maker.op_type == "Identity" and maker.inputs[0]:
+        value = maker.inputs[0]
+        maker = value.producer()
+    return value
+
+
+def _ask(
+    node: ir.Node,
+    known: Mapping[ir.Value, Array],
+    instead: Mapping[ir.Value, ir.Value],
+    opsets: Mapping[str, int],
+) -> Mapping[str, onnx.TypeProto]:
+    version = opsets.get("", opsets.get("ai.onnx", 0))
+    if not is_standard(node) or not onnx.defs.has(node.op_type, version):
+        return {}
     types: dict[str, onnx.TypeProto] = {}
     data: dict[str, onnx.TensorProto] = {}
     for value in node.inputs:
         if value is None:
             continue
-        if value.type is None or not value.name:
-            return None, data
-        types[value.name] = ir.serde.serialize_value(value).type
+        source = instead.get(value, value)
+        if source.type is None or not value.name:
+            return {}
+        types[value.name] = ir.serde.serialize_value(source).type
         if value in known:
             data[value.name] = onnx.numpy_helper.from_array(known[value], value.name)
-    return types, data
+    return onnx.shape_inference.infer_node_outputs(
+        onnx.defs.get_schema(node.op_type, version),
+        ir.serde.serialize_node(node),
+        types,
+        data,
+        opset_imports=[onnx.helper.make_opsetid("", version)],
+    )
 
 
 def _record(node: ir.Node, found: Mapping[str, onnx.TypeProto]) -> bool:

@@ -89,7 +89,7 @@ class Sweep:
             opsets: the model's.
             refused: nodes that nobody here can evaluate.
             fresh: initializers that ONNX's own inference has not seen yet.
-            through_compute: whether convolutions, products and the like may be constant.
+            through_compute: whether convolutions, products, ... may be constant.
             trust_shapes: False inside loops, where a shape may change every round.
         """
         self.opsets = opsets
@@ -145,7 +145,10 @@ class Sweep:
         return True
 
     def _touched(self, node: ir.Node) -> bool:
-        if all(value.shape is not None and value.shape.is_static() for value in node.outputs):
+        if all(
+            value.shape is not None and value.shape.is_static()
+            for value in node.outputs
+        ):
             return False
         return any(
             value in self.learnt or value in self.known.maker
@@ -246,5 +249,3 @@ def _key(node: ir.Node, inputs: tuple[ir.Value | None, ...]) -> object:
         for name in sorted(node.attributes)
     ]
     return (node.op_type, inputs, len(node.outputs), tuple(attributes))
-
-

@@ -11,6 +11,9 @@ _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
 """Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
 Bernoulli, Multinomial, SequenceEmpty; the window functions and MelWeightMatrix."""
 
+_BY_WIDTH = ("BitCast",)
+"""Standard operators that mean something else at another width."""
+
 
 def demote(model: ir.Model) -> tuple[int, str]:
     """Turn double into float32 everywhere: weights, attributes, value types.
@@ -58,11 +61,13 @@ def _keeper(model: ir.Model) -> str:
             if value.type is not None and _is_double(value.type):
                 return f"{kind} {value.name}"
     for node in _nodes(model):
-        if node.domain == "" or node.op_identifier() in model.functions:
+        known = node.domain == "" and node.op_type not in _BY_WIDTH
+        if known or node.op_identifier() in model.functions:
             continue
         for touched in (*node.inputs, *node.outputs):
             if touched is not None and touched.dtype == ir.DataType.DOUBLE:
-                return f"{touched.name} of the custom operator {node.op_type}"
+                custom = "custom " if node.domain else ""
+                return f"{touched.name} of the {custom}operator {node.op_type}"
     return ""
 
 

@@ -1,0 +1,45 @@
+"""Use any pass written for onnx-ir."""
+
+import dataclasses
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress.errors import PassError
+from me2e_compress.graph import digest
+from me2e_compress.passes.base import Context, PassResult
+
+__all__ = ["OnnxIrPass"]
+
+
+@dataclasses.dataclass(frozen=True)
+class OnnxIrPass:
+    """Run an onnx-ir pass and count its changes by the graph itself.
+
+    Given:   OnnxIrPass(onnx_ir.passes.common.IdentityEliminationPass())
+    Result:  the same as a pass of this package; new nodes get no past, so that the
+             manager refuses onnx-ir passes that make nodes without copying metadata
+
+    Attributes:
+        inner: the pass; it must keep the outputs, as those in ``onnx_ir.passes.common``
+            do.
+    """
+
+    name: ClassVar[str] = "onnx-ir-pass"
+    exact: ClassVar[bool] = True
+    changes_interface: ClassVar[bool] = False
+    inner: ir.passes.PassBase
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Delegate.
+
+        Raises:
+            PassError: the onnx-ir pass broke.
+        """
+        before = digest(model)
+        try:
+            after = self.inner(model).model
+        except ir.passes.PassError as error:
+            what = type(self.inner).__name__
+            raise PassError(f"onnx-ir's {what} broke: {error.__cause__}") from error
+        return PassResult(after, int(digest(after) != before))
