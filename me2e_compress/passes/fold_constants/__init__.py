@@ -22,11 +22,16 @@ __all__ = ["FoldConstants"]
 class _Tally:
     lifted: int = 0
     seated: int = 0
+    dead: int = 0
     folded: int = 0
     stored: int = 0
     kept: int = 0
     growth_bytes: int = 0
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
+
+    @property
+    def changes(self) -> int:
+        return self.lifted + self.seated + self.dead + self.folded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,11 +61,14 @@ class FoldConstants:
         graphs.infer_shapes(model)
         for body in graphs_of(model.graph):
             tally.seated += seat_ranges(body, model.opset_imports, self.name)
-        for body in graphs_of(model.graph):
-            self._fold(body, model.opset_imports, tally, trust=body is model.graph)
-        dead = remove_dead(model.graph) if tally.folded else 0
-        changes = tally.lifted + tally.seated + tally.folded + dead
-        return PassResult(model, changes, _notes(tally))
+        before = -1
+        while tally.changes > before:
+            before = tally.changes
+            tally.dead += remove_dead(model.graph)
+            tally.kept = 0
+            for body in list(graphs_of(model.graph)):
+                self._fold(body, model.opset_imports, tally, trust=body is model.graph)
+        return PassResult(model, tally.changes, _notes(tally))
 
     def _fold(
         self, body: ir.Graph, opsets: dict[str, int], tally: _Tally, *, trust: bool

@@ -7,19 +7,12 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 import onnxruntime
-from onnxruntime.capi import onnxruntime_pybind11_state as failures
 
 from me2e_compress.graph import array_of
 from me2e_compress.passes.edits import Array
 from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
+from me2e_compress.runtime.native import REFUSALS
 
-FAILURES = (
-    failures.Fail,
-    failures.InvalidArgument,
-    failures.InvalidGraph,
-    failures.NotImplemented,
-    failures.RuntimeException,
-)
 SILENT = 4
 """onnxruntime's log level "fatal": what cannot be evaluated is said in the notes."""
 
@@ -37,7 +30,7 @@ def evaluate(
         return {}, []
     try:
         return _run(needed, list(values), known.arrays, known, opsets), []
-    except FAILURES:
+    except REFUSALS:
         return _one_by_one(needed, values, known, opsets)
 
 
@@ -56,7 +49,7 @@ def _one_by_one(
             continue
         try:
             done.update(_run([one], outputs, done, known, opsets))
-        except FAILURES:
+        except REFUSALS:
             refused.extend(one.nodes)
     found = {value: done[value] for value in values if value in done}
     return found, refused

@@ -62,9 +62,10 @@ class FuseBasic:
         done: Counter[str] = Counter()
         refused: Counter[str] = Counter()
         for body in graphs_of(model.graph):
+            refused_now: Counter[str] = Counter()
             for _ in range(ROUNDS):
                 before = done.total()
-                refused_now: Counter[str] = Counter()
+                refused_now.clear()
                 _round(Site(body, opset, self.name, self.swish, refused_now), done)
                 if done.total() == before:
                     break

@@ -19,6 +19,7 @@ from me2e_compress.passes.fuse_basic.match import (
     sole_maker,
 )
 
+KINDS = (ir.DataType.FLOAT, ir.DataType.FLOAT16)
 SINCE = 17
 """The opset that brought LayerNormalization."""
 
@@ -39,15 +40,13 @@ def fuse_layer_norm(node: ir.Node, site: Site) -> bool:
     if site.opset < SINCE:
         return site.refuse(f"LayerNormalization needs opset {SINCE}")
     shape = static_shape(core.source)
-    if shape is None or core.source.dtype not in (
-        ir.DataType.FLOAT,
-        ir.DataType.FLOAT16,
-    ):
+    kind = core.source.dtype
+    if shape is None or kind is None or kind not in KINDS:
         return site.refuse("LayerNormalization of an unknown shape or of float64")
     last, scale = _affine(node, "Mul", shape[core.axis :])
     last, bias = _affine(last, "Add", shape[core.axis :])
     if scale is None:
-        ones = np.ones(shape[core.axis :], core.source.dtype.numpy())
+        ones = np.ones(shape[core.axis :], kind.numpy())
         scale = constant_value(site.graph, ones, f"{node.outputs[0].name}_scale")
     put(
         last,

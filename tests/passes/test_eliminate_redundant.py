@@ -1,0 +1,326 @@
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import onnx_ir as ir
+import pytest
+from hypothesis import given, settings
+
+from me2e_compress.graph import provenance
+from me2e_compress.passes.eliminate_redundant import EliminateRedundant
+from tests.passes.small import NO_MODULES, apply, compute, ops, read
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
+
+
+def one(call: str, kind: str = "float[2,3]", out: str = "float[2,3]") -> str:
+    """A graph of Relu, the call on ``a``, and Relu."""
+    return HEAD + (
+        f"g ({kind} x) => ({out} y) {{ a = Abs(x)  b = {call}  y = Neg(b) }}"
+    )
+
+
+SHAPE = {"s": np.array([2, 3])}
+ONE = {"c": np.float32(1)}
+
+
+@pytest.mark.parametrize(
+    ("call", "weights"),
+    [
+        ("Identity(a)", {}),
+        ("Dropout(a)", {}),
+        ("Cast<to = 1>(a)", {}),
+        ("Reshape(a, s)", SHAPE),
+        ("Expand(a, s)", SHAPE),
+        ("Tile(a, s)", {"s": np.array([1, 1])}),
+        ("Transpose<perm = [0, 1]>(a)", {}),
+        ("Flatten(a)", {}),
+        ("Concat<axis = 0>(a)", {}),
+        ("Max(a)", {}),
+        ("Pad(a, s)", {"s": np.zeros(4, np.int64)}),
+        ("Slice(a, s, e)", {"s": np.array([0]), "e": np.array([99])}),
+        ("Mul(a, c)", ONE),
+        ("Mul(c, a)", ONE),
+        ("Div(a, c)", ONE),
+        ("Pow(a, c)", ONE),
+        ("Add(a, c)", {"c": np.float32(-0.0)}),
+        ("Sub(a, c)", {"c": np.float32(0.0)}),
+        ("Clip(a)", {}),
+        ("Where(c, a, x)", {"c": np.bool_(True)}),
+        ("Abs(a)", {}),
+    ],
+)
+def test_identities_go(call: str, weights: dict[str, Any]) -> None:
+    model = read(one(call), **weights)
+    apply(EliminateRedundant(), model)
+    assert ops(model) == ["Abs", "Neg"]
+
+
+@pytest.mark.parametrize(
+    ("call", "weights", "why"),
+    [
+        ("Add(a, c)", {"c": np.float32(0.0)}, "-0.0 + 0.0 is +0.0"),
+        ("Sub(a, c)", {"c": np.float32(-0.0)}, "-0.0 - -0.0 is +0.0"),
+        ("Sub(c, a)", {"c": np.float32(0.0)}, "a negation"),
+        ("Div(c, a)", ONE, "a reciprocal"),
+        ("Mul(a, c)", {"c": np.ones((2, 2, 3), np.float32)}, "broadcasts"),
+        ("Transpose<perm = [1, 0]>(a)", {}, "moves"),
+        ("Dropout(a, r, t)", {"r": np.float32(0.5), "t": np.bool_(True)}, "trains"),
+        ("Clip(a, c)", ONE, "has a bound"),
+        (
+            "Slice(a, s, e, x0, t)",
+            {
+                "s": np.array([-1]),
+                "e": np.array([-99]),
+                "x0": np.array([0]),
+                "t": np.array([-1]),
+            },
+            "reverses",
+        ),
+    ],
+)
+def test_what_only_looks_like_an_identity_stays(
+    call: str, weights: dict[str, Any], why: str
+) -> None:
+    model = read(one(call, out="float[A,B]"), **weights)
+    EliminateRedundant().run(model, NO_MODULES)
+    assert len(ops(model)) == 3, why
+
+
+MERGES: list[tuple[str, str, list[str] | None]] = [
+    ("Reshape", "b = Transpose<perm = [1, 0]>(a)  c = Reshape(b, s)", None),
+    ("", "b = Transpose<perm = [1, 0]>(a)  c = Transpose<perm = [1, 0]>(b)", []),
+    ("", "b = Reshape(a, flat)  c = Reshape(b, s)", []),
+    ("", "b = Unsqueeze(a, zero)  c = Squeeze(b, zero)", []),
+    ("", "b = Cast<to = 11>(a)  c = Cast<to = 1>(b)", []),
+    ("", "b = Neg(a)  c = Neg(b)", []),
+    ("", "b = Reshape(a, flat)  k = Relu(b)  c = Reshape(k, s)", None),
+]
+
+
+@pytest.mark.parametrize(("_", "body", "middle"), MERGES)
+def test_pairs_are_merged(_: str, body: str, middle: list[str] | None) -> None:
+    text = (
+        HEAD + f"g (float[2,3] x) => (float[2,3] y) {{ a = Abs(x) {body} y = Neg(c) }}"
+    )
+    weights = {"s": np.array([2, 3]), "flat": np.array([6]), "zero": np.array([0])}
+    used = {name: value for name, value in weights.items() if name in body}
+    before, after = read(text, **used), read(text, **used)
+    apply(EliminateRedundant(), after)
+    if middle is not None:
+        assert ops(after) == ["Abs", *middle, "Neg"]
+    else:
+        assert len(ops(after)) == len(ops(before))
+    feeds = {"x": np.random.default_rng(0).normal(size=(2, 3)).astype(np.float32)}
+    np.testing.assert_array_equal(compute(after, feeds)[0], compute(before, feeds)[0])
+
+
+def test_a_cast_that_loses_digits_is_not_skipped() -> None:
+    text = one("Cast<to = 10>(a)").replace(
+        "y = Neg(b)", "c = Cast<to = 1>(b) y = Neg(c)"
+    )
+    model = read(text)
+    apply(EliminateRedundant(), model)
+    assert ops(model) == ["Abs", "Cast", "Cast", "Neg"]
+
+
+def test_slices_of_different_axes_become_one() -> None:
+    text = (
+        HEAD
+        + """
+    g (float[4,6] x) => (float[2,3] y) {
+        a = Slice(x, one, three, zero)
+        y = Slice(a, one, seven, ones, two)
+    }
+    """
+    )
+    numbers = {"zero": 0, "one": 1, "three": 3, "seven": 7, "ones": 1, "two": 2}
+    weights = {name: np.array([number]) for name, number in numbers.items()}
+    before, after = read(text, **weights), read(text, **weights)
+    apply(EliminateRedundant(), after)
+    assert ops(after) == ["Slice"]
+    feeds = {"x": np.arange(24, dtype=np.float32).reshape(4, 6)}
+    np.testing.assert_array_equal(compute(after, feeds)[0], compute(before, feeds)[0])
+
+
+def test_an_expand_before_a_broadcast_goes() -> None:
+    text = (
+        HEAD
+        + """
+    g (float[1,3] x, float[5,3] z) => (float[5,3] y) {
+        wide = Expand(x, s)
+        y = Add(wide, z)
+    }
+    """
+    )
+    model = read(text, s=np.array([5, 3]))
+    apply(EliminateRedundant(), model)
+    assert ops(model) == ["Add"]
+
+
+def test_concats_of_one_axis_become_one() -> None:
+    text = (
+        HEAD
+        + """
+    g (float[2] x, float[2] z) => (float[6] y) {
+        a = Concat<axis = 0>(x, z)
+        y = Concat<axis = 0>(a, x)
+    }
+    """
+    )
+    model = read(text)
+    apply(EliminateRedundant(), model)
+    assert [value.name for value in model.graph.node(0).inputs if value] == [
+        "x",
+        "z",
+        "x",
+    ]
+
+
+TWINS = (
+    HEAD
+    + """
+g (float[2] x, float[2] z) => (float[2] y) {
+    a = Add(x, z)
+    b = Add(z, x)
+    y = Mul(a, b)
+}
+"""
+)
+
+
+def _in_modules(first: str, second: str) -> ir.Model:
+    model = read(TWINS)
+    for node, module in zip(model.graph, (first, second, second), strict=True):
+        provenance.stamp(node, provenance.Provenance(module, (node.name or "",)))
+    return model
+
+
+@pytest.mark.parametrize(
+    ("modules", "across", "left"),
+    [(("det", "det"), False, 2), (("det", "map"), False, 3), (("det", "map"), True, 2)],
+)
+def test_equal_nodes_become_one_within_their_module(
+    modules: tuple[str, str], across: bool, left: int
+) -> None:
+    model = _in_modules(*modules)
+    apply(EliminateRedundant(across_modules=across), model)
+    assert len(model.graph) == left
+
+
+def test_the_survivor_remembers_both() -> None:
+    model = _in_modules("det", "det")
+    apply(EliminateRedundant(), model)
+    past = provenance.read(model.graph.node(0))
+    assert past == provenance.Provenance("det", ("n0", "n1"), ("eliminate-redundant",))
+
+
+def test_random_nodes_are_never_equal() -> None:
+    text = TWINS.replace("Add(x, z)", "RandomNormalLike(x)").replace(
+        "Add(z, x)", "RandomNormalLike(x)"
+    )
+    model = read(text)
+    assert apply(EliminateRedundant(), model).changes == 0
+
+
+def test_equal_initializers_become_one_and_idle_ones_go() -> None:
+    text = (
+        HEAD
+        + """
+    g (float[2] x) => (float[2] y) { a = Add(x, p) b = Mul(a, q) y = Sub(b, r) }
+    """
+    )
+    array = np.array([1, 2], np.float32)
+    model = read(text, p=array, q=array, r=array + 1, idle=array)
+    apply(EliminateRedundant(), model)
+    assert list(model.graph.initializers) == ["p", "r"]
+
+
+def test_initializers_that_differ_in_the_middle_stay_apart() -> None:
+    text = HEAD + "g (float[99] x) => (float[99] y) { a = Add(x, p) y = Mul(a, q) }"
+    p = np.zeros(99, np.float32)
+    q = p.copy()
+    q[50] = 1
+    model = read(text, p=p, q=q)
+    apply(EliminateRedundant(), model)
+    assert list(model.graph.initializers) == ["p", "q"]
+
+
+BRANCHES = (
+    HEAD
+    + """
+g (float[2] x) => (float[2] y) {
+    a = Relu(x)
+    b = If(c) <
+        then_branch = t () => (float[2] p) { inner = Neg(x)  p = Neg(inner) },
+        else_branch = e () => (float[2] q) { q = Abs(x) }
+    >
+    y = Add(a, b)
+}
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("taken", "left"), [(True, ["Relu", "Add"]), (False, ["Relu", "Abs", "Add"])]
+)
+def test_the_branch_that_is_taken_replaces_the_if(taken: bool, left: list[str]) -> None:
+    before = read(BRANCHES, c=np.bool_(taken))
+    after = read(BRANCHES, c=np.bool_(taken))
+    apply(EliminateRedundant(), after)
+    assert ops(after) == left
+    feeds = {"x": np.array([-1, 2], np.float32)}
+    np.testing.assert_array_equal(compute(after, feeds)[0], compute(before, feeds)[0])
+
+
+def test_an_identity_between_input_and_output_stays() -> None:
+    model = read(HEAD + "g (float[2] x) => (float[2] y) { y = Identity(x) }")
+    assert apply(EliminateRedundant(), model).changes == 0
+
+
+STEPS = (
+    "Identity({})",
+    "Neg({})",
+    "Relu({})",
+    "Transpose<perm = [1, 0]>({})",
+    "Transpose<perm = [1, 0]>({})",
+    "Add({}, zero)",
+    "Add({}, minus)",
+    "Mul({}, unit)",
+    "Add({}, {})",
+    "Cast<to = 11>({})",
+    "Concat<axis = 0>({})",
+    "Reshape({}, flat)",
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from(STEPS), min_size=1, max_size=12))
+def test_random_chains_keep_every_bit(steps: list[str]) -> None:
+    lines, last = [], "x"
+    for index, step in enumerate(steps):
+        if "Cast" in step:
+            lines.append(f"w{index} = {step.format(last)}")
+            lines.append(f"v{index} = Cast<to = 1>(w{index})")
+        elif "Reshape" in step:
+            lines.append(f"w{index} = {step.format(last)}")
+            lines.append(f"v{index} = Reshape(w{index}, square)")
+        else:
+            lines.append(f"v{index} = {step.format(*[last] * step.count('{}'))}")
+        last = f"v{index}"
+    body = " ".join([*lines, f"y = Sin({last})"])
+    text = HEAD + f"g (float[3,3] x) => (float[3,3] y) {{ {body} }}"
+    weights: dict[str, Any] = {
+        "zero": np.float32(0.0),
+        "minus": np.float32(-0.0),
+        "unit": np.ones((1, 3), np.float32),
+        "flat": np.array([9]),
+        "square": np.array([3, 3]),
+    }
+    used = {name: value for name, value in weights.items() if name in body}
+    before, after = read(text, **used), read(text, **used)
+    apply(EliminateRedundant(), after)
+    x = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
+    x[0] = (np.nan, -0.0, np.inf)
+    want, got = compute(before, {"x": x})[0], compute(after, {"x": x})[0]
+    assert want.tobytes() == got.tobytes()

@@ -1,0 +1,327 @@
+import re
+from typing import Any
+
+import hypothesis.strategies as st
+import ml_dtypes
+import numpy as np
+import onnx_ir as ir
+import pytest
+from hypothesis import given, settings
+
+from me2e_compress import graph
+from me2e_compress.passes.fold_constants import FoldConstants
+from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
+from tests.passes.small import NO_MODULES, apply, compute, ops, read
+
+SHAPE_CHAIN = """
+<ir_version: 9, opset_import: ["" : 17]>
+g (float[2,3,4] x) => (float[2,12] y) {
+    shape = Shape(x)
+    first = Gather<axis = 0>(shape, zero)
+    row = Unsqueeze(first, axes)
+    target = Concat<axis = 0>(row, rest)
+    y = Reshape(x, target)
+}
+"""
+
+
+def test_shape_arithmetic_becomes_one_initializer() -> None:
+    model = read(SHAPE_CHAIN, zero=np.int64(0), axes=[0], rest=np.array([-1]))
+    apply(FoldConstants(), model)
+    assert ops(model) == ["Reshape"]
+    assert model.graph.initializers["target"].const_value is not None
+    assert model.graph.initializers["target"].const_value.numpy().tolist() == [2, -1]
+
+
+def test_shape_of_a_dynamic_value_stays() -> None:
+    text = SHAPE_CHAIN.replace("float[2,3,4] x", "float[N,3,4] x").replace(
+        "float[2,12] y", "float[N,12] y"
+    )
+    model = read(text, zero=np.int64(0), axes=[0], rest=np.array([-1]))
+    result = apply(FoldConstants(), model)
+    assert result.changes == 0
+    assert ops(model) == ["Shape", "Gather", "Unsqueeze", "Concat", "Reshape"]
+
+
+def test_a_weight_is_transposed_ahead_and_not_stored_twice() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (float[5,3] x) => (float[5,4] y) {
+        turned = Transpose<perm = [1, 0]>(weight)
+        y = MatMul(x, turned)
+    }
+    """
+    weight = np.arange(12, dtype=np.float32).reshape(4, 3)
+    model = read(text, weight=weight)
+    apply(FoldConstants(), model)
+    assert list(model.graph.initializers) == ["turned"]
+    np.testing.assert_array_equal(
+        graph.array_of(model.graph.initializers["turned"]), weight.T
+    )
+
+
+TABLE = """
+<ir_version: 9, opset_import: ["" : 17]>
+g (float[1000,64] x) => (float[1000,64] y) {
+    table = Expand(row, shape)
+    shifted = Add(table, one)
+    y = Mul(x, shifted)
+}
+"""
+TABLE_WEIGHTS: dict[str, Any] = {
+    "row": np.arange(64, dtype=np.float32),
+    "shape": np.array([1000, 64]),
+    "one": np.ones(1, np.float32),
+}
+
+
+def test_a_repeated_table_is_not_stored() -> None:
+    model = read(TABLE, **TABLE_WEIGHTS)
+    result = apply(FoldConstants(), model)
+    assert ops(model) == ["Expand", "Add", "Mul"]
+    assert "cheaper than their bytes" in result.notes[0]
+
+
+def test_a_repeated_table_is_stored_when_nodes_are_dear() -> None:
+    model = read(TABLE, **TABLE_WEIGHTS)
+    apply(FoldConstants(bytes_per_node=200_000), model)
+    assert ops(model) == ["Mul"]
+
+
+def test_the_cut_goes_before_the_table() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (float[1000,64] x) => (float[1000,64] y) {
+        doubled = Mul(row, two)
+        table = Expand(doubled, shape)
+        y = Mul(x, table)
+    }
+    """
+    model = read(
+        text,
+        row=np.arange(64, dtype=np.float32),
+        two=np.float32(2),
+        shape=np.array([1000, 64]),
+    )
+    apply(FoldConstants(), model)
+    assert ops(model) == ["Expand", "Mul"]
+    assert "doubled" in model.graph.initializers
+
+
+PRODUCT = """
+<ir_version: 9, opset_import: ["" : 17]>
+g (float[4,4] x) => (float[4,4] y) {
+    product = MatMul(a, b)
+    y = Add(x, product)
+}
+"""
+
+
+@pytest.mark.parametrize(("through", "left"), [(True, 1), (False, 2)])
+def test_products_of_weights(through: bool, left: int) -> None:
+    ones = np.ones((4, 4), np.float32)
+    model = read(PRODUCT, a=ones, b=ones)
+    apply(FoldConstants(through_compute=through), model)
+    assert len(model.graph) == left
+
+
+def test_a_constant_output_is_handed_on_by_an_identity() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (float[2] x) => (float[2] y, float[2] z) {
+        y = Add(a, a)
+        z = Relu(x)
+    }
+    """
+    model = read(text, a=np.ones(2, np.float32))
+    apply(FoldConstants(), model)
+    assert ops(model) == ["Identity", "Relu"]
+    y, _ = compute(model, {"x": np.zeros(2, np.float32)})
+    assert y.tolist() == [2, 2]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "RandomNormalLike<seed = 1.0>(a)",
+        "Bernoulli(a)",
+        "Dropout(a, half, yes)",
+        "DequantizeLinear(q, scale)",
+    ],
+)
+def test_what_is_random_or_quantized_stays(call: str) -> None:
+    text = f"""
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (float[2] x) => (float[2] y) {{
+        n = {call}
+        y = Add(x, n)
+    }}
+    """
+    weights: dict[str, Any] = {
+        "a": np.ones(2, np.float32),
+        "half": np.float32(0.5),
+        "yes": np.bool_(True),
+        "q": np.ones(2, np.int8),
+        "scale": np.float32(0.5),
+    }
+    used = {n: array for n, array in weights.items() if re.search(rf"\b{n}\b", call)}
+    assert apply(FoldConstants(), read(text, **used)).changes == 0
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [ml_dtypes.bfloat16, ml_dtypes.float8_e4m3fn, ml_dtypes.float8_e5m2],
+)
+def test_unusual_types_stay_whole(kind: Any) -> None:
+    text = """
+    <ir_version: 10, opset_import: ["" : 21]>
+    g (float[2,2] x) => (float[2,2] y) {
+        turned = Transpose(weight)
+        wide = Cast<to = 1>(turned)
+        y = Add(x, wide)
+    }
+    """
+    weight = np.array([[1, 2], [3, 4]]).astype(kind)
+    model = read(text, weight=weight)
+    apply(FoldConstants(), model)
+    tensor = next(iter(model.graph.initializers.values())).const_value
+    assert tensor is not None
+    assert tensor.dtype == ir.DataType.from_numpy(np.dtype(kind))
+    assert ops(model) == ["Transpose", "Cast", "Add"]
+
+
+def test_what_the_runtime_cannot_evaluate_stays_and_the_rest_folds() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (int16[2000] x) => (int16[2000] y) {
+        bad = Max(a, a)
+        good = Add(b, b)
+        sum = Add(bad, good)
+        y = Add(x, sum)
+    }
+    """
+    model = read(text, a=np.arange(2000, dtype=np.int16), b=np.ones(2000, np.int16))
+    result = apply(FoldConstants(), model)
+    assert "good" in model.graph.initializers
+    assert any("cannot evaluate" in note for note in result.notes)
+
+
+def test_an_unknown_operator_stops_nothing() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17, "trt" : 1]>
+    g (float[2,3] x) => (float[M] y) {
+        mystery = trt.Plugin(x)
+        size = Shape(x)
+        flat = ReduceProd<keepdims = 1>(size)
+        y = Reshape(mystery, flat)
+    }
+    """
+    model = read(text)
+    apply(FoldConstants(), model)
+    assert ops(model) == ["Plugin", "Reshape"]
+
+
+def test_equal_expressions_are_stored_once() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (float[4,4] x) => (float[4,4] y) {
+        one = Transpose(weight)
+        two = Transpose(weight)
+        a = MatMul(x, one)
+        y = MatMul(a, two)
+    }
+    """
+    model = read(text, weight=np.arange(16, dtype=np.float32).reshape(4, 4))
+    apply(FoldConstants(), model)
+    assert list(model.graph.initializers) == ["one"]
+
+
+def test_constants_inside_branches_are_folded() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (bool c, float[2] x) => (float[2] y) {
+        y = If(c) <
+            then_branch = t () => (float[2] a) { s = Add(w, w)  a = Add(x, s) },
+            else_branch = e () => (float[2] b) { b = Identity(x) }
+        >
+    }
+    """
+    model = read(text, w=np.ones(2, np.float32))
+    apply(FoldConstants(), model)
+    branch = model.graph.node(0).attributes["then_branch"].as_graph()
+    assert [node.op_type for node in branch] == ["Add"]
+
+
+BINARY = ("Add", "Sub", "Mul", "Max", "Min")
+UNARY = ("Neg", "Abs", "Relu", "Identity", "Floor", "Sqrt")
+
+
+@st.composite
+def programs(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
+    """Random straight-line programs over one input and three weights."""
+    shapes = [(2, 3), (3,), (1, 3), (2, 1)]
+    seed = draw(st.integers(0, 2**16))
+    generator = np.random.default_rng(seed)
+    weights = {
+        f"w{index}": generator.normal(size=draw(st.sampled_from(shapes))).astype("f")
+        for index in range(3)
+    }
+    names, lines = [*weights, "x"], []
+    for index in range(draw(st.integers(1, 12))):
+        if draw(st.booleans()):
+            op, count = draw(st.sampled_from(BINARY)), 2
+        else:
+            op, count = draw(st.sampled_from(UNARY)), 1
+        read_names = [draw(st.sampled_from(names)) for _ in range(count)]
+        lines.append(f"v{index} = {op}({', '.join(read_names)})")
+        names.append(f"v{index}")
+    lines.append(f"z = Add({names[-1]}, x)")
+    body = "\n".join(lines)
+    text = (
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        f"g (float[2,3] x) => (float[A,B] z) {{ {body} }}"
+    )
+    return text, {name: array for name, array in weights.items() if name in body}
+
+
+@settings(max_examples=60, deadline=None)
+@given(programs(), st.sampled_from([0, 40, 512, 10**6]))
+def test_random_programs_keep_their_meaning_and_their_price(
+    program: tuple[str, dict[str, Any]], bytes_per_node: int
+) -> None:
+    text, weights = program
+    before, after = read(text, **weights), read(text, **weights)
+    apply(FoldConstants(bytes_per_node), after)
+    feeds = {"x": np.random.default_rng(0).normal(size=(2, 3)).astype(np.float32)}
+    for want, got in zip(compute(before, feeds), compute(after, feeds), strict=True):
+        np.testing.assert_array_equal(got, want)
+    growth = _file_bytes(after) - _file_bytes(before)
+    removed = len(before.graph) - len(after.graph)
+    assert growth <= bytes_per_node * removed
+
+
+def _file_bytes(model: ir.Model) -> int:
+    return graph.size(model).weight_bytes + ENTRY_BYTES * len(model.graph.initializers)
+
+
+def test_two_runs_give_the_same_bytes() -> None:
+    protos = []
+    for _ in range(2):
+        model = read(TABLE, **TABLE_WEIGHTS)
+        FoldConstants(10**6).run(model, NO_MODULES)
+        protos.append(ir.to_proto(model).SerializeToString(deterministic=True))
+    assert protos[0] == protos[1]
+
+
+def test_a_weight_that_only_dead_nodes_share_is_free_to_fold() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    g (float[2,3] x) => (float[2,3] y) {
+        dead = Add(weight, x)
+        negated = Neg(weight)
+        y = Add(negated, x)
+    }
+    """
+    model = read(text, weight=np.ones((2, 3), np.float32))
+    apply(FoldConstants(bytes_per_node=0), model)
+    assert ops(model) == ["Add"]
