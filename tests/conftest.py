@@ -16,13 +16,13 @@ driver (float[1,4] camera) => (float[1,4] plan) {
 DRIVER_MAP = """
 [modules.backbone]
 role = "feature"
-patterns = ["backbone"]
+optional = ["backbone"]
 [modules.occ]
 role = "prediction"
-patterns = ["occ_head"]
+optional = ["occ_head"]
 [modules.planner]
 role = "prediction"
-patterns = ["plan_head"]
+optional = ["plan_head"]
 """
 
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Annotated
 
+import onnx_ir as ir
 import typer
 
 from me2e_compress import graph, recipe
@@ -16,7 +17,7 @@ from me2e_compress.cli.console import (
     progress,
 )
 from me2e_compress.cli.tables import steps_table, verification_table
-from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.errors import GraphError, ModuleMapError, RecipeError
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.modules import ModuleMap, detect
 from me2e_compress.passes import Context, Pass
@@ -114,7 +115,7 @@ def run(
 ) -> Report:
     """Load, check the frames, run the passes."""
     loaded = graph.load(model)
-    modules = ModuleMap.load(module_map) if module_map else detect(loaded)
+    modules = modules_of(loaded, module_map)
     recording = None
     if frames is not None:
         recording = CalibrationSet(frames)
@@ -122,6 +123,19 @@ def run(
     manager = PassManager(passes, verify_frames, reproducers)
     with progress("passes") as advance:
         return manager.run(loaded, Context(modules, recording, seed), advance)
+
+
+def modules_of(model: ir.Model, module_map: str | None) -> ModuleMap:
+    """Load the map that is asked for, or find the preset that fits.
+
+    A graph that no preset fits is one module, named ``model``.
+    """
+    if module_map is not None:
+        return ModuleMap.load(module_map)
+    try:
+        return detect(model)
+    except ModuleMapError:
+        return ModuleMap.whole()
 
 
 def write(report: Report, source: Path, output: Path) -> Path:

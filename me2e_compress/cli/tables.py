@@ -69,7 +69,7 @@ def modules_table(before: Iterable[Item], after: Iterable[Item]) -> Table:
             item.module,
             f"{item.nodes} → {now.nodes if now else 0}",
             number(item.parameters),
-            f"{megabytes(item.bytes)} → {megabytes(now.bytes if now else 0)}",
+            f"{megabytes(item.weight_bytes)} → {megabytes(now.weight_bytes if now else 0)}",
             f"{_giga(item.macs)} → {_giga(now.macs if now else 0)}",
         )
     return shown
@@ -77,10 +77,28 @@ def modules_table(before: Iterable[Item], after: Iterable[Item]) -> Table:
 
 def fidelity_table(fidelity: Fidelity) -> Table:
     """Show how close the outputs of two graphs are."""
-    shown = table("Fidelity", "output", "SQNR dB", "max|a-b|/max|a|")
+    shown = table(
+        f"Fidelity over {fidelity.frames} frames",
+        "output",
+        "SQNR dB",
+        "max|a-b|/max|a|",
+    )
     for item in fidelity.outputs:
-        shown.add_row(item.name, number(item.sqnr_db, ".1f"), f"{item.error:.1e}")
+        shown.add_row(item.name, f"{item.sqnr_db:.1f}", f"{item.error:.1e}")
+    for name in fidelity.missing:
+        shown.add_row(name, "removed", "")
     return shown
+
+
+def plan_line(fidelity: Fidelity) -> str:
+    """Say in one line how far the plan moved."""
+    if fidelity.plan is None:
+        return f"plan displacement: not measured ({fidelity.plan_reason})"
+    moved = fidelity.plan
+    return (
+        f"plan displacement: mean {moved.mean_m:.4f} m, largest {moved.max_m:.4f} m"
+        f" over {fidelity.frames} frames"
+    )
 
 
 def _giga(count: int | None) -> str:

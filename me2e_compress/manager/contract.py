@@ -19,7 +19,7 @@ def check(current: Pass, before: ir.Model, result: PassResult) -> None:
     """
     _check_claim(current, before, result)
     if not current.changes_interface:
-        _check_interface(current, before, result.model)
+        _check_interface(current, before, result)
     if lost := provenance.missing(result.model):
         raise VerificationError(
             f"{current.name} lost where {len(lost)} nodes come from, {lost[0]} first"
@@ -51,8 +51,11 @@ def _check_claim(current: Pass, before: ir.Model, result: PassResult) -> None:
         raise VerificationError(f"{current.name} changed the graph and denies it")
 
 
-def _check_interface(current: Pass, before: ir.Model, after: ir.Model) -> None:
-    for old, new in zip(graph.interface(before), graph.interface(after), strict=True):
+def _check_interface(current: Pass, before: ir.Model, result: PassResult) -> None:
+    inputs, outputs = graph.interface(before)
+    kept = tuple(port for port in outputs if port.name not in result.removed_outputs)
+    after = graph.interface(result.model)
+    for old, new in zip((inputs, kept), after, strict=True):
         if old != new:
             gone = [port for port in old if port not in new]
             come = [port for port in new if port not in old]

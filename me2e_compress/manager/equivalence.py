@@ -76,6 +76,8 @@ def relative(a: npt.NDArray[np.generic], b: npt.NDArray[np.generic]) -> float:
     wide = np.complex128 if a.dtype.kind == "c" else np.float64
     x, y = a.astype(wide), b.astype(wide)
     finite = np.isfinite(x)
+    if not np.array_equal(finite, np.isfinite(y)):
+        return float("inf")
     if not np.array_equal(x[~finite], y[~finite], equal_nan=True):
         return float("inf")
     if not finite.any():

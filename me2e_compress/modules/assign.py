@@ -94,6 +94,10 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
         placed.setdefault(node, Placement(module, "parameter"))
     for node, module in by_scope.items():
         placed.setdefault(node, Placement(module, "scope"))
+    everywhere = modules.match("")
+    if everywhere is not None:  # a pattern ``**``: what has no name is its too
+        for node in nodes:
+            placed.setdefault(node, Placement(everywhere, "scope"))
     known = {node: place.module for node, place in placed.items()}
     if nodes and not known:
         raise ModuleMapError(

@@ -120,6 +120,11 @@ class ModuleMap:
             draft.strip,
         )
 
+    @classmethod
+    def whole(cls) -> Self:
+        """Make the map of a graph that is one module, ``model``, and no ME2E stack."""
+        return cls("whole", (Module("model", "feature", (), ("**",)),))
+
     def names(self, role: Role | None = None) -> tuple[str, ...]:
         """Name the modules, all or those of a role, in the order of the file."""
         return tuple(m.name for m in self.modules if role in (None, m.role))

@@ -44,7 +44,7 @@ class AblateModules:
 
     name: ClassVar[str] = "ablate-modules"
     exact: ClassVar[bool] = False
-    changes_interface: ClassVar[bool] = True
+    changes_interface: ClassVar[bool] = False
     drop: tuple[str, ...]
     fill: Literal["zeros", "substitute"] = "substitute"
     keep: tuple[str, ...] = ()
@@ -77,7 +77,8 @@ class AblateModules:
         graph.sweep(model)
         graph.sort(model)
         removed = before - graph.node_count(model)
-        return PassResult(model, max(1, removed), (*notes, f"{removed} nodes removed"))
+        notes.append(f"{removed} nodes removed")
+        return PassResult(model, max(1, removed), tuple(notes), tuple(gone))
 
     def _goes(self, node: ir.Node | None) -> bool:
         if node is None or provenance.module_of(node) not in self.drop:

@@ -31,12 +31,15 @@ class PassResult:
     Attributes:
         model: the graph, the same object where the pass works in place.
         changes: how many places changed; 0 exactly if the graph is as it was.
+        removed_outputs: names of the graph outputs that went, where the options asked
+            for that; every other output and every input must be as it was.
         notes: sentences for the report: what was left alone and why.
     """
 
     model: ir.Model
     changes: int
     notes: tuple[str, ...] = ()
+    removed_outputs: tuple[str, ...] = ()
 
 
 @runtime_checkable
@@ -47,7 +50,7 @@ class Pass(Protocol):
         name: what recipes and the command line call it.
         exact: True promises the same outputs, and the manager checks it by running
             the graph before and after; False is judged by fidelity and on the road.
-        changes_interface: True if the pass may change inputs and outputs.
+        changes_interface: True if the pass may change inputs and outputs at will.
     """
 
     name: ClassVar[str]

@@ -19,6 +19,8 @@ def options(current: Pass) -> dict[str, object]:
     found: dict[str, object] = {}
     for field in dataclasses.fields(current):
         value = getattr(current, field.name)
+        if callable(value) or field.name == "name":  # a function has no text
+            continue
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()

@@ -192,3 +192,12 @@ def test_a_map_of_another_stack_names_what_there_is() -> None:
         "map three: none of its patterns matches a parameter or a scope of this graph,"
         " which has head.out, trunk.w"
     )
+
+
+def test_a_graph_without_any_name_is_one_module() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[2] x) => (float[2] y) { a = Relu(x)\n y = Neg(a) }"
+    )
+    placed = assign(model, ModuleMap.whole())
+    assert [placed.module_of(node) for node in model.graph] == ["model", "model"]

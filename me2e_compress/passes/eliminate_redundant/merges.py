@@ -70,11 +70,15 @@ class Site:
         """The version of ONNX's own operators."""
         return self.opsets.get("", self.opsets.get("ai.onnx", 0))
 
-    def shape(self, sizes: tuple[int, ...]) -> ir.Value:
-        """Give the initializer that holds a shape; one for every equal shape."""
+    def shape(self, sizes: tuple[int, ...], reader: ir.Node) -> ir.Value:
+        """Give the initializer that holds a shape; one for every equal shape.
+
+        It is named after its first reader: value names are unique in the whole
+        model, subgraphs included.
+        """
         value = self.shapes.get(sizes)
         if value is None or value.graph is not self.graph:
-            name = "shape_" + "x".join(str(size) for size in sizes)
+            name = f"{reader.outputs[0].name}_shape"
             value = constant_value(self.graph, np.array(sizes, np.int64), name)
             self.shapes[sizes] = value
         return value
@@ -126,7 +130,7 @@ def _views(node: ir.Node, site: Site) -> ir.Node | None:
         return node
     if single_reader(inner.outputs[0]) is None:
         return None
-    shape = site.shape(sizes)
+    shape = site.shape(sizes, node)
     return put(node, "Reshape", [source, shape], by=site.by, sources=[inner])
 
 

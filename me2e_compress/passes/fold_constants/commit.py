@@ -1,5 +1,8 @@
 """Write into the graph what folding found."""
 
+import hashlib
+
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance, replace_value
@@ -38,14 +41,15 @@ def commit(
 
 
 class _Store:
-    """Gives equal small arrays one initializer."""
+    """Gives equal arrays one initializer."""
 
     def __init__(self, graph: ir.Graph) -> None:
         self.graph = graph
         self.known: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
 
     def add(self, array: Array, name: str) -> ir.Value:
-        key = (str(array.dtype), array.shape, array.tobytes())
+        content = hashlib.blake2b(np.ascontiguousarray(array), digest_size=16)
+        key = (str(array.dtype), array.shape, content.digest())
         if key not in self.known:
             self.known[key] = constant_value(self.graph, array, name)
         return self.known[key]

@@ -1,0 +1,131 @@
+"""Passes that misbehave, each in one way, and one that does not."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import provenance
+from me2e_compress.passes.base import Context, PassResult
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """Base of the samples.
+
+    Given:   x
+    Result:  x
+    """
+
+    name: ClassVar[str] = "sample"
+    exact: ClassVar[bool] = True
+    changes_interface: ClassVar[bool] = False
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        return PassResult(model, 0)
+
+
+@dataclass(frozen=True)
+class Idle(_Sample):
+    name: ClassVar[str] = "idle"
+
+
+@dataclass(frozen=True)
+class DropsReluOfSigmoid(_Sample):
+    """Right: a sigmoid is never negative."""
+
+    name: ClassVar[str] = "drops-relu-of-sigmoid"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        changes = 0
+        for node in list(model.graph):
+            source = node.inputs[0].producer() if node.inputs[0] else None
+            if node.op_type == "Relu" and source and source.op_type == "Sigmoid":
+                node.outputs[0].replace_all_uses_with(source.outputs[0])
+                model.graph.remove(node, safe=True)
+                changes += 1
+        return PassResult(model, changes)
+
+
+@dataclass(frozen=True)
+class TurnsTanhIntoSigmoid(_Sample):
+    """Wrong, and says it is exact."""
+
+    name: ClassVar[str] = "turns-tanh-into-sigmoid"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        changes = 0
+        for node in model.graph:
+            if node.op_type == "Tanh":
+                node.op_type = "Sigmoid"
+                changes += 1
+        return PassResult(model, changes)
+
+
+@dataclass(frozen=True)
+class Breaks(_Sample):
+    name: ClassVar[str] = "breaks"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        if any(node.op_type == "Tanh" for node in model.graph):
+            raise KeyError("no such value")
+        return PassResult(model, 0)
+
+
+@dataclass(frozen=True)
+class RenamesOutput(_Sample):
+    name: ClassVar[str] = "renames-output"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        model.graph.outputs[0].name = "other"
+        return PassResult(model, 1)
+
+
+@dataclass(frozen=True)
+class ClaimsTooMuch(_Sample):
+    name: ClassVar[str] = "claims-too-much"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        return PassResult(model, 3)
+
+
+@dataclass(frozen=True)
+class DeniesIt(_Sample):
+    name: ClassVar[str] = "denies-it"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        return PassResult(TurnsTanhIntoSigmoid().run(model, context).model, 0)
+
+
+@dataclass(frozen=True)
+class Forgets(_Sample):
+    name: ClassVar[str] = "forgets"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        del model.graph[0].metadata_props[provenance.ORIGINS]
+        return PassResult(model, 1)
+
+
+@dataclass(frozen=True)
+class Invalidates(_Sample):
+    name: ClassVar[str] = "invalidates"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        model.graph[0].op_type = "NoSuchOperator"
+        return PassResult(model, 1)
+
+
+@dataclass(frozen=True)
+class Halves(_Sample):
+    """Lossy: halves every weight."""
+
+    name: ClassVar[str] = "halves"
+    exact: ClassVar[bool] = False
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        for value in model.graph.initializers.values():
+            if value.const_value is not None:
+                data = value.const_value.numpy() * np.float32(0.5)
+                value.const_value = ir.tensor(data, name=value.name)
+        return PassResult(model, len(model.graph.initializers), ("halved",))

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from me2e_compress.manager.equivalence import relative
+
+FLOATS = hnp.arrays(
+    np.float32,
+    hnp.array_shapes(max_side=4),
+    elements=st.floats(-1e6, 1e6, width=32, allow_subnormal=False),
+)
+
+
+@given(FLOATS)
+def test_nothing_differs_from_itself(a: np.ndarray) -> None:
+    assert relative(a, a.copy()) == 0.0
+
+
+@given(FLOATS, st.floats(0.0009765625, 0.5, width=32))
+def test_the_error_is_relative_to_the_largest(a: np.ndarray, share: float) -> None:
+    peak = np.unravel_index(np.abs(a).argmax(), a.shape)
+    if abs(a[peak]) < 1e-3:
+        return
+    b = a.astype(np.float64)
+    b[peak] *= 1 + share
+    assert relative(a.astype(np.float64), b) == pytest.approx(share, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (np.zeros(2, np.float32), np.zeros(3, np.float32)),
+        (np.zeros(2, np.float32), np.zeros(2, np.float64)),
+        (np.zeros(2, np.float32), np.full(2, 1e-30, np.float32)),
+        (np.array([1.0, np.nan], np.float32), np.array([1.0, 2.0], np.float32)),
+        (np.array([1.0, np.inf], np.float32), np.array([1.0, -np.inf], np.float32)),
+        (np.array([1, 2]), np.array([1, 3])),
+        (np.array(["a"]), np.array(["b"])),
+    ],
+)
+def test_what_no_number_can_measure_is_infinite(a: np.ndarray, b: np.ndarray) -> None:
+    assert relative(a, b) == float("inf")
+
+
+def test_a_new_non_number_is_infinite() -> None:
+    a, b = np.ones(2, np.float32), np.array([1.0, np.nan], np.float32)
+    assert relative(a, b) == float("inf")
+
+
+def test_empty_outputs_are_equal() -> None:
+    assert relative(np.zeros((0, 3)), np.zeros((0, 3))) == 0.0

@@ -1,0 +1,213 @@
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.errors import PassError, VerificationError
+from me2e_compress.graph import provenance
+from me2e_compress.manager import PassManager, Report
+from me2e_compress.passes.base import Context, Pass
+from tests.manager import passes
+
+CHAIN = """
+<ir_version: 9, opset_import: ["" : 17]>
+chain (float[1,8] x) => (float[1,8] y)
+<float[8] w = {1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0}> {
+    ["/backbone/Mul"] a = Mul(x, w)
+    ["/backbone/Sigmoid"] b = Sigmoid(a)
+    ["/backbone/Relu"] c = Relu(b)
+    ["/occ_head/Neg"] d = Neg(c)
+    ["/occ_head/Abs"] e = Abs(d)
+    ["/occ_head/Tanh"] f = Tanh(e)
+    ["/plan_head/Exp"] g = Exp(f)
+    ["/plan_head/Add"] y = Add(g, f)
+}
+"""
+
+
+@pytest.fixture
+def chain() -> ir.Model:
+    return ir.from_onnx_text(CHAIN)
+
+
+def run(
+    model: ir.Model, context: Context, *chosen: Pass, folder: Path | None = None
+) -> Report:
+    return PassManager(chosen, reproducers=folder).run(model, context)
+
+
+def test_a_step_says_what_its_pass_did(chain: ir.Model, context: Context) -> None:
+    step = run(chain, context, passes.DropsReluOfSigmoid()).steps[-1]
+    assert (step.name, step.changes) == ("drops-relu-of-sigmoid", 1)
+    assert (step.before.nodes, step.after.nodes) == (8, 7)
+    assert step.after.weight_bytes == 8 * 4
+
+
+def test_the_given_model_stays_as_it_is(chain: ir.Model, context: Context) -> None:
+    before = graph.digest(chain)
+    run(chain, context, passes.DropsReluOfSigmoid(), passes.Halves())
+    assert graph.digest(chain) == before
+
+
+def test_import_is_put_in_front(chain: ir.Model, context: Context) -> None:
+    report = run(chain, context, passes.Idle())
+    assert [step.name for step in report.steps] == ["import-normalize", "idle"]
+
+
+def test_every_node_knows_its_module(chain: ir.Model, context: Context) -> None:
+    model = run(chain, context, passes.DropsReluOfSigmoid()).model
+    modules = [provenance.module_of(node) for node in model.graph]
+    assert modules == ["backbone"] * 2 + ["occ"] * 3 + ["planner"] * 2
+
+
+def test_what_is_imported_is_not_imported_twice(
+    chain: ir.Model, context: Context
+) -> None:
+    once = run(chain, context, passes.Idle()).model
+    report = run(once, context, passes.Idle())
+    assert [step.name for step in report.steps] == ["idle"]
+
+
+def test_exact_passes_are_measured(chain: ir.Model, context: Context) -> None:
+    (check,) = run(chain, context, passes.DropsReluOfSigmoid()).verifications
+    assert check.errors == {"y": 0.0}
+    assert check.inputs == "synthetic"
+
+
+def test_a_lossy_pass_starts_a_new_stretch(chain: ir.Model, context: Context) -> None:
+    report = run(
+        chain, context, passes.Idle(), passes.Halves(), passes.DropsReluOfSigmoid()
+    )
+    assert [check.passes for check in report.verifications] == [
+        ("import-normalize", "idle"),
+        ("drops-relu-of-sigmoid",),
+    ]
+    assert all(check.errors == {"y": 0.0} for check in report.verifications)
+
+
+def test_the_guilty_pass_is_found_among_others(
+    chain: ir.Model, context: Context
+) -> None:
+    suspects = (
+        passes.Idle(),
+        passes.DropsReluOfSigmoid(),
+        passes.TurnsTanhIntoSigmoid(),
+        passes.Idle(),
+    )
+    with pytest.raises(VerificationError, match="^turns-tanh-into-sigmoid promises"):
+        run(chain, context, *suspects)
+
+
+def test_the_reproducer_is_small_and_reproduces(
+    chain: ir.Model, context: Context, tmp_path: Path
+) -> None:
+    with pytest.raises(VerificationError, match=r"reproducer \(1 nodes\)"):
+        run(chain, context, passes.TurnsTanhIntoSigmoid(), folder=tmp_path)
+    (folder,) = tmp_path.iterdir()
+    piece = graph.load(folder / "model.onnx")
+    assert [node.op_type for node in piece.graph] == ["Tanh"]
+    assert (folder / "pipeline.txt").read_text() == "turns-tanh-into-sigmoid\n"
+    with pytest.raises(VerificationError, match="turns-tanh-into-sigmoid"):
+        run(piece, context, passes.TurnsTanhIntoSigmoid())
+
+
+def test_a_broken_pass_is_named_with_its_cause(
+    chain: ir.Model, context: Context
+) -> None:
+    with pytest.raises(PassError, match="breaks broke: KeyError") as caught:
+        run(chain, context, passes.Breaks())
+    assert isinstance(caught.value.__cause__, KeyError)
+
+
+def test_a_broken_pass_leaves_a_reproducer(
+    chain: ir.Model, context: Context, tmp_path: Path
+) -> None:
+    with pytest.raises(PassError, match=r"reproducer \(1 nodes\)"):
+        run(chain, context, passes.Breaks(), folder=tmp_path)
+    (folder,) = tmp_path.iterdir()
+    assert "KeyError" in (folder / "why.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (passes.RenamesOutput(), "renames-output changed the interface"),
+        (passes.ClaimsTooMuch(), "claims-too-much claims 3 changes but made none"),
+        (passes.DeniesIt(), "denies-it changed the graph and denies it"),
+        (passes.Forgets(), "forgets lost where 1 nodes come from, /backbone/Mul"),
+        (passes.Invalidates(), "invalidates left an invalid graph"),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_a_breach_of_contract_is_named(
+    chain: ir.Model, context: Context, bad: Pass, message: str
+) -> None:
+    with pytest.raises(VerificationError, match=message):
+        run(chain, context, bad)
+
+
+def test_an_operator_nobody_knows_is_carried_through(context: Context) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1]>\n'
+        "m (float[1,8] x) => (float[1,8] y) {"
+        ' ["/backbone/Relu"] a = Relu(x)\n'
+        ' ["/occ_head/Rotate"] b = trt.plugins.Rotate<mode=1>(a)\n'
+        ' ["/plan_head/Neg"] y = Neg(b) }'
+    )
+    report = run(model, context, passes.Idle())
+    (check,) = report.verifications
+    assert "trt.plugins::Rotate" in (check.skipped or "")
+    assert [node.op_type for node in report.model.graph] == ["Relu", "Rotate", "Neg"]
+
+
+def test_open_shapes_are_not_measured_without_frames(context: Context) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        'm (float[N,8] x) => (float[N,8] y) { ["/backbone/Relu"] y = Relu(x) }'
+    )
+    (check,) = run(model, context, passes.Idle()).verifications
+    assert "static shape" in (check.skipped or "")
+
+
+def test_two_runs_give_the_same_bytes(chain: ir.Model, context: Context) -> None:
+    first, second = (
+        ir.to_proto(run(chain, context, passes.DropsReluOfSigmoid()).model)
+        for _ in range(2)
+    )
+    assert first.SerializeToString() == second.SerializeToString()
+
+
+def test_a_report_is_plain_data(
+    chain: ir.Model, context: Context, tmp_path: Path
+) -> None:
+    source, output = tmp_path / "a.onnx", tmp_path / "b.onnx"
+    graph.save(chain, source)
+    report = run(chain, context, passes.Halves())
+    graph.save(report.model, output)
+    record = report.record(source, output)
+    assert record["pipeline"] == "import-normalize,halves"
+    assert record["source"] == {"file": "a.onnx", "sha256": graph.sha256_of(source)}
+
+
+def test_progress_counts_the_passes(chain: ir.Model, context: Context) -> None:
+    seen: list[tuple[int, int, str]] = []
+    PassManager((passes.Idle(),)).run(
+        chain, context, lambda done, total, what: seen.append((done, total, what))
+    )
+    assert seen == [(0, 2, "import-normalize"), (1, 2, "idle"), (2, 2, "verify")]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_equal_non_numbers_are_equal(value: float, context: Context) -> None:
+    literal = "nan" if np.isnan(value) else "inf"
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[2] x) => (float[2] y)\n<float[1] w = {0.0}> {"
+        ' ["/backbone/Add"] y = Add(x, w) }'
+    )
+    data = np.array([value], np.float32)
+    model.graph.initializers["w"].const_value = ir.tensor(data, name="w")
+    (check,) = run(model, context, passes.Idle()).verifications
+    assert check.errors == {"y": 0.0}, literal
