@@ -116,6 +116,8 @@ def session(path: Path) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = THREADS
     options.log_severity_level = 4
+    # Four arenas of a driving model side by side are 15 GB.
+    options.enable_cpu_mem_arena = False
     return onnxruntime.InferenceSession(path, options)
 
 
