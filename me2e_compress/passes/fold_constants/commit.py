@@ -48,7 +48,8 @@ class _Store:
         self.known: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
 
     def add(self, array: Array, name: str) -> ir.Value:
-        content = hashlib.blake2b(np.ascontiguousarray(array).data, digest_size=16)
+        data = np.ascontiguousarray(array).tobytes()
+        content = hashlib.blake2b(data, digest_size=16)
         key = (str(array.dtype), array.shape, content.digest())
         if key not in self.known:
             self.known[key] = constant_value(self.graph, array, name)
