@@ -37,4 +37,5 @@ def judge(reference: Path, candidate: Path, frames: Path) -> Fidelity:
     total = len(recording)
     with progress("frames") as advance:
         read = (advance(f.index, total, "") or f for f in recording)
-        return measure(Session(reference), Session(candidate), read)
+        left, right = (Session(path, release=True) for path in (reference, candidate))
+        return measure(left, right, read)

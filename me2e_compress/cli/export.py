@@ -1,7 +1,7 @@
 """``me2e-compress export``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,7 +13,9 @@ def export(
     stack: Annotated[str, typer.Argument(help="vad-tiny")],
     output: Annotated[Path, typer.Option("-o", "--output", help="the ONNX file")],
     opset: Annotated[int, typer.Option(help="ONNX opset of the file")] = 17,
-    heads: Annotated[str, typer.Option(help="nuscenes or bench2drive")] = "nuscenes",
+    heads: Annotated[
+        Literal["nuscenes", "bench2drive"], typer.Option(help="classes and ego modes")
+    ] = "nuscenes",
     seed: Annotated[int, typer.Option(help="of the initial weights")] = 0,
 ) -> None:
     """Write a reference stack as ONNX, at its published dimensions."""

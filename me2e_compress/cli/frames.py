@@ -19,6 +19,11 @@ def frames(
     """Write calibration frames: synthetic six-camera scenes, coherent in time."""
     with progress("frames") as advance:
         renderer.write_frames(
-            stack, output, count, seed=seed, scene_length=scene_length, progress=advance
+            stack,
+            output,
+            count,
+            seed,
+            scene_length,
+            lambda done: advance(done, count, stack),
         )
     console.print(f"{output}: {count} frames of {stack}, seed {seed}")

@@ -4,10 +4,10 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated
 
+import onnx_ir as ir
 import typer
 
-from me2e_compress import graph
-from me2e_compress.cli.compress import modules_of
+from me2e_compress import graph, recipe
 from me2e_compress.cli.console import (
     console,
     file_bytes,
@@ -16,8 +16,11 @@ from me2e_compress.cli.console import (
     print_json,
     table,
 )
-from me2e_compress.graph import Port
-from me2e_compress.modules import Assignment, Item, assign, itemise
+from me2e_compress.cli.job import modules_of, run_on
+from me2e_compress.graph import Port, provenance
+from me2e_compress.modules import Item, ModuleMap, assign, itemise
+
+_SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,10 +77,11 @@ def inspect(
 def look(path: Path, module_map: str | None) -> Inspection:
     """Read a file and weigh its modules."""
     model = graph.load(path)
-    graph.infer_shapes(model)
     modules = modules_of(model, module_map)
-    placed: Assignment = assign(model, modules)
+    placed = assign(model, modules)
     inputs, outputs = graph.interface(model)
+    items = itemise(model, modules, placed.module_of)
+    costs = {item.module: item.macs for item in weigh(model, modules)}
     return Inspection(
         path.name,
         file_bytes(path),
@@ -86,9 +90,17 @@ def look(path: Path, module_map: str | None) -> Inspection:
         modules.name,
         inputs,
         outputs,
-        itemise(model, modules, placed.module_of, graph.macs),
+        tuple(dataclasses.replace(i, macs=costs.get(i.module)) for i in items),
         {str(rule): count for rule, count in placed.rules().items()},
     )
+
+
+def weigh(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
+    """Weigh the modules once the shape arithmetic is done, which MACs need to know."""
+    if provenance.missing(model):
+        model = run_on(model, recipe.parse(_SHAPES), modules)
+    graph.infer_shapes(model)
+    return itemise(model, modules, provenance.module_of, graph.macs)
 
 
 def _modules(found: Inspection) -> object:

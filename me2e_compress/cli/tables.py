@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+from rich.markup import escape
 from rich.table import Table
 
 from me2e_compress.cli.console import megabytes, number, table
@@ -25,9 +26,16 @@ def steps_table(steps: Iterable[Step]) -> Table:
             _giga(step.after.macs),
             f"{step.seconds:.2f}",
         )
-        for note in step.notes:
-            shown.add_row(f"  [dim]{note}[/dim]")
     return shown
+
+
+def notes(steps: Iterable[Step]) -> str:
+    """Give what the passes have to say, a line each."""
+    return "\n".join(
+        f"[dim]{step.name}: {escape(note)}[/dim]"
+        for step in steps
+        for note in step.notes
+    )
 
 
 def verification_table(verifications: Iterable[Verification]) -> Table:
@@ -69,7 +77,8 @@ def modules_table(before: Iterable[Item], after: Iterable[Item]) -> Table:
             item.module,
             f"{item.nodes} → {now.nodes if now else 0}",
             number(item.parameters),
-            f"{megabytes(item.weight_bytes)} → {megabytes(now.weight_bytes if now else 0)}",
+            f"{megabytes(item.weight_bytes)} →"
+            f" {megabytes(now.weight_bytes if now else 0)}",
             f"{_giga(item.macs)} → {_giga(now.macs if now else 0)}",
         )
     return shown

@@ -186,9 +186,9 @@ def attempt(current: Pass, model: ir.Model, context: Context) -> PassResult | Me
     except Me2eError as error:
         return error
     except Exception as cause:  # whatever a pass may raise: chained, never swallowed
-        error = PassError(f"{current.name} broke: {type(cause).__name__}: {cause}")
-        error.__cause__ = cause
-        return error
+        broken = PassError(f"{current.name} broke: {type(cause).__name__}: {cause}")
+        broken.__cause__ = cause
+        return broken
     return result
 
 

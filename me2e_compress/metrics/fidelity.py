@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.adapter import PlanAdapter
+from me2e_compress.metrics.adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, replay
 
@@ -112,6 +112,9 @@ def _common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"
+    shape = a.outputs[adapter.output].shape
+    if PLAN not in a.metadata and (len(shape) not in (3, 4) or shape[-1] != 2):
+        return None, f"{adapter.output} is {list(shape)}, a plan is [1, n, 2]"
     if adapter.output not in b.outputs:
         return None, f"the second model has no output {adapter.output}"
     return adapter, ""
