@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-console = Console()
+console = Console(record=True)
 errors = Console(stderr=True, highlight=False)
 
 Advance = Callable[[int, int, str], None]

@@ -42,7 +42,7 @@ def demo(
         str, typer.Option(help="feature-ext, prediction or full")
     ] = "feature-ext",
     count: Annotated[int, typer.Option(help="calibration frames")] = 8,
-    rounds: Annotated[int, typer.Option(help="latency rounds")] = 5,
+    rounds: Annotated[int, typer.Option(help="latency rounds")] = 4,
     threads: Annotated[int, typer.Option(help="of onnxruntime, for latency")] = 2,
 ) -> None:
     """Run the main job: export VAD-tiny, make it small, show what that did to it."""
@@ -52,28 +52,23 @@ def demo(
     calibration, held_out = out / "frames", out / "frames-held-out"
     frames(STACK, calibration, count, 4, CALIBRATION_SEED)
     frames(STACK, held_out, 4, 4, HELD_OUT_SEED)
-    exact = out / f"{STACK}.exact.onnx"
     small = out / f"{STACK}.{scheme}.onnx"
-    _compress(source, "exact", calibration, exact)
-    record = _compress(source, scheme, calibration, small)
-    console.print(modules_table(_weigh(source), _weigh(small)))
-    for candidate in (exact, small):
-        found = judge(source, candidate, held_out)
-        console.print(f"\n[bold]{candidate.name} against {source.name}[/bold]")
-        console.print(fidelity_table(found))
-        console.print(plan_line(found))
-    console.print(_files((source, exact, small), held_out, rounds, threads))
-    console.print(f"{small} and {record} are yours.")
-
-
-def _compress(source: Path, name: str, frames: Path, output: Path) -> Path:
-    report = job.run(source, recipe.load(name), frames, None, 0, 2, output.parent)
-    path = job.write(report, source, output)
-    console.print(f"\n[bold]{output.name}: recipe {name}[/bold]")
+    report = job.run(source, recipe.load(scheme), calibration, None, 0, 2, out)
+    record = job.write(report, source, small)
     console.print(steps_table(report.steps))
     console.print(notes(report.steps))
     console.print(verification_table(report.verifications))
-    return path
+    console.print(modules_table(_weigh(source), _weigh(small)))
+    found = judge(source, small, held_out)
+    console.print(fidelity_table(found))
+    console.print(plan_line(found))
+    exact = out / f"{STACK}.exact.onnx"
+    job.write(
+        job.run(source, recipe.load("exact"), None, None, 0, 0, out), source, exact
+    )
+    console.print(_files((source, exact, small), held_out, rounds, threads))
+    console.print(f"{small} and {record} are yours.")
+    console.save_svg(str(out / "demo.svg"), title="me2e-compress demo")
 
 
 def _weigh(path: Path) -> tuple[Item, ...]:

@@ -61,5 +61,5 @@ def write_frames(folder: Path, **arrays: np.ndarray) -> None:
         moved = {
             name: array + array.dtype.type(index) for name, array in arrays.items()
         }
-        np.savez(folder / f"{index:06d}.npz", **moved)  # type: ignore[arg-type]
+        np.savez(folder / f"{index:06d}.npz", **moved)
     (folder / "scenes.json").write_text('{"scenes": [0]}')

@@ -1,6 +1,6 @@
 """What users get wrong: one line that names the culprit, exit 1, nothing changed."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 @pytest.fixture
 def refused(
     command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> Iterator[Callable[..., str]]:
+) -> Callable[..., str]:
     """Run a command that must be refused; give the line that it says."""
 
     def run(*words: str | Path) -> str:
@@ -32,7 +32,7 @@ def refused(
         assert snapshot(files) == before
         return lines[0]
 
-    yield run
+    return run
 
 
 def compress(

@@ -96,7 +96,7 @@ def test_the_guilty_pass_is_found_among_others(
         passes.TurnsTanhIntoSigmoid(),
         passes.Idle(),
     )
-    with pytest.raises(VerificationError, match="^turns-tanh-into-sigmoid promises"):
+    with pytest.raises(VerificationError, match=r"^turns-tanh-into-sigmoid promises"):
         run(chain, context, *suspects)
 
 

@@ -1,0 +1,85 @@
+"""What every shipped recipe makes of VAD-tiny: size, fidelity, and does it still see.
+
+    python -m benchmarks.bench_recipes [FOLDER] [--calibration 8] [--held-out 4]
+
+Exports VAD-tiny and writes its frames into FOLDER (default: a scratch folder), runs
+every recipe of the package from file to file, compares each result with the source on
+frames of another seed, and exchanges one camera's image after the other: the least of
+the six moves of the plan is printed, relative to its length. Random weights: figures
+say how numerically delicate the graph is, not how well a trained one would drive.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from time import process_time
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.manager import PassManager
+from me2e_compress.metrics.fidelity import compare
+from me2e_compress.metrics.reaction import plan_reaction
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.runtime.session import Session
+from me2e_compress.zoo.export import export
+from me2e_compress.zoo.frames import write_frames
+
+STACK, CAMERAS = "vad-tiny", 6
+HEAD = "recipe            MB   nodes  int8 MB  ego dB  plan m (max)     least camera  CPU s"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--calibration", type=int, default=8)
+    parser.add_argument("--held-out", type=int, default=4)
+    options = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.folder or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        source = export(STACK, folder / f"{STACK}.onnx")
+        seen = write_frames(STACK, folder / "frames", options.calibration, 0, 4)
+        held_out = write_frames(STACK, folder / "held-out", options.held_out, 1, 1)
+        frames, others = CalibrationSet(seen), CalibrationSet(held_out)
+        print(HEAD)
+        reference = Session(source, threads=2, release=True)
+        report("source", source, reference, others, 0.0)
+        for name in recipe.shipped():
+            start = process_time()
+            target = folder / f"{name}.onnx"
+            squeeze(source, name, frames, target)
+            report(name, target, reference, others, process_time() - start)
+
+
+def squeeze(source: Path, name: str, frames: CalibrationSet, target: Path) -> None:
+    manager = PassManager(recipe.load(name), verify_frames=0)
+    context = Context(ModuleMap.load("vad"), frames)
+    graph.save(manager.run(graph.load(source), context).model, target)
+
+
+def report(
+    name: str, path: Path, reference: Session, frames: CalibrationSet, cpu_s: float
+) -> None:
+    model = graph.load(path)
+    weights = [value.const_value for value in model.graph.initializers.values()]
+    int8 = sum(w.nbytes for w in weights if w is not None and w.dtype.name == "INT8")
+    session = Session(path, threads=2, release=True)
+    found = compare(reference, session, frames)
+    ego = {item.name: item.sqnr_db for item in found.outputs}["ego_fut_preds"]
+    moves = [
+        plan_reaction(session, frames[0], frames[1], image="img", camera=camera)
+        for camera in range(CAMERAS)
+    ]
+    plan = found.plan
+    metres = "-" if plan is None else f"{plan.mean_m:.3f} ({plan.max_m:.3f})"
+    print(
+        f"{name:15} {path.stat().st_size / 1e6:6.1f} {graph.node_count(model):6}"
+        f" {int8 / 1e6:8.1f} {ego:7.1f}  {metres:15} {min(moves):12.1%} {cpu_s:7.1f}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()

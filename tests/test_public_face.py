@@ -1,0 +1,52 @@
+import re
+from pathlib import Path
+
+import pytest
+
+import me2e_compress
+from me2e_compress import recipe
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import PASSES
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.mark.parametrize("name", me2e_compress.__all__)
+def test_every_public_name_is_there(name: str) -> None:
+    assert getattr(me2e_compress, name) is not None
+
+
+@pytest.mark.parametrize("cls", PASSES.values(), ids=lambda cls: cls.name)
+def test_every_pass_shows_before_and_after(cls: type) -> None:
+    assert "Given:" in (cls.__doc__ or "")
+    assert "Result:" in (cls.__doc__ or "")
+
+
+@pytest.mark.parametrize("name", list(PASSES))
+def test_every_pass_is_documented(name: str) -> None:
+    assert f"| `{name}` |" in (DOCS / "passes.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", recipe.shipped())
+def test_every_recipe_stands_in_the_readme(name: str) -> None:
+    text = (DOCS.parent / "README.md").read_text(encoding="utf-8")
+    short = name.removeprefix("vad-scheme")
+    assert f"`{name}`" in text or f"`{short}`" in text
+
+
+def test_the_links_of_the_documents_lead_somewhere() -> None:
+    for page in (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))):
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_map_of_the_documents_is_a_map() -> None:
+    text = (DOCS / "modules.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    assert ModuleMap.parse(block, "documents").names() == ("backbone", "map")
+
+
+def test_the_pipeline_of_the_readme_parses() -> None:
+    text = (DOCS.parent / "README.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"--passes '([^']+)'", text)
+    assert [current.name for current in recipe.parse(line)][1] == "ablate-modules"

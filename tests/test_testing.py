@@ -1,0 +1,112 @@
+from dataclasses import dataclass
+from typing import ClassVar
+
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import VerificationError
+from me2e_compress.passes import PASSES, Context, Pass, PassResult
+from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.testing import check_pass
+from tests.manager import passes
+
+EXACT = [cls for cls in PASSES.values() if cls.exact and "onnxsim" not in cls.name]
+
+
+@pytest.mark.parametrize("cls", EXACT, ids=lambda cls: cls.name)
+def test_our_exact_passes_hold(
+    driver: ir.Model, context: Context, cls: type[Pass]
+) -> None:
+    assert check_pass(cls(), driver, context).model is not driver
+
+
+def test_ablation_holds(driver: ir.Model, context: Context) -> None:
+    assert check_pass(AblateModules(drop=("occ",)), driver, context).changes
+
+
+@dataclass(frozen=True)
+class DropsOneNegation:
+    """Says it is done while there is more to do.
+
+    Given:   x -> Neg -> Neg -> Neg
+    Result:  x -> Neg -> Neg
+    """
+
+    name: ClassVar[str] = "drops-one-negation"
+    exact: ClassVar[bool] = True
+    changes_interface: ClassVar[bool] = False
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        for node in model.graph:
+            if node.op_type == "Neg" and not node.outputs[0].is_graph_output():
+                node.outputs[0].replace_all_uses_with(node.inputs[0])  # type: ignore[arg-type]
+                model.graph.remove(node, safe=True)
+                return PassResult(model, 1)
+        return PassResult(model, 0)
+
+
+NEGATIONS = """
+<ir_version: 9, opset_import: ["" : 17]>
+m (float[1,4] x) => (float[1,4] y) {
+    ["/backbone/a"] a = Neg(x)
+    ["/backbone/b"] b = Neg(a)
+    ["/backbone/c"] c = Neg(b)
+    ["/backbone/y"] y = Neg(c)
+}
+"""
+
+
+def test_a_pass_that_is_not_idempotent_is_caught(context: Context) -> None:
+    with pytest.raises(VerificationError, match="not idempotent"):
+        check_pass(DropsOneNegation(), ir.from_onnx_text(NEGATIONS), context)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (passes.Idle(), "docstring lacks Given: and Result:"),
+        (passes.Forgets(), "docstring lacks Given: and Result:"),
+    ],
+)
+def test_a_pass_without_given_and_result_is_caught(
+    driver: ir.Model, context: Context, bad: Pass, message: str
+) -> None:
+    with pytest.raises(VerificationError, match=message):
+        check_pass(bad, driver, context)
+
+
+@dataclass
+class Loose:
+    """Could change under our hands.
+
+    Given:   x
+    Result:  x
+    """
+
+    name: ClassVar[str] = "loose"
+    exact: ClassVar[bool] = True
+    changes_interface: ClassVar[bool] = False
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        return PassResult(model, 0)
+
+
+def test_a_pass_that_is_not_frozen_is_caught(
+    driver: ir.Model, context: Context
+) -> None:
+    with pytest.raises(VerificationError, match="Loose is not a frozen dataclass"):
+        check_pass(Loose(), driver, context)
+
+
+def test_a_wrong_exact_pass_is_caught(context: Context) -> None:
+    @dataclass(frozen=True)
+    class Wrong(passes.TurnsTanhIntoSigmoid):
+        """Wrong.
+
+        Given:   Tanh
+        Result:  Sigmoid
+        """
+
+    text = NEGATIONS.replace("c = Neg(b)", "c = Tanh(b)")
+    with pytest.raises(VerificationError, match="moved the outputs"):
+        check_pass(Wrong(), ir.from_onnx_text(text), context)
