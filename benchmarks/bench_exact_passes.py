@@ -195,6 +195,7 @@ def compare(source: Path, folder: Path, preset: str) -> None:
 
 def scaling() -> None:
     import onnx
+
     from benchmarks.synthetic import synthetic
 
     print("nodes in  nodes out  CPU s  CPU ms/node")

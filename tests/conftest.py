@@ -1,8 +1,12 @@
+from pathlib import Path
+
 import onnx_ir as ir
 import pytest
 
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
+from me2e_compress.zoo import truth
+from me2e_compress.zoo.export import export
 
 DRIVER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -40,3 +44,15 @@ def driver_map() -> ModuleMap:
 @pytest.fixture
 def context(driver_map: ModuleMap) -> Context:
     return Context(driver_map)
+
+
+@pytest.fixture(scope="session")
+def vad_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The exported reference stack, seed 0, opset 17, nuScenes heads."""
+    return export("vad-tiny", tmp_path_factory.mktemp("zoo") / "vad-tiny.onnx")
+
+
+@pytest.fixture(scope="session")
+def vad_truth() -> truth.Truth:
+    """What its trace knew: the module of every node, and torch's own MACs."""
+    return truth.record("vad-tiny")

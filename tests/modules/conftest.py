@@ -11,7 +11,6 @@ import torch
 from me2e_compress import graph
 from me2e_compress.modules import Assignment, ModuleMap, assign
 from me2e_compress.zoo import truth
-from me2e_compress.zoo.export import export
 from me2e_compress.zoo.vad.stack import VadTiny
 
 
@@ -35,16 +34,15 @@ class Reference:
 
 
 @pytest.fixture(scope="session")
-def vad(tmp_path_factory: pytest.TempPathFactory) -> Reference:
+def vad(vad_tiny: Path, vad_truth: truth.Truth) -> Reference:
     """VAD-tiny with nuScenes heads, seed 0, opset 17."""
-    path: Path = tmp_path_factory.mktemp("modules") / "vad-tiny.onnx"
-    model = graph.load(export("vad-tiny", path))
+    model = graph.load(vad_tiny)
     with torch.device("meta"):
         shapes = VadTiny()
     return Reference(
         model,
         assign(model, ModuleMap.load("vad")),
-        truth.record("vad-tiny"),
+        vad_truth,
         {name: tensor.numel() for name, tensor in shapes.named_parameters()},
         {name: tensor.numel() for name, tensor in shapes.state_dict().items()},
     )

@@ -4,6 +4,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 import onnx_ir as ir
+import pytest
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
@@ -14,6 +15,8 @@ from me2e_compress.passes.import_normalize import ImportNormalize
 
 if TYPE_CHECKING:
     from tests.modules.conftest import Reference
+
+pytestmark = pytest.mark.xdist_group("vad-truth")
 
 PUBLISHED = {
     "backbone": 23_508_032,

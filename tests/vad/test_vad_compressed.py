@@ -1,6 +1,7 @@
 """Every lossy pass on the stack of real size; about a minute on two cores."""
 
 import math
+from pathlib import Path
 
 import onnx_ir as ir
 import pytest
@@ -20,10 +21,11 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
-from me2e_compress.zoo.export import export
 from me2e_compress.zoo.frames import frames as drive
 from me2e_compress.zoo.stacks import VAD_TINY
 from tests.frames import record
+
+pytestmark = pytest.mark.xdist_group("vad-run")
 
 WEIGHT_MB = 159.5
 """39,865,999 float32 parameters."""
@@ -46,9 +48,8 @@ def context(frames: CalibrationSet) -> Context:
 
 
 @pytest.fixture(scope="module")
-def folded(tmp_path_factory: pytest.TempPathFactory, context: Context) -> ir.Model:
-    path = export("vad-tiny", tmp_path_factory.mktemp("vad") / "vad.onnx")
-    model = graph.load(path)
+def folded(vad_tiny: Path, context: Context) -> ir.Model:
+    model = graph.load(vad_tiny)
     graph.infer_shapes(model)
     for each in (ImportNormalize(), FoldConstants()):
         model = each.run(model, context).model

@@ -1,6 +1,5 @@
 """One export and one torch model for all tests of the zoo."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from me2e_compress.zoo.export import build, export
+from me2e_compress.zoo.export import build
 from me2e_compress.zoo.frames import Frame, frames
 from me2e_compress.zoo.stacks import VAD_TINY
 
@@ -20,12 +19,6 @@ if TYPE_CHECKING:
 def two_threads() -> None:
     """More would only wait for each other on a shared machine."""
     torch.set_num_threads(2)
-
-
-@pytest.fixture(scope="session")
-def vad_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The exported reference stack, seed 0."""
-    return export("vad-tiny", tmp_path_factory.mktemp("zoo") / "vad-tiny.onnx")
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,8 @@ from me2e_compress.zoo.vad.stack import VadTiny
 
 TINY = replace(VAD_TINY, name="tiny", inputs={"x": (1,)}, outputs=("y",))
 
+pytestmark = pytest.mark.xdist_group("vad-run")
+
 
 @pytest.fixture(scope="module")
 def graph(vad_tiny: Path) -> onnx.ModelProto:

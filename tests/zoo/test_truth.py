@@ -15,12 +15,14 @@ from me2e_compress.zoo.regions import listening, region
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.truth import NOT_COMPUTE, Truth
 
+pytestmark = pytest.mark.xdist_group("vad-truth")
+
 MODULES = ["backbone", "bev_encoder", "det", "map", "motion", "neck", "planner"]
 
 
-@pytest.fixture(scope="module")
-def recorded() -> Truth:
-    return truth.record("vad-tiny")
+@pytest.fixture
+def recorded(vad_truth: Truth) -> Truth:
+    return vad_truth
 
 
 def test_every_compute_node_has_a_module(recorded: Truth, vad_tiny: Path) -> None:
