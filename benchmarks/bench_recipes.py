@@ -27,7 +27,7 @@ from me2e_compress.zoo.export import export
 from me2e_compress.zoo.frames import write_frames
 
 STACK, CAMERAS = "vad-tiny", 6
-HEAD = "recipe            MB   nodes  int8 MB  ego dB  plan m (max)    least move   CPU s"
+HEAD = "recipe            MB   nodes  int8 MB  ego dB  plan m (max)  least move  CPU s"
 
 
 def main(argv: Sequence[str] | None = None) -> None:

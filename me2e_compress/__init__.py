@@ -1,11 +1,15 @@
 """Compress modular end-to-end driving models and measure what it costs on the road."""
 
-from me2e_compress import graph, recipe
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import Me2eError
-from me2e_compress.manager import PassManager, Report, Step, Verification
-from me2e_compress.modules import ModuleMap
-from me2e_compress.passes import PASSES, Context, Pass, PassResult
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from me2e_compress import graph, recipe
+    from me2e_compress.calibration.dataset import CalibrationSet
+    from me2e_compress.errors import Me2eError
+    from me2e_compress.manager import PassManager, Report, Step, Verification
+    from me2e_compress.modules import ModuleMap
+    from me2e_compress.passes import PASSES, Context, Pass, PassResult
 
 __version__ = "0.1.0"
 __all__ = [
@@ -23,3 +27,20 @@ __all__ = [
     "graph",
     "recipe",
 ]
+
+_ROOMS = {
+    "CalibrationSet": "calibration.dataset",
+    "Me2eError": "errors",
+    "ModuleMap": "modules",
+    **dict.fromkeys(("PassManager", "Report", "Step", "Verification"), "manager"),
+    **dict.fromkeys(("PASSES", "Context", "Pass", "PassResult"), "passes"),
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name when it is asked for: a worker pays only for what it uses."""
+    if name in ("graph", "recipe"):
+        return importlib.import_module(f"me2e_compress.{name}")
+    if name in _ROOMS:
+        return getattr(importlib.import_module(f"me2e_compress.{_ROOMS[name]}"), name)
+    raise AttributeError(f"me2e_compress has no {name}")
