@@ -33,10 +33,12 @@ class Observation:
             None unless the policy asks for images.
         lidar2img: float32 [6, 4, 4], ego frame (x forward, y left, z up, metres) to
             pixels of each camera.
-        can_bus: float32 [18], in the order of nuScenes' CAN bus as BEVFormer and UniAD
-            read it: [0:3] position (m), [3:7] quaternion w, x, y, z, [7:10] specific
-            acceleration (m/s2, ego frame), [10:13] yaw rate about x, y, z (rad/s),
-            [13:16] velocity (m/s, ego frame), [16] heading (rad), [17] heading (deg).
+        can_bus: float32 [18], laid out as Bench2Drive's UniAD and VAD agents fill it,
+            in a right-handed world (x east, y north): [0:3] metres moved since the
+            last decision (world frame), [3:7] quaternion w, x, y, z, [7] speed (m/s),
+            [10:13] acceleration (m/s2, ego frame), [13:16] angular velocity (rad/s),
+            [16] heading (rad, in [0, 2 pi)), [17] degrees turned since the last
+            decision; [0:3] and [17] are zero at the first decision, [8:10] always.
         command: Where the route goes next: 0 left, 1 right, 2 straight, 3 follow the
             lane, 4 change lane to the left, 5 change lane to the right.
         speed_mps: The ego's speed.
