@@ -1,0 +1,1 @@
+"""Closed loop in highway-env: world, cameras, expert, runner."""
