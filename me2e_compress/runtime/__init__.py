@@ -1,0 +1,1 @@
+"""Models at work: sessions, recurrent state, latency traces."""
