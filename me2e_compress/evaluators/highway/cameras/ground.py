@@ -87,7 +87,8 @@ class GroundSampler:
                         dst=taps[tap, first:last],
                         borderMode=cv2.BORDER_REPLICATE,
                     )
-            stacked[group.rows] = cv2.cvtColor(_mean(list(taps)), cv2.COLOR_RGBA2RGB)
+            samples: list[Bytes] = [taps[tap] for tap in range(len(u))]
+            stacked[group.rows] = cv2.cvtColor(_mean(samples), cv2.COLOR_RGBA2RGB)
 
     def label(self, labels: Bytes, texture: GroundTexture, ego: Ego) -> None:
         """Fill the ground rows of class images uint8 [6, H, W]."""
@@ -102,7 +103,7 @@ class GroundSampler:
 
     @cached_property
     def places(self) -> Floats:
-        """[6, H, W, 2] ground points of all pixels, ego frame; the sky's are far off."""
+        """[6, H, W, 2] ground points of all pixels, ego frame; sky far off."""
         depth = np.minimum(row_depths(self.rig, 1)[0], SKY_M)[..., None, None]
         column = np.arange(self.rig.width) + 0.5 - self.rig.centre_px[0]
         tangent = (column / self.rig.focals_px[:, None])[:, None, :, None]
@@ -112,7 +113,7 @@ class GroundSampler:
 
     @cached_property
     def distances_m(self) -> Floats:
-        """[6, H, W] along the ground from the camera to each pixel; >= `SKY_M` in the sky."""
+        """[6, H, W] along the ground from the camera to each pixel; `SKY_M` for sky."""
         offset = self.places - self.rig.positions[:, None, None, :2]
         return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
 
@@ -129,7 +130,8 @@ class GroundSampler:
         step = (group.steps @ rotation.T) * scale[:, None]
         start32, step32 = start.astype(np.float32), step.astype(np.float32)
         column = np.arange(self.rig.width, dtype=np.float32) + np.float32(0.5)
-        u, v = (step32[..., i, None] * column for i in (0, 1))
+        u = np.asarray(step32[..., 0, None] * column, np.float32)
+        v = np.asarray(step32[..., 1, None] * column, np.float32)
         u += start32[..., 0, None]
         v += start32[..., 1, None]
         return u, v

@@ -11,9 +11,10 @@ from me2e_compress.evaluators.highway.cameras.template import (
 )
 
 POLE_M = 0.06
-HOUSING_M = (0.35, 1.9, 3.7)
+HOUSING_M = (0.35, 1.3, 2.95)
 """Half width, lower and upper edge. Housing and lamps are half as large again as real
-ones, so that the colour of a lamp is more than a pixel at 25 m."""
+ones, so that the colour of a lamp is more than a pixel at 25 m, and hang low enough
+that a car waiting at the stop line still has all three in an image."""
 SIGN_CENTRE_M, SIGN_RADIUS_M = 2.2, 0.5
 FOOT = (-0.2, 0.2)
 

@@ -65,7 +65,8 @@ def car() -> Template:
 def van(*, beacon: bool) -> Template:
     """Return a van, or an ambulance with its stripes and its beacon."""
     body = Box(FULL, FULL, (0.15, 0.5), Slot.BODY)
-    upper = Box((-0.5, 0.42), FULL, (0.5, 0.92), Slot.BODY, (-0.5, 0.3), (-0.47, 0.47))
+    roof, front = (0.92 if beacon else 1.0), ((-0.5, 0.42), (-0.5, 0.3))
+    upper = Box(front[0], FULL, (0.5, roof), Slot.BODY, front[1], (-0.47, 0.47))
     decals = _lamps(body, (0.5, 0.85), 0.16)
     if beacon:
         decals += [
@@ -81,8 +82,9 @@ def van(*, beacon: bool) -> Template:
     ]
     glass.append(upper.on("back", (0.4, 0.6), (0.9, 1.0), Slot.THIRD_LAMP))
     quads = [VEHICLE_SHADOW, *body.quads(decals), *upper.quads(glass)]
-    slot = Slot.BEACON if beacon else Slot.TRIM
-    quads += Box((0.0, 0.12), (-0.35, 0.35), (0.92, 1.0), slot).quads()
+    if beacon:
+        bar = Box((0.0, 0.12), (-0.35, 0.35), (roof, 1.0), Slot.BEACON)
+        quads += bar.quads()
     return template(quads)
 
 
