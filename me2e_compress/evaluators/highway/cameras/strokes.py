@@ -9,10 +9,11 @@ import numpy.typing as npt
 
 from me2e_compress.evaluators.highway.cameras.classes import PixelClass
 from me2e_compress.evaluators.highway.geometry import resample
-from me2e_compress.evaluators.highway.scene import Lane, LaneMarking, Roadmap
+from me2e_compress.evaluators.highway.scene import LaneMarking, Roadmap
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
+Colour = tuple[int, int, int]
 
 ASPHALT = (98, 98, 101)
 SHOULDER = (116, 112, 105)
@@ -22,7 +23,7 @@ KERB_M = 0.3
 """A lighter rim around all pavement: where the road ends is seen without a line."""
 LINE_M = 0.2
 """A little wider than the 0.15 m of real lines: our images are small."""
-DASH_M, DASH_PERIOD_M = 3.0, 9.0
+DASH_M, DASH_PERIOD_M, DASH_STEP_M = 3.0, 9.0, 0.5
 """3 m painted, 6 m free, from the start of the lane: the pattern of highway-env."""
 STOP_LINE_M = 0.5
 BAR_M, BAR_PERIOD_M = 0.5, 1.0
@@ -51,24 +52,27 @@ class GroundPlan:
         low, high = (f(self.texels(points), axis=0) for f in (np.min, np.max))
         return bool((high > -width).all() and (low < (2 * width, 2 * height)).all())
 
-    def polygon(
-        self, corners: Floats, colour: tuple[int, int, int], kind: PixelClass
+    def strip(
+        self, line: Floats, width_m: float, colour: Colour, kind: PixelClass
     ) -> None:
-        """Fill a polygon [N, 2] of world points; its class goes to the same texels."""
-        fixed = [self._fixed(corners)]
-        cv2.fillPoly(self.colours, fixed, colour, cv2.LINE_AA, SUBPIXEL_BITS)
-        cv2.fillPoly(self.classes, fixed, (int(kind),), cv2.LINE_8, SUBPIXEL_BITS)
+        """Paint a band along a polyline [N, 2] of world points.
 
-    def line(self, points: Floats, kind: PixelClass) -> None:
-        """Draw a white line of `LINE_M` along a polyline [N, 2]."""
-        fixed = [self._fixed(points)]
-        texels = max(1, round(LINE_M / self.resolution_m))
-        cv2.polylines(
-            self.colours, fixed, False, WHITE, texels, cv2.LINE_AA, SUBPIXEL_BITS
-        )
-        cv2.polylines(
-            self.classes, fixed, False, (int(kind),), texels, cv2.LINE_8, SUBPIXEL_BITS
-        )
+        Piece by piece, since cv2 paints convex polygons without bias and others not.
+        Antialiased, it rounds them out by half a texel on each side: taken off here.
+        """
+        aliased = self._quads(line, width_m)
+        smooth = self._quads(line, width_m - self.resolution_m)
+        for sharp, soft in zip(aliased, smooth, strict=True):
+            cv2.fillConvexPoly(
+                self.classes, sharp, (int(kind),), cv2.LINE_8, SUBPIXEL_BITS
+            )
+            cv2.fillConvexPoly(self.colours, soft, colour, cv2.LINE_AA, SUBPIXEL_BITS)
+
+    def _quads(self, line: Floats, width_m: float) -> npt.NDArray[np.int32]:
+        """[N - 1, 4, 2] the pieces of a band."""
+        sides = (offset_line(line, side * width_m) for side in (0.5, -0.5))
+        left, right = (self._fixed(side) for side in sides)
+        return np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1)
 
     def _fixed(self, points: Floats) -> npt.NDArray[np.int32]:
         """Fixed-point texels for cv2, which has pixel centres at whole numbers."""
@@ -76,12 +80,12 @@ class GroundPlan:
         return np.rint(scaled).astype(np.int32)
 
 
-def offset_line(lane: Lane, lateral_m: float) -> Floats:
-    """[N, 2] the lane's centre line moved to its left."""
-    tangent = np.gradient(lane.centre, axis=0)
+def offset_line(line: Floats, lateral_m: float) -> Floats:
+    """[N, 2] a polyline moved to its left."""
+    tangent = np.gradient(line, axis=0)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     normal *= lateral_m / np.linalg.norm(normal, axis=1)[:, None]
-    return np.asarray(lane.centre + normal)
+    return np.asarray(line + normal)
 
 
 def paint_lanes(plan: GroundPlan, roadmap: Roadmap) -> None:
@@ -90,15 +94,13 @@ def paint_lanes(plan: GroundPlan, roadmap: Roadmap) -> None:
     shoulders = [lane for lane in lanes if lane.shoulder]
     driven = [lane for lane in lanes if not lane.shoulder]
     layers = (
-        (lanes, KERB_M, KERB, PixelClass.TERRAIN),
+        (lanes, 2 * KERB_M, KERB, PixelClass.TERRAIN),
         (shoulders, 0.0, SHOULDER, PixelClass.SHOULDER),
         (driven, 0.0, ASPHALT, PixelClass.DRIVABLE),
     )
-    for members, rim_m, colour, kind in layers:
+    for members, more_m, colour, kind in layers:
         for lane in members:
-            half = lane.width / 2 + rim_m
-            sides = offset_line(lane, half), offset_line(lane, -half)[::-1]
-            plan.polygon(np.concatenate(sides), colour, kind)
+            plan.strip(lane.centre, lane.width + more_m, colour, kind)
 
 
 def paint_markings(plan: GroundPlan, roadmap: Roadmap) -> None:
@@ -107,30 +109,26 @@ def paint_markings(plan: GroundPlan, roadmap: Roadmap) -> None:
         if not plan.near(lane.centre):
             continue
         for marking, side in ((lane.left, 0.5), (lane.right, -0.5)):
-            edge = offset_line(lane, side * lane.width)
-            if marking is LaneMarking.SOLID:
-                plan.line(edge, PixelClass.LANE_MARKING)
-            elif marking is LaneMarking.DASHED:
-                for dash in _dashes(edge):
-                    plan.line(dash, PixelClass.LANE_MARKING)
+            edge = offset_line(lane.centre, side * lane.width)
+            for line in _pieces(edge, marking):
+                plan.strip(line, LINE_M, WHITE, PixelClass.LANE_MARKING)
 
 
-def _dashes(edge: Floats) -> Iterator[Floats]:
-    dense = resample(edge, 0.5)
-    dash, period = int(DASH_M / 0.5), int(DASH_PERIOD_M / 0.5)
-    for start in range(0, len(dense) - 1, period):
-        yield dense[start : start + dash + 1]
+def _pieces(edge: Floats, marking: LaneMarking) -> Iterator[Floats]:
+    """The polylines to paint along an edge: all of it, its dashes, or nothing."""
+    if marking is LaneMarking.SOLID:
+        yield edge
+    if marking is LaneMarking.DASHED:
+        dense = resample(edge, DASH_STEP_M)
+        dash, period = (round(m / DASH_STEP_M) for m in (DASH_M, DASH_PERIOD_M))
+        for start in range(0, len(dense) - 1, period):
+            yield dense[start : start + dash + 1]
 
 
 def paint_stop_lines(plan: GroundPlan, roadmap: Roadmap) -> None:
     """Paint bars of 0.5 m across the lanes."""
     for ends in roadmap.stop_lines:
-        left, right = np.array(ends, float)
-        along = right - left
-        along = along / np.linalg.norm(along)
-        across = np.array([-along[1], along[0]]) * STOP_LINE_M / 2
-        corners = (left + across, right + across, right - across, left - across)
-        plan.polygon(np.array(corners), WHITE, PixelClass.STOP_LINE)
+        plan.strip(np.array(ends, float), STOP_LINE_M, WHITE, PixelClass.STOP_LINE)
 
 
 def paint_crosswalks(plan: GroundPlan, roadmap: Roadmap) -> None:
@@ -140,8 +138,6 @@ def paint_crosswalks(plan: GroundPlan, roadmap: Roadmap) -> None:
         if np.linalg.norm(b - a) < np.linalg.norm(c - b):
             a, b, c, d = b, c, d, a
         length = float(np.linalg.norm(b - a))
-        for start in np.arange(BAR_M / 2, length - BAR_M / 2, BAR_PERIOD_M):
-            near, far = start / length, min(1.0, (start + BAR_M) / length)
-            bar = [a + near * (b - a), a + far * (b - a)]
-            bar += [d + far * (c - d), d + near * (c - d)]
-            plan.polygon(np.array(bar), WHITE, PixelClass.CROSSWALK)
+        for middle in np.arange(BAR_M, length - BAR_M / 2, BAR_PERIOD_M) / length:
+            bar = np.array([a + middle * (b - a), d + middle * (c - d)])
+            plan.strip(bar, BAR_M, WHITE, PixelClass.CROSSWALK)

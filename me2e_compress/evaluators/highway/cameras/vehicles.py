@@ -93,7 +93,7 @@ def truck() -> tuple[Template, Template]:
     cargo_x, cab_x = (-0.5, 0.18), (0.21, 0.5)
     bed = Box(cargo_x, FULL, (0.17, 0.32), Slot.TRIM)
     cargo = Box(cargo_x, FULL, (0.32, 1.0), Slot.STRIPE)
-    rear = [quad for quad in _lamps(bed, (0.4, 0.95), 0.14) if quad.corners[0, 0] < 0]
+    rear = [quad for quad in _lamps(bed, (0.52, 0.95), 0.14) if quad.corners[0, 0] < 0]
     rear += _wheels(bed, (0.3, 0.62), 0.09, 0.5)
     back = [cargo.on("back", (0.49, 0.51), (0.0, 1.0), Slot.TRIM)]
     cab = Box(cab_x, FULL, (0.14, 0.82), Slot.BODY)
