@@ -33,7 +33,7 @@ FARTHEST_M = 400.0
 """Depth of the last row before the horizon, at most."""
 SKY_M = 4000.0
 """The sky counts as this far away."""
-FAR_M = 18.0
+FAR_M = 10.0
 """From this depth a row is taken from several samples."""
 FAR_TAPS = 4
 BLUR = 0.5

@@ -111,7 +111,8 @@ def rectangle(
 ) -> Floats:
     half = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (length / 2, width / 2)
     cos, sin = np.cos(heading), np.sin(heading)
-    return half @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
+    turned = half @ np.array([(cos, sin), (-sin, cos)])
+    return np.asarray(turned + np.array([x, y]))
 
 
 def first_hit(corners: Floats, bearing: float) -> float:
