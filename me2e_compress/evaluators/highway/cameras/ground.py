@@ -3,8 +3,8 @@
 A camera without pitch and roll sees, in each of its rows, a straight segment of the
 ground at constant depth. So one row of an image is a point and a step in the ego
 frame; both turn and move with the ego, and the pixels of all rows of all cameras are
-one outer product. Rows far away are short in the image and long on the ground: they
-are sampled `FAR_TAPS` times, which keeps distant lines without flicker.
+one outer product. Rows far away are short in the image and long on the ground: they are
+sampled several times, which keeps distant lines without flicker.
 """
 
 from dataclasses import dataclass, replace
@@ -33,9 +33,8 @@ FARTHEST_M = 400.0
 """Depth of the last row before the horizon, at most."""
 SKY_M = 4000.0
 """The sky counts as this far away."""
-FAR_M = 10.0
-"""From this depth a row is taken from several samples."""
-FAR_TAPS = 4
+TAPS = ((0.0, 1), (10.0, 4))
+"""From these depths (metres) on, a row is the mean of this many samples."""
 BLUR = 0.5
 """A mip level is chosen whose texel is this part of a sample's length on the ground:
 less shimmers, more blurs."""
@@ -52,6 +51,8 @@ class RowGroup:
         steps: [T, R, 2] metres from one column to the next.
         levels: [R] mip level.
         blocks: (level, first, last) slices of the rows.
+        coordinates: Two [T, R, W], working memory, written anew in every frame.
+        samples: [T, R, W, 4], likewise.
     """
 
     rows: npt.NDArray[np.intp]
@@ -59,11 +60,13 @@ class RowGroup:
     steps: Floats
     levels: npt.NDArray[np.intp]
     blocks: tuple[tuple[int, int, int], ...]
+    coordinates: tuple[Floats32, Floats32]
+    samples: Bytes
 
 
 @dataclass(frozen=True, eq=False)
 class GroundSampler:
-    """Draws the ground of a rig from a texture.
+    """Draws the ground of a rig from a texture, on one thread at a time.
 
     Args:
         rig: The cameras.
@@ -76,7 +79,7 @@ class GroundSampler:
         stacked = images.reshape(-1, *images.shape[2:])
         for group in self._groups:
             u, v = self._coordinates(group, texture, ego)
-            taps = np.empty((*u.shape, 4), np.uint8)
+            taps = group.samples
             for level, first, last in group.blocks:
                 for tap in range(len(u)):
                     cv2.remap(
@@ -130,19 +133,21 @@ class GroundSampler:
         step = (group.steps @ rotation.T) * scale[:, None]
         start32, step32 = start.astype(np.float32), step.astype(np.float32)
         column = np.arange(self.rig.width, dtype=np.float32) + np.float32(0.5)
-        u = np.asarray(step32[..., 0, None] * column, np.float32)
-        v = np.asarray(step32[..., 1, None] * column, np.float32)
-        u += start32[..., 0, None]
-        v += start32[..., 1, None]
-        return u, v
+        for i, pixels in enumerate(group.coordinates):
+            np.multiply(step32[..., i, None], column, out=pixels)
+            pixels += start32[..., i, None]
+        return group.coordinates
 
     @cached_property
     def _groups(self) -> tuple[RowGroup, ...]:
         depths = row_depths(self.rig, 1)[0]
-        camera, row = np.nonzero(np.isfinite(depths))
-        far = depths[camera, row] > FAR_M
-        near_rows = self._group(camera[~far], row[~far], taps=1)
-        return near_rows, self._group(camera[far], row[far], taps=FAR_TAPS)
+        limits = [*(depth for depth, _ in TAPS), np.inf]
+        groups = list[RowGroup]()
+        for (_, taps), low, high in zip(TAPS, limits[:-1], limits[1:], strict=True):
+            camera, row = np.nonzero((depths >= low) & (depths < high))
+            if len(row):
+                groups.append(self._group(camera, row, taps))
+        return tuple(groups)
 
     @cached_property
     def _label_rows(self) -> RowGroup:
@@ -163,12 +168,15 @@ class GroundSampler:
         centre = self.rig.positions[camera, :2] + depth * forward
         found, first = np.unique(levels, return_index=True)
         last = [*first[1:].tolist(), len(levels)]
+        shape = (taps, len(levels), self.rig.width)
         return RowGroup(
             rows=camera * self.rig.height + row,
             origins=centre - steps * self.rig.centre_px[0],
             steps=steps,
             levels=levels,
             blocks=tuple(zip(found.tolist(), first.tolist(), last, strict=True)),
+            coordinates=(np.empty(shape, np.float32), np.empty(shape, np.float32)),
+            samples=np.empty((*shape, 4), np.uint8),
         )
 
     def _levels(

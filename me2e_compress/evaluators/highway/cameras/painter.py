@@ -22,8 +22,8 @@ Flags = npt.NDArray[np.bool_]
 
 NEAR_M = 0.2
 """Polygons are cut at this depth."""
-SMALLEST_DETAIL_PX = 0.8
-"""Details whose longer side is less are left out."""
+LEAST_PX = np.array([2.0, 0.7])
+"""Details whose longer side is less are left out: others, lamps."""
 SUBPIXEL_BITS = 4
 LIMIT_PX = 20_000.0
 """Far outside any image, and safe in cv2's fixed-point numbers."""
@@ -83,22 +83,27 @@ class Painter:
         poses = _to_ego(np.array([s.pose for s in solids]), ego)
         corners, footprints = _place(solids, poses)
         camera, solid = painting_order(*self._views(footprints))
-        counts = np.array([len(s.colours) for s in solids], np.intp)
-        view, face = _spread(counts, solid)
+        view, face = _spread(np.array([len(s.colours) for s in solids]), solid)
         points = self._to_camera(corners[:, :, face], camera[view])
-        details = np.concatenate([s.template.details for s in solids])
-        keep, pixels = self._project(points, camera[view], details[face])
-        seen, whose, face = camera[view[keep]], solid[view[keep]], face[keep]
-        away = poses[whose, :2] - self.rig.positions[seen, :2]
-        slots = np.concatenate([s.template.slots for s in solids])
+        seen = self._seen(points, camera[view])
+        points, view, face = points[:, :, seen], view[seen], face[seen]
+        pixels = self._project(points, camera[view])
+        details = np.concatenate([s.template.details for s in solids])[face]
+        lamps = np.concatenate([s.template.slots for s in solids])[face] >= FIRST_LAMP
+        keep = np.flatnonzero(
+            ~details | (_extent(pixels) > LEAST_PX[lamps.astype(int)])
+        )
+        view, face = view[keep], face[keep]
+        camera, solid = camera[view], solid[view]
+        away = poses[solid, :2] - self.rig.positions[camera, :2]
         return Faces(
-            cameras=seen,
-            polygons=self._polygons(points[:, :, keep], pixels[..., keep], seen),
+            cameras=camera,
+            polygons=self._polygons(points[..., keep], pixels[..., keep], camera),
             colours=np.concatenate([s.colours for s in solids])[face],
-            lamps=slots[face] >= FIRST_LAMP,
-            details=details[face],
-            kinds=np.array([s.kind for s in solids], np.intp)[whose],
-            places=poses[whose, :2],
+            lamps=lamps[keep],
+            details=details[keep],
+            kinds=np.array([s.kind for s in solids], np.intp)[solid],
+            places=poses[solid, :2],
             distances=np.hypot(away[:, 0], away[:, 1]),
         )
 
@@ -123,27 +128,33 @@ class Painter:
         forward = axes[:, 2, 0] * dx + axes[:, 2, 1] * dy
         return np.stack([right, CAMERA_HEIGHT_M - points[2], forward])
 
-    def _project(
-        self, points: Floats, camera: Ints, details: Flags
-    ) -> tuple[Ints, Floats]:
-        """Indices of the faces to draw, and the pixels [2, 4, M] of all faces."""
-        depth = points[2]
-        farthest, cut = depth.max(axis=0), depth.min(axis=0) < NEAR_M
-        scale = self.rig.focals_px[camera] / np.maximum(depth, NEAR_M)
-        u, v = (points[i] * scale + self.rig.centre_px[i] for i in (0, 1))
-        left, right, top, bottom = u.min(0), u.max(0), v.min(0), v.max(0)
-        inside = (right > -1.0) & (left < self.rig.width + 1.0)
-        inside &= (bottom > -1.0) & (top < self.rig.height + 1.0)
-        large = np.maximum(right - left, bottom - top) > SMALLEST_DETAIL_PX
-        keep = _towards(points) & (farthest > NEAR_M) & (inside | cut)
-        return np.flatnonzero(keep & (large | ~details)), np.stack([u, v])
+    def _seen(self, points: Floats, camera: Ints) -> Ints:
+        """Indices of the faces [3, 4, M] that look at the camera, in its frustum."""
+        right, down, depth = points
+        centre_column, horizon = self.rig.centre_px
+        slope = depth / self.rig.focals_px[camera]
+        outside = (depth < NEAR_M).all(axis=0)
+        for across, low, high in (
+            (right, centre_column, self.rig.width - centre_column),
+            (down, horizon, self.rig.height - horizon),
+        ):
+            outside |= (across < -(low + 1.0) * slope).all(axis=0)
+            outside |= (across > (high + 1.0) * slope).all(axis=0)
+        return np.flatnonzero(_towards(points) & ~outside)
+
+    def _project(self, points: Floats, camera: Ints) -> Floats:
+        """[2, 4, M] pixels; corners before the near plane come out wrong."""
+        scale = self.rig.focals_px[camera] / np.maximum(points[2], NEAR_M)
+        pixels = points[:2] * scale
+        pixels += np.array(self.rig.centre_px)[:, None, None]
+        return np.asarray(pixels)
 
     def _polygons(
         self, points: Floats, pixels: Floats, camera: Ints
     ) -> list[npt.NDArray[np.int32]]:
         polygons = list(_fixed(pixels.transpose(2, 1, 0)))
-        for i in np.flatnonzero(points[2].min(axis=0) < NEAR_M).tolist():
-            kept = _cut(points[:, :, i].T)
+        for i in np.flatnonzero((points[2] < NEAR_M).any(axis=0)).tolist():
+            kept = _cut(points[:, :, i].T.tolist())
             scale = self.rig.focals_px[camera[i]] / kept[:, 2:]
             polygons[i] = _fixed(kept[:, :2] * scale + self.rig.centre_px)
         return polygons
@@ -196,6 +207,11 @@ def _spread(counts: Ints, solid: Ints) -> tuple[Ints, Ints]:
     return view, (np.cumsum(counts) - counts)[solid][view] + within
 
 
+def _extent(pixels: Floats) -> Floats:
+    """[M] longer side of what encloses each polygon [2, 4, M], in pixels."""
+    return np.asarray((pixels.max(axis=1) - pixels.min(axis=1)).max(axis=0))
+
+
 def _towards(points: Floats) -> Flags:
     """Whether faces [3, 4, M] look at the camera; their diagonals give the normal."""
     (ax, ay, az), (bx, by, bz) = (
@@ -207,14 +223,15 @@ def _towards(points: Floats) -> Flags:
     return np.asarray(volume < 0.0)
 
 
-def _cut(polygon: Floats) -> Floats:
-    """The part of a polygon [N, 3] in front of the near plane."""
-    kept = list[Floats]()
-    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+def _cut(polygon: list[list[float]]) -> Floats:
+    """The part in front of the near plane [N, 3] of a polygon of (x, y, depth)."""
+    kept = list[list[float]]()
+    for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         if a[2] >= NEAR_M:
             kept.append(a)
         if (a[2] >= NEAR_M) != (b[2] >= NEAR_M):
-            kept.append(a + (NEAR_M - a[2]) / (b[2] - a[2]) * (b - a))
+            part = (NEAR_M - a[2]) / (b[2] - a[2])
+            kept.append([p + part * (q - p) for p, q in zip(a, b, strict=True)])
     return np.array(kept)
 
 

@@ -11,13 +11,12 @@ from me2e_compress.evaluators.highway.cameras.rig import CAMERAS, CameraRig
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
-Floats32 = npt.NDArray[np.float32]
 
 ZENITH, HAZE = (128, 170, 224), (216, 228, 238)
 HILLS, TREES = (122, 146, 142), (66, 94, 60)
-COLUMNS, ROWS = 1440, 64
-"""Panorama: 0.25 degrees a column."""
-TALLEST = 0.12
+COLUMNS, ROWS = 2880, 64
+"""Panorama: 0.125 degrees a column."""
+TALLEST = 0.1
 """Tangent of the elevation of the panorama's upper edge; above it the sky is even."""
 
 
@@ -40,46 +39,36 @@ class Sky:
 
     def paint(self, images: Bytes, heading: float) -> None:
         """Fill the sky rows of uint8 [6, H, W, 3] for an ego heading in radians."""
-        first, u, v = self._strip
+        first, texels = self._strip
         images[:, :first] = self._even[:first]
-        turned = u + np.float32(heading / (2 * np.pi) * COLUMNS % COLUMNS)
-        turned -= np.float32(COLUMNS) * (turned >= COLUMNS)
-        across = np.broadcast_to(turned[:, None], v.shape)
-        flat = (-1, self.rig.width)
-        seen = cv2.remap(
-            self._panorama,
-            np.ascontiguousarray(across).reshape(flat),
-            v.reshape(flat),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        strip = cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB)
-        images[:, first : self.height] = strip.reshape(*v.shape, 3)
+        turned = texels + round(heading / (2 * np.pi) * COLUMNS) % COLUMNS
+        seen = self._panorama.take(turned).view(np.uint8)
+        strip = cv2.cvtColor(seen.reshape(-1, self.rig.width, 4), cv2.COLOR_RGBA2RGB)
+        images[:, first : self.height] = strip.reshape(*texels.shape, 3)
 
     @cached_property
     def _even(self) -> Bytes:
         return np.full((self.height, self.rig.width, 3), ZENITH, np.uint8)
 
     @cached_property
-    def _strip(self) -> tuple[int, Floats32, Floats32]:
-        """First row, panorama columns [6, W] at heading 0 and rows [6, R, W]."""
+    def _strip(self) -> tuple[int, npt.NDArray[np.intp]]:
+        """First row, and the panorama's texel of each pixel [6, R, W] at heading 0."""
         focal = self.rig.focals_px[:, None]
         centre_column, horizon = self.rig.centre_px
         tangent = (np.arange(self.rig.width) + 0.5 - centre_column) / focal
-        yaw = np.deg2rad([camera.yaw_deg for camera in CAMERAS])[:, None]
-        azimuth = (yaw - np.arctan(tangent)) % (2 * np.pi)
-        first = max(
-            0, int(horizon - TALLEST * focal.max() * np.hypot(1, tangent).max())
-        )
+        slant = np.hypot(1.0, tangent)
+        first = max(0, int(horizon - TALLEST * (focal * slant).max()))
         rise = (horizon - np.arange(first, self.height) - 0.5) / focal
-        elevation = rise[:, :, None] / np.hypot(1.0, tangent)[:, None, :]
-        row = (1.0 - elevation / TALLEST) * ROWS - 0.5
-        column = azimuth / (2 * np.pi) * COLUMNS
-        return first, column.astype(np.float32), row.astype(np.float32)
+        elevation = rise[:, :, None] / slant[:, None, :]
+        row = np.clip((1.0 - elevation / TALLEST) * ROWS, 0, ROWS - 1).astype(np.intp)
+        yaw = np.deg2rad([camera.yaw_deg for camera in CAMERAS])[:, None]
+        azimuth = (yaw - np.arctan(tangent)) / (2 * np.pi) % 1.0
+        column = (azimuth * COLUMNS).astype(np.intp)
+        return first, row * (2 * COLUMNS) + column[:, None, :]
 
     @cached_property
-    def _panorama(self) -> Bytes:
-        """RGBA [ROWS, COLUMNS + 1, 4]; the first column is repeated at the end."""
+    def _panorama(self) -> npt.NDArray[np.uint32]:
+        """[ROWS * 2 * COLUMNS] RGBA texels, twice around: no index needs to wrap."""
         rng = np.random.default_rng(self.seed)
         elevation = TALLEST * (1.0 - (np.arange(ROWS) + 0.5) / ROWS)[:, None]
         share = np.sqrt(elevation / TALLEST)[..., None]
@@ -94,9 +83,9 @@ class Sky:
             covered = (skyline - elevation) * ROWS / TALLEST + 0.5
             alpha = np.clip(covered, 0.0, 1.0)[..., None]
             picture = (1 - alpha) * picture + alpha * np.array(colour, float)
-        closed = np.concatenate([picture, picture[:, :1]], axis=1)
-        rounded = np.rint(closed).astype(np.uint8)
-        return np.asarray(cv2.cvtColor(rounded, cv2.COLOR_RGB2RGBA), np.uint8)
+        rounded = np.rint(np.concatenate([picture, picture], axis=1)).astype(np.uint8)
+        texels = np.asarray(cv2.cvtColor(rounded, cv2.COLOR_RGB2RGBA), np.uint8)
+        return texels.reshape(-1).view(np.uint32)
 
 
 def _skyline(waves: tuple[int, ...], rng: np.random.Generator) -> Floats:
