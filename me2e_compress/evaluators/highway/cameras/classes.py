@@ -40,5 +40,4 @@ ACTOR_CLASSES = {
     ActorKind.CONE: PixelClass.STATIC,
     ActorKind.BARRIER: PixelClass.STATIC,
 }
-"""Every kind of actor has a class; a new kind without one fails at import of none,
-but at its first frame, by a KeyError that names it."""
+"""What an actor's pixels are."""

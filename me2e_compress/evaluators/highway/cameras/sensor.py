@@ -17,7 +17,7 @@ RAIN_NOISE = 5.0
 STREAKS = 60
 """Streaks in an image in the heaviest rain."""
 STREAK_LEVEL = 46
-POOL = 4
+POOL = 2
 """The noise comes from a pool of this many sets of images, at a random offset."""
 
 

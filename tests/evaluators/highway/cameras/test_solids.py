@@ -11,6 +11,7 @@ from me2e_compress.evaluators.highway.cameras import (
     Cameras,
     PixelClass,
 )
+from me2e_compress.evaluators.highway.cameras.classes import ACTOR_CLASSES
 from me2e_compress.evaluators.highway.cameras.ordering import painting_order
 from me2e_compress.evaluators.highway.cameras.solids import TEMPLATES
 from me2e_compress.evaluators.highway.scene import (
@@ -246,5 +247,5 @@ def test_what_is_far_away_is_not_drawn(cameras: Cameras) -> None:
     np.testing.assert_array_equal(cameras.render(far), cameras.render(town.scene()))
 
 
-def test_every_kind_has_a_size_and_a_shape() -> None:
-    assert set(TEMPLATES) == set(ActorKind) == set(DIMENSIONS)
+def test_every_kind_has_a_size_a_shape_and_a_class() -> None:
+    assert set(TEMPLATES) == set(ACTOR_CLASSES) == set(ActorKind) == set(DIMENSIONS)
