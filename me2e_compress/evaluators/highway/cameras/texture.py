@@ -25,7 +25,7 @@ Bytes = npt.NDArray[np.uint8]
 RESOLUTION_M = 0.125
 """Metres of a texel at the finest level: a 0.15 m line is just wider than one."""
 LEVELS = 6
-MARGIN_M = 70.0
+MARGIN_M = 60.0
 """How far the texture reaches beyond the route's bounding box. What lies further
 repeats its border, which continues a straight road."""
 GRASS = (92, 122, 70)
@@ -68,7 +68,7 @@ def paint_texture(
 
     Args:
         roadmap: What to paint.
-        route: [N, 2] metres: the texture covers their bounding box and 70 m around.
+        route: [N, 2] metres: the texture covers their bounding box and 60 m around.
         seed: Of the grain of grass and asphalt.
     """
     west, south = route.min(axis=0) - MARGIN_M

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.evaluators.highway.cameras import (
@@ -26,6 +26,7 @@ Floats = npt.NDArray[np.float64]
 FRONT, FRONT_LEFT, FRONT_RIGHT, BACK = (
     CAMERA_NAMES.index(name) for name in ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK")
 )
+TEXTURE = town.paint()
 PAINTS_APART = (0, 1)
 """Numbers of two actors that get different colours."""
 
@@ -245,6 +246,33 @@ def test_something_in_the_face_of_a_camera_is_cut_not_dropped(cameras: Cameras) 
 def test_what_is_far_away_is_not_drawn(cameras: Cameras) -> None:
     far = town.scene(town.actor(130.0, 0.0))
     np.testing.assert_array_equal(cameras.render(far), cameras.render(town.scene()))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(ActorKind),
+            st.floats(-8, 8),
+            st.floats(-8, 8),
+            st.floats(-7, 7),
+        ),
+        max_size=8,
+    )
+)
+def test_actors_may_be_anywhere_even_inside_each_other(
+    crowd: list[tuple[ActorKind, float, float, float]],
+) -> None:
+    actors = [
+        town.actor(x, y, kind, number=i, heading=heading)
+        for i, (kind, x, y, heading) in enumerate(crowd)
+    ]
+    cameras = Cameras(TEXTURE, CameraRig(48, 80))
+    labels = cameras.classes(town.scene(*actors))
+    kinds = {int(ACTOR_CLASSES[kind]) for kind, *_ in crowd}
+    solid = set(np.unique(labels[labels >= PixelClass.VEHICLE]).tolist())
+    assert solid <= kinds
+    assert cameras.render(town.scene(*actors)).shape == (6, 48, 80, 3)
 
 
 def test_every_kind_has_a_size_a_shape_and_a_class() -> None:

@@ -3,6 +3,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -78,6 +79,7 @@ def test_frames_are_the_same_in_every_process() -> None:
             text=True,
             check=True,
             env={**os.environ, "PYTHONHASHSEED": salt},
+            cwd=Path(__file__).parents[4],
         )
         return done.stdout.split()
 
