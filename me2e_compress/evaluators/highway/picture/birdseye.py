@@ -61,6 +61,7 @@ STATES: dict[SignalState, Colour] = {
 }
 AHEAD_M, BEHIND_M = 50.0, 22.0
 SCALE_BAR_M = 10.0
+LABEL_PX = 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,23 +207,28 @@ def _plan(canvas: Canvas, scene: Scene, plan: Floats) -> None:
 
 
 def _infractions(canvas: Canvas, events: tuple[Event, ...]) -> None:
-    """A cross where the ego was, and the name beside it."""
+    """A cross where the ego was, and the name beside it; one of a kind at a place."""
     rows, columns = canvas.pixels.shape[:2]
     arm, texts = 7.0 / canvas.scale, list[Text]()
     for event in events:
-        place = np.array([event.x, event.y])
-        column, row = canvas.to_pixels(place).tolist()
-        if not (0 <= column < columns and 0 <= row < rows):
-            continue
-        for colour, width in ((PAPER, 7), (INFRACTION, 3)):
-            for slant in (1.0, -1.0):
-                offset = np.array([arm, slant * arm])
-                canvas.line((place - offset, place + offset), colour, width)
+        column, row = canvas.to_pixels((event.x, event.y)).tolist()
         name = event.kind.replace("_", " ")
-        left = min(column + 12, columns - text_width(name, 14) - 4)
-        below = row - 8 + 16 * sum(text.row // 16 == row // 16 for text in texts)
-        texts.append(Text(name, left, below, 14, INFRACTION, PAPER))
+        left = min(column + 12, columns - text_width(name, LABEL_PX) - 4)
+        near = [t for t in texts if np.hypot(t.column - left, t.row - row) < 40]
+        inside = 0 <= column < columns and 0 <= row < rows
+        if not inside or name in (text.content for text in near):
+            continue
+        _cross(canvas, np.array([event.x, event.y]), arm)
+        top = row - LABEL_PX / 2 + (LABEL_PX + 2) * len(near)
+        texts.append(Text(name, left, top, LABEL_PX, INFRACTION, PAPER))
     write(canvas.pixels, texts)
+
+
+def _cross(canvas: Canvas, place: Floats, arm_m: float) -> None:
+    for colour, width in ((PAPER, 7), (INFRACTION, 3)):
+        for slant in (1.0, -1.0):
+            offset = np.array([arm_m, slant * arm_m])
+            canvas.line((place - offset, place + offset), colour, width)
 
 
 def _scale_bar(canvas: Canvas) -> None:
