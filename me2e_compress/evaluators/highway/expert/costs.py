@@ -1,0 +1,100 @@
+"""What each sampled future costs besides collisions: rules, progress, comfort.
+
+The weights were chosen by hand: a collision outweighs a rule, a rule outweighs
+progress, progress outweighs comfort.
+"""
+
+import numpy as np
+
+from me2e_compress.evaluators.highway.expert.candidates import Candidates
+from me2e_compress.evaluators.highway.expert.collisions import FADE, followers
+from me2e_compress.evaluators.highway.expert.forecast import Forecast
+from me2e_compress.evaluators.highway.expert.targets import SLOW_MPS, Place
+from me2e_compress.evaluators.highway.geometry import Floats
+from me2e_compress.evaluators.highway.scene import Ego, RoutePath
+
+OFF_ROAD, RUN_LINE, WRONG_SIDE, HEADWAY = 120.0, 500.0, 1.5, 14.0
+PROGRESS_PER_M, SPEED_PER_MPS = 0.40, 0.8
+OFFSET_PER_M, SWITCH, BRAKE_HARD, EFFORT, JERK = 0.6, 3.0, 3.0, 0.4, 0.15
+STANDOFF_M, GAP_S = 2.0, 0.8
+"""Distance kept to a leader: standing, and per m/s."""
+SWING_OUT_M = 8.0
+"""Standing distance to an obstacle that has to be driven around."""
+BESIDE_M = 0.3
+"""A leader is whoever is not passed with this much room."""
+EMERGENCY, EMERGENCY_M = 12.0, 60.0
+"""Staying in the way of an emergency vehicle that is this near behind."""
+
+
+def rule_cost(
+    future: Candidates, path: RoutePath, ego: Ego, stop_m: float | None
+) -> Floats:
+    """[K] cost of leaving the road, of the wrong side, and of passing a stop line."""
+    half = ego.width / 2 + 0.1
+    left = path.value(path.left_m, future.along_m)
+    both = path.value(path.oncoming_m, future.along_m)
+    right = path.value(path.right_m, future.along_m)
+    edge = np.where(future.oncoming[:, None], both, left)
+    over = np.maximum(future.lateral_m + half - both, -right - future.lateral_m + half)
+    wrong = np.clip(future.lateral_m + half - edge, 0.0, 1.0)
+    cost = OFF_ROAD * np.max(np.clip(over, 0.0, 1.0) * FADE, axis=1)
+    cost += WRONG_SIDE * np.sum(wrong * FADE, axis=1)
+    if stop_m is not None:
+        cost += RUN_LINE * (np.max(future.along_m, axis=1) > stop_m + 0.25)
+    return np.asarray(cost)
+
+
+def headway_cost(
+    future: Candidates, seen: Forecast, ego: Ego, place: Place, passable: bool
+) -> Floats:
+    """[K] cost of driving too close behind somebody, or up to an obstacle.
+
+    What stands still on a passable road is kept at the distance that lets the ego
+    swing out.
+    """
+    along, lateral = seen.along_m[:, None, 1:], seen.lateral_m[:, None, 1:]
+    ahead = along - future.along_m[None]
+    room = seen.half_breadth[:, None, 1:] + ego.width / 2 + BESIDE_M
+    leads = (np.abs(lateral - future.lateral_m[None]) < room) & (ahead > 0)
+    leads &= (~followers(seen, ego, place))[:, None, None]
+    gap = ahead - seen.half_span[:, None, 1:] - ego.length / 2
+    still = (np.max(seen.speed_mps, axis=1) < SLOW_MPS / 3)[:, None, None]
+    standing = np.where(still & passable, SWING_OUT_M, STANDOFF_M)
+    wanted = standing + GAP_S * future.speed_mps[None]
+    short = np.where(leads, np.clip((wanted - gap) / wanted, 0.0, 1.2), 0.0)
+    return np.asarray(HEADWAY * np.max(short, axis=(0, 2), initial=0.0))
+
+
+def emergency_cost(
+    future: Candidates, seen: Forecast, ego: Ego, place: Place
+) -> Floats:
+    """[K] cost of staying in front of an emergency vehicle that comes from behind."""
+    behind = place.s_m - seen.along_m[:, 0]
+    urgent = seen.emergency & (behind > -ego.length) & (behind < EMERGENCY_M)
+    urgent &= np.cos(seen.away[:, 0]) > 0.5
+    if not np.any(urgent):
+        return np.zeros(len(future.acceleration))
+    lateral = seen.lateral_m[urgent][:, -1]
+    room = ego.width / 2 + seen.width[urgent] / 2 + BESIDE_M
+    blocked = np.abs(future.lateral_m[:, -1, None] - lateral) < room
+    return np.asarray(EMERGENCY * np.any(blocked, axis=1))
+
+
+def drive_cost(future: Candidates, ego: Ego, place: Place, kept_m: float) -> Floats:
+    """[K] lack of progress, effort, and restlessness.
+
+    Args:
+        future: The sampled futures.
+        ego: The ego.
+        place: The same on its route.
+        kept_m: The lateral target of the last plan.
+    """
+    rate = future.acceleration
+    begun = (future.speed_mps[:, 1] - place.speed_mps) / 0.5
+    cost = -PROGRESS_PER_M * (future.along_m[:, -1] - place.s_m)
+    cost -= SPEED_PER_MPS * future.speed_mps[:, -1]
+    cost += EFFORT * np.abs(rate) + BRAKE_HARD * (rate < -3.5)
+    cost += JERK * np.abs(begun - ego.acceleration_mps2)
+    cost += OFFSET_PER_M * np.abs(future.target_m)
+    cost += SWITCH * np.minimum(np.abs(future.target_m - kept_m), 1.0)
+    return np.asarray(cost)

@@ -1,0 +1,144 @@
+"""Which lateral offsets the expert may aim at: lanes, nudges, the oncoming lane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.evaluators.highway.expert.forecast import Flags, Forecast
+from me2e_compress.evaluators.highway.geometry import Floats
+from me2e_compress.evaluators.highway.scene import Ego, RoutePath
+
+NUDGES_M = (0.5, -0.5, 1.0, -1.0)
+"""Small shifts within what is drivable: past a door, away from who cuts the bend."""
+SLOW_MPS = 3.0
+"""What is slower than this in the own lane is passed, not followed."""
+CHAIN_M = 14.0
+"""Obstacles closer to each other than this are passed in one go."""
+CLEAR_S = 1.0
+"""Time that must be left between the return and the oncoming car."""
+PASS_MPS2 = 1.8
+"""How the expert accelerates while it passes."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """The ego on its route.
+
+    Args:
+        s_m: Arc length.
+        lateral_m: Metres left of the route.
+        slope: Metres to the left per metre of route, see `reference.slope_of`.
+        speed_mps: Speed.
+        top_mps: What the road ahead allows.
+    """
+
+    s_m: float
+    lateral_m: float
+    slope: float
+    speed_mps: float
+    top_mps: float
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """Where the expert may aim.
+
+    Args:
+        target_m: [L] metres left of the route.
+        oncoming: [L] whether that is in the oncoming lane.
+        passable: Whether there is any lane beside the own one, now or later.
+    """
+
+    target_m: Floats
+    oncoming: Flags
+    passable: bool
+
+
+def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> Options:
+    """Look at the road a little ahead.
+
+    The oncoming lane is offered only behind a blocked own lane and with a gap, or to
+    who is already in it.
+    """
+    ahead = place.s_m + max(6.0, 0.8 * place.speed_mps)
+    lane = float(path.value(path.lane_widths, ahead))
+    left = float(path.value(path.left_m, ahead))
+    right = float(path.value(path.right_m, ahead))
+    both = float(path.value(path.oncoming_m, ahead))
+    half = ego.width / 2
+    offsets = [0.0]
+    offsets += [n for n in NUDGES_M if -right < n - half - 0.1 and n + half < left]
+    offsets += [lane] if left > 1.4 * lane else []
+    offsets += [-lane] if right > 1.4 * lane else []
+    oncoming = [False] * len(offsets)
+    facing = left + lane / 2
+    around = both > facing + half - 0.1
+    passable = around or max(left, right) > 1.4 * lane
+    if around and left < 1.4 * lane:
+        inside = place.lateral_m + half > left + 0.3
+        if inside or gap_for_passing(place, ego, seen, left, lane):
+            offsets.append(facing)
+            oncoming.append(True)
+    return Options(np.array(offsets), np.array(oncoming), passable)
+
+
+def gap_for_passing(
+    place: Place, ego: Ego, seen: Forecast, left_m: float, lane_m: float
+) -> bool:
+    """Whether what blocks the own lane can be passed before anybody comes.
+
+    The stretch beside the blockers must be left before the first oncoming car
+    reaches its end, with `CLEAR_S` to spare.
+    """
+    span = blocked_stretch(place, ego, seen)
+    if span is None or span[0] > max(30.0, 3.0 * place.speed_mps):
+        return False
+    distance = span[1] + ego.length + 6.0
+    seconds = _seconds_for(distance, place.speed_mps, min(place.top_mps, 10.0))
+    coming = (np.cos(seen.away[:, 0]) < -0.5) & seen.moves
+    coming &= seen.lateral_m[:, 0] < left_m + 1.5 * lane_m
+    coming &= seen.lateral_m[:, 0] > left_m - 0.5 * lane_m
+    gap = seen.along_m[:, 0] - place.s_m
+    coming &= gap > -2.0
+    closing = np.maximum(seen.speed_mps.max(axis=1), 3.0)
+    arrival = (gap - seen.length / 2 - distance) / closing
+    return bool(np.all(arrival[coming] > seconds + CLEAR_S))
+
+
+def blocked_stretch(
+    place: Place, ego: Ego, seen: Forecast
+) -> tuple[float, float] | None:
+    """Metres from the ego's centre to the start and end of what blocks its lane.
+
+    A blocker is something slow on the centre line (0.3 m to spare); neighbours within
+    `CHAIN_M` count as one. None if the lane is free.
+    """
+    lateral, half = seen.lateral_m[:, 0], seen.half_breadth[:, 0]
+    in_way = np.abs(lateral) < half + ego.width / 2 + 0.3
+    slow = (np.max(seen.speed_mps[:, :9], axis=1) < SLOW_MPS) & ~seen.fragile
+    gap = seen.along_m[:, 0] - place.s_m
+    ends = gap + seen.half_span[:, 0]
+    blocking = in_way & slow & (ends > -ego.length / 2)
+    if not np.any(blocking):
+        return None
+    order = np.argsort(gap[blocking])
+    starts = (gap - seen.half_span[:, 0])[blocking][order]
+    stops = ends[blocking][order]
+    end = float(stops[0])
+    for begin, stop in zip(starts[1:], stops[1:], strict=True):
+        if begin - end > CHAIN_M:
+            break
+        end = max(end, float(stop))
+    return float(starts[0]), end
+
+
+def _seconds_for(distance_m: float, speed: float, top: float) -> float:
+    """Time for a distance from a speed, accelerating to ``top``."""
+    top = max(top, speed, 1.0)
+    ramp_s = (top - speed) / PASS_MPS2
+    ramp_m = (speed + top) / 2 * ramp_s
+    if ramp_m >= distance_m:
+        return float(
+            (np.sqrt(speed**2 + 2 * PASS_MPS2 * distance_m) - speed) / PASS_MPS2
+        )
+    return ramp_s + (distance_m - ramp_m) / top
