@@ -130,9 +130,10 @@ class Painter:
 
     def _seen(self, points: Floats, camera: Ints) -> Ints:
         """Indices of the faces [3, 4, M] that look at the camera, in its frustum."""
-        right, down, depth = points
+        front = np.flatnonzero(_towards(points))
+        right, down, depth = points[:, :, front]
         centre_column, horizon = self.rig.centre_px
-        slope = depth / self.rig.focals_px[camera]
+        slope = depth / self.rig.focals_px[camera[front]]
         outside = (depth < NEAR_M).all(axis=0)
         for across, low, high in (
             (right, centre_column, self.rig.width - centre_column),
@@ -140,7 +141,7 @@ class Painter:
         ):
             outside |= (across < -(low + 1.0) * slope).all(axis=0)
             outside |= (across > (high + 1.0) * slope).all(axis=0)
-        return np.flatnonzero(_towards(points) & ~outside)
+        return np.asarray(front[~outside])
 
     def _project(self, points: Floats, camera: Ints) -> Floats:
         """[2, 4, M] pixels; corners before the near plane come out wrong."""
