@@ -84,17 +84,6 @@ class Roadmap:
         away = _distance_to_chords(points, start, direction, length) - half_width
         return np.asarray(np.maximum(np.min(away, axis=1), 0.0))
 
-    def along_all(self, points: Floats, headings: Floats) -> npt.NDArray[np.bool_]:
-        """Which of [N, 2] points lie in a lane (no shoulder) that runs their way.
-
-        "Their way" is within 60 degrees of the [N] headings.
-        """
-        start, direction, length, half_width = self._chords
-        inside = _distance_to_chords(points, start, direction, length) <= half_width
-        mine = np.stack([np.cos(headings), np.sin(headings)], axis=1)
-        same_way = mine @ direction.T > np.cos(np.pi / 3)
-        return np.asarray(np.any(inside & same_way & self._driving, axis=1))
-
     @cached_property
     def _chords(self) -> tuple[Floats, Floats, Floats, Floats]:
         starts = np.concatenate([lane.centre[:-1] for lane in self.lanes])
@@ -104,13 +93,6 @@ class Roadmap:
             np.full(len(lane.centre) - 1, lane.width / 2) for lane in self.lanes
         ]
         return starts, steps / lengths[:, None], lengths, np.concatenate(half_widths)
-
-    @cached_property
-    def _driving(self) -> npt.NDArray[np.bool_]:
-        flags = [
-            np.full(len(lane.centre) - 1, not lane.shoulder) for lane in self.lanes
-        ]
-        return np.concatenate(flags)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,206 @@
+"""Cars that follow lanes by highway-env's IDM, with manners of their own.
+
+What stock `IDMVehicle` gets wrong and this one does not (highway-env 1.12): its
+parameters are class attributes that one environment changes under another; it reverses
+when cut off; it draws random numbers where no route is given; it shares one route list
+between cars; and it measures the gap in the coordinates of its own lane even where the
+leader is around the corner.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from highway_env.vehicle.behavior import IDMVehicle
+
+from me2e_compress.evaluators.highway.geometry import Floats
+from me2e_compress.evaluators.highway.scene import DIMENSIONS, ActorKind
+from me2e_compress.evaluators.highway.traffic.network import (
+    LaneIndex,
+    Network,
+    Pose,
+    flip,
+)
+
+LATERAL_COMFORT_MPS2 = 2.5
+"""Lateral acceleration at which actors take a curve: our choice, half the comfort
+bound of nuPlan (4.89)."""
+LOOK_AHEAD_M = 70.0
+
+
+@dataclass(frozen=True, slots=True)
+class Manners:
+    """IDM parameters of one car; defaults are highway-env's but for the gaps.
+
+    highway-env's jam distance of 10 m is measured between centres; ours between
+    bumpers.
+    """
+
+    acceleration_mps2: float = 3.0
+    braking_mps2: float = 5.0
+    hardest_mps2: float = 8.0
+    jam_gap_m: float = 2.5
+    headway_s: float = 1.2
+    sees_ego: bool = True
+    """False for actors that take their way whatever the ego does."""
+
+
+class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
+    """An actor on lanes.
+
+    Args:
+        id: Unique.
+        network: Where it drives.
+        lanes: The lanes it will take, each the successor of the one before.
+        s_m: Where on the first of them it starts.
+        speed_mps: At the start.
+        target_mps: Wanted speed; the initial one by default.
+        kind: Decides its size.
+        manners: Its IDM parameters.
+    """
+
+    def __init__(
+        self,
+        id: int,
+        network: Network,
+        lanes: Sequence[LaneIndex],
+        s_m: float,
+        speed_mps: float,
+        target_mps: float | None = None,
+        kind: ActorKind = ActorKind.CAR,
+        manners: Manners | None = None,
+    ) -> None:
+        pose = network.pose(lanes[0], s_m)
+        super().__init__(
+            None,
+            flip(pose.x, pose.y),
+            -pose.heading,
+            speed_mps,
+            enable_lane_change=False,
+            timer=0.5,
+        )
+        self.id, self.kind, self.network = id, kind, network
+        self.LENGTH, self.WIDTH, self.height = DIMENSIONS[kind]
+        self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
+        self.speed: float = speed_mps
+        self.position: Floats
+        self.manners = manners or Manners()
+        self.COMFORT_ACC_MAX = self.manners.acceleration_mps2
+        self.COMFORT_ACC_MIN = -self.manners.braking_mps2
+        self.DISTANCE_WANTED = self.manners.jam_gap_m
+        self.TIME_WANTED = self.manners.headway_s
+        self.target_speed = speed_mps if target_mps is None else target_mps
+        self.lanes, self.leg = list(lanes), 0
+        self.target_lane_index = self.lane_index = self.lanes[0]
+        self.action = {"acceleration": 0.0, "steering": 0.0}
+        self.forced_mps2: float | None = None
+        """An acceleration that a script imposes instead of IDM's."""
+        self.offset_m = 0.0
+        """How far left of the lane's centre it drives."""
+        self.braking, self.indicator = False, 0
+
+    @property
+    def pose(self) -> Pose:
+        """Right-handed pose."""
+        x, y = self.position
+        return Pose(float(x), -float(y), -float(self.heading))
+
+    @property
+    def lane_s(self) -> float:
+        """Arc length in the present lane."""
+        lane = self.network.lane(self.lanes[self.leg])
+        return float(lane.local_coordinates(self.position)[0])
+
+    @property
+    def station_m(self) -> float:
+        """Metres from the beginning of its first lane."""
+        done = sum(self.network.length(index) for index in self.lanes[: self.leg])
+        return done + self.lane_s
+
+    @property
+    def gone(self) -> bool:
+        """Whether it has left its last lane."""
+        last = self.leg == len(self.lanes) - 1
+        return last and self.lane_s > self.network.length(self.lanes[-1])
+
+    def change_lane(self, lanes: Sequence[LaneIndex], indicator: int) -> None:
+        """Go on in other lanes, the first of them beside the present one."""
+        self.indicator = indicator
+        self.lanes[self.leg :] = lanes
+
+    def follow_road(self) -> None:
+        """Enter the next lane of the chain where the present one ends."""
+        length = self.network.length(self.lanes[self.leg])
+        if self.leg + 1 < len(self.lanes) and self.lane_s > length:
+            self.leg += 1
+        self.target_lane_index = self.lane_index = self.lanes[self.leg]
+
+    def act(self, action: object = None) -> None:
+        """Decide: follow the lane, keep the gap, obey the script."""
+        self.follow_road()
+        lead = self.road.lead(self)
+        wanted = self.forced_mps2
+        if wanted is None:
+            wanted = self.acceleration(self, *lead) if lead else self.acceleration(self)
+        wanted = min(max(wanted, -self.manners.hardest_mps2), self.COMFORT_ACC_MAX)
+        self.action = {"acceleration": wanted, "steering": self._steering()}
+        self.braking = wanted < -0.7 or self.speed < 0.2
+
+    def acceleration(
+        self,
+        ego_vehicle: "Car",
+        front_vehicle: object = None,
+        gap_m: float = math.inf,
+    ) -> float:
+        """IDM's acceleration for a leader at a gap between bumpers (m/s2)."""
+        allowed = max(self.allowed_mps(), 0.01)
+        free = self.COMFORT_ACC_MAX * (1 - (self.speed / allowed) ** self.DELTA)
+        free = float(max(free, self.COMFORT_ACC_MIN))
+        if front_vehicle is None:
+            return free
+        wanted = max(self.desired_gap(self, front_vehicle), self.DISTANCE_WANTED)
+        return float(free - self.COMFORT_ACC_MAX * (wanted / max(gap_m, 0.3)) ** 2)
+
+    def allowed_mps(self) -> float:
+        """The wanted speed, less where a limit or a curve is or comes."""
+        allowed = float(self.target_speed)
+        ahead = -self.lane_s
+        for index in self.lanes[self.leg :]:
+            lane = self.network.lane(index)
+            here = float(lane.speed_limit)
+            radius = getattr(lane, "radius", None)
+            if radius is not None:
+                here = min(here, math.sqrt(LATERAL_COMFORT_MPS2 * radius))
+            reach = here * here + 2 * 2.0 * max(ahead, 0.0)
+            allowed = min(allowed, math.sqrt(reach))
+            ahead += float(lane.length)
+            if ahead > LOOK_AHEAD_M / 2:
+                break
+        return allowed
+
+    def step(self, dt: float) -> None:
+        """Advance by ``dt`` seconds; never backwards."""
+        slip = math.atan(math.tan(self.action["steering"]) / 2)
+        before = float(self.speed)
+        after = max(0.0, before + self.action["acceleration"] * dt)
+        travel = (before + after) / 2 * dt
+        turn = travel * math.sin(slip) / (self.LENGTH / 2)
+        course = self.heading + slip + turn / 2
+        self.position[0] += travel * math.cos(course)
+        self.position[1] += travel * math.sin(course)
+        self.heading += turn
+        self.speed = after
+
+    def _steering(self) -> float:
+        """highway-env's lateral control, of the position less the wanted offset."""
+        if not self.offset_m:
+            return float(self.steering_control(self.target_lane_index))
+        shifted = self.position
+        lane = self.network.lane(self.target_lane_index)
+        angle = float(lane.heading_at(self.lane_s))
+        right = np.array([-math.sin(angle), math.cos(angle)])
+        self.position = shifted + self.offset_m * right
+        wheel = float(self.steering_control(self.target_lane_index))
+        self.position = shifted
+        return wheel
