@@ -49,8 +49,8 @@ def headway_cost(
 ) -> Floats:
     """[K] cost of driving too close behind somebody, or up to an obstacle.
 
-    What stands still on a passable road is kept at the distance that lets the ego
-    swing out.
+    What is slow on a passable road is followed at the distance that lets the
+    ego swing out.
     """
     along, lateral = seen.along_m[:, None, 1:], seen.lateral_m[:, None, 1:]
     ahead = along - future.along_m[None]
@@ -58,8 +58,8 @@ def headway_cost(
     leads = (np.abs(lateral - future.lateral_m[None]) < room) & (ahead > 0)
     leads &= (~followers(seen, ego, place))[:, None, None]
     gap = ahead - seen.half_span[:, None, 1:] - ego.length / 2
-    still = (np.max(seen.speed_mps, axis=1) < SLOW_MPS / 3)[:, None, None]
-    standing = np.where(still & passable, SWING_OUT_M, STANDOFF_M)
+    slow = (np.max(seen.speed_mps, axis=1) < SLOW_MPS)[:, None, None]
+    standing = np.where(slow & passable, SWING_OUT_M, STANDOFF_M)
     wanted = standing + GAP_S * future.speed_mps[None]
     short = np.where(leads, np.clip((wanted - gap) / wanted, 0.0, 1.2), 0.0)
     return np.asarray(HEADWAY * np.max(short, axis=(0, 2), initial=0.0))
@@ -71,7 +71,7 @@ def emergency_cost(
     """[K] cost of staying in front of an emergency vehicle that comes from behind."""
     behind = place.s_m - seen.along_m[:, 0]
     urgent = seen.emergency & (behind > -ego.length) & (behind < EMERGENCY_M)
-    urgent &= np.cos(seen.away[:, 0]) > 0.5
+    urgent &= (np.cos(seen.away[:, 0]) > 0.5) & (seen.speed_mps[:, 0] > SLOW_MPS)
     if not np.any(urgent):
         return np.zeros(len(future.acceleration))
     lateral = seen.lateral_m[urgent][:, -1]

@@ -36,7 +36,7 @@ class Forecast:
         moves: [A] whether it can move at all.
         yields: [A] whether it brakes for the ego.
         emergency: [A] whether it is an emergency vehicle.
-        fragile: [A] whether it is a pedestrian or a bicycle.
+        walks: [A] whether it is a pedestrian.
         along_m: [A, T] arc length on the route.
         lateral_m: [A, T] metres left of the route.
         away: [A, T] heading against the route's (radians).
@@ -51,7 +51,7 @@ class Forecast:
     moves: Flags
     yields: Flags
     emergency: Flags
-    fragile: Flags
+    walks: Flags
     along_m: Floats
     lateral_m: Floats
     away: Floats
@@ -70,7 +70,6 @@ class Forecast:
 
 
 FIXED = (ActorKind.PARKED, ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER)
-FRAGILE = (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
 
 
 def forecast(
@@ -101,7 +100,7 @@ def forecast(
         moves=np.array([actor.kind not in FIXED for actor in near], bool),
         yields=np.array([_yields(intents.get(actor.id)) for actor in near], bool),
         emergency=np.array([a.kind is ActorKind.EMERGENCY for a in near], bool),
-        fragile=np.array([actor.kind in FRAGILE for actor in near], bool),
+        walks=np.array([a.kind is ActorKind.PEDESTRIAN for a in near], bool),
         along_m=along,
         lateral_m=lateral,
         away=away,

@@ -90,35 +90,51 @@ def gap_for_passing(
     The stretch beside the blockers must be left before the first oncoming car
     reaches its end, with `CLEAR_S` to spare.
     """
-    span = blocked_stretch(place, ego, seen)
-    if span is None or span[0] > max(30.0, 3.0 * place.speed_mps):
+    block = blocked_stretch(place, ego, seen)
+    if block is None or block.start_m > max(30.0, 3.0 * place.speed_mps):
         return False
-    distance = span[1] + ego.length + 6.0
-    seconds = _seconds_for(distance, place.speed_mps, min(place.top_mps, 10.0))
-    coming = (np.cos(seen.away[:, 0]) < -0.5) & seen.moves
-    coming &= seen.lateral_m[:, 0] < left_m + 1.5 * lane_m
-    coming &= seen.lateral_m[:, 0] > left_m - 0.5 * lane_m
+    top, seconds = min(place.top_mps, 10.0), 0.0
+    for _ in range(3):
+        distance = block.end_m + ego.length + 6.0 + block.speed_mps * seconds
+        seconds = _seconds_for(distance, place.speed_mps, top)
     gap = seen.along_m[:, 0] - place.s_m
+    coming = (np.cos(seen.away[:, 0]) < -0.5) & (seen.speed_mps.max(axis=1) > 0.5)
+    coming &= np.abs(seen.lateral_m[:, 0] - left_m - lane_m / 2) < lane_m
     coming &= gap > -2.0
     closing = np.maximum(seen.speed_mps.max(axis=1), 3.0)
     arrival = (gap - seen.length / 2 - distance) / closing
     return bool(np.all(arrival[coming] > seconds + CLEAR_S))
 
 
-def blocked_stretch(
-    place: Place, ego: Ego, seen: Forecast
-) -> tuple[float, float] | None:
-    """Metres from the ego's centre to the start and end of what blocks its lane.
+@dataclass(frozen=True)
+class Block:
+    """What blocks the ego's lane.
 
-    A blocker is something slow on the centre line (0.3 m to spare); neighbours within
-    `CHAIN_M` count as one. None if the lane is free.
+    Args:
+        start_m: From the ego's centre to the nearest end of it.
+        end_m: To its farthest end.
+        speed_mps: How fast it moves on.
+    """
+
+    start_m: float
+    end_m: float
+    speed_mps: float
+
+
+def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:
+    """Find what has to be driven around; None if the lane is free.
+
+    That is anything slow along the centre line (0.3 m to spare), but nobody who
+    crosses; neighbours within `CHAIN_M` count as one.
     """
     lateral, half = seen.lateral_m[:, 0], seen.half_breadth[:, 0]
+    fastest = np.max(seen.speed_mps[:, :9], axis=1)
+    crosses = (np.abs(np.sin(seen.away[:, 0])) > 0.5) & (fastest > 0.3)
     in_way = np.abs(lateral) < half + ego.width / 2 + 0.3
-    slow = (np.max(seen.speed_mps[:, :9], axis=1) < SLOW_MPS) & ~seen.fragile
     gap = seen.along_m[:, 0] - place.s_m
     ends = gap + seen.half_span[:, 0]
-    blocking = in_way & slow & (ends > -ego.length / 2)
+    blocking = in_way & (fastest < SLOW_MPS) & ~crosses & ~seen.walks
+    blocking &= ends > -ego.length / 2
     if not np.any(blocking):
         return None
     order = np.argsort(gap[blocking])
@@ -129,7 +145,7 @@ def blocked_stretch(
         if begin - end > CHAIN_M:
             break
         end = max(end, float(stop))
-    return float(starts[0]), end
+    return Block(float(starts[0]), end, float(np.max(fastest[blocking])))
 
 
 def _seconds_for(distance_m: float, speed: float, top: float) -> float:
