@@ -1,1 +1,1 @@
-"""Models at work: sessions, recurrent state, latency traces."""
+"""Run graphs: sessions on the CPU, frames in order, recurrent state fed forward."""

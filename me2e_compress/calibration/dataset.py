@@ -1,0 +1,167 @@
+"""Recorded frames, in scenes: what ranges and fidelity are measured on.
+
+A recording is a folder: one ``.npz`` a frame, keyed by input name, in the order of
+their names, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
+frame of every scene.
+"""
+
+import hashlib
+import itertools
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.calibration.check import check_frame
+from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.graph import static_shape
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.recurrence import recurrent_inputs
+
+__all__ = ["CalibrationSet", "Frame", "synthetic"]
+
+
+class CalibrationSet:
+    """A recording on disk, read frame by frame.
+
+    Args:
+        folder: where the frames are.
+
+    Raises:
+        FramesError: no such folder, no frames, or scenes.json is missing or wrong.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise FramesError(f"{folder}: no such folder")
+        self.folder = folder
+        self.files = tuple(sorted(folder.glob("*.npz")))
+        if not self.files:
+            raise FramesError(f"{folder}: holds no .npz frames")
+        self.scenes = _scenes(folder / "scenes.json", len(self.files))
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Read the frames in order, one in memory at a time."""
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> Frame:
+        """Read one frame.
+
+        Raises:
+            FramesError: the file cannot be read as arrays.
+        """
+        path = self.files[index]
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                arrays: dict[str, Array] = {name: archive[name] for name in archive}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise FramesError(f"{path}: not a readable .npz ({error})") from error
+        return Frame(index, index in self.scenes, arrays)
+
+    @property
+    def fingerprint(self) -> str:
+        """A number that changes with the content, the order or the scenes.
+
+        Read from the checksums that every .npz carries (CRC-32 and size of each
+        array), so that hundreds of frames take a moment, not the time to read them.
+        """
+        seal = hashlib.blake2b(digest_size=16)
+        seal.update(repr(self.scenes).encode())
+        for path in self.files:
+            try:
+                with zipfile.ZipFile(path) as archive:
+                    entries = sorted(
+                        (each.filename, each.file_size, each.CRC)
+                        for each in archive.infolist()
+                    )
+            except (OSError, zipfile.BadZipFile) as error:
+                raise FramesError(f"{path}: not a readable .npz ({error})") from error
+            seal.update(repr(entries).encode())
+        return seal.hexdigest()
+
+    def check(self, model: ir.Model) -> None:
+        """Read every frame once and hold it against a model's inputs.
+
+        Recurrent inputs may be absent; names that the model has not are an error.
+
+        Raises:
+            FramesError: on the first array that is missing, unknown, of another
+                shape or dtype, or not finite: its file, its name, what was found and
+                what is expected.
+        """
+        for path, frame in zip(self.files, self, strict=True):
+            check_frame(frame, model, str(path))
+
+
+def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
+    """Make seeded inputs where there is no recording: one scene of ``count`` frames.
+
+    Floats are standard normal, integers 0 or 1, booleans either. They prove that two
+    graphs compute the same; they are not what a model sees, so nothing is calibrated
+    on them. Recurrent inputs are left to the replay.
+
+    Args:
+        model: whose inputs.
+        seed: same seed, same frames.
+        count: how many frames.
+
+    Returns:
+        The frames, made one by one.
+
+    Raises:
+        PreconditionError: an input has an open shape or a type that cannot be drawn.
+    """
+    open_state = recurrent_inputs(model)
+    ports = [value for value in model.graph.inputs if value.name not in open_state]
+    for value in ports:
+        if static_shape(value) is None or value.dtype is None:
+            raise PreconditionError(
+                f"input {value.name} is {value.type} {value.shape}: seeded inputs need"
+                " a static shape, give frames instead"
+            )
+        if value.dtype.numpy().kind not in "fiub":
+            raise PreconditionError(
+                f"input {value.name} is {value.dtype.name}: seeded inputs are numbers"
+            )
+    generator = np.random.default_rng(seed)
+    return (
+        Frame(index, index == 0, {str(v.name): _draw(v, generator) for v in ports})
+        for index in range(count)
+    )
+
+
+def _draw(value: ir.Value, generator: np.random.Generator) -> Array:
+    shape = static_shape(value) or ()
+    dtype = np.dtype(np.float32) if value.dtype is None else value.dtype.numpy()
+    if dtype.kind == "f":
+        return np.asarray(generator.standard_normal(shape)).astype(dtype)
+    return np.asarray(generator.integers(0, 2, shape)).astype(dtype)
+
+
+def _scenes(path: Path, count: int) -> tuple[int, ...]:
+    """Read where scenes begin."""
+    if not path.is_file():
+        raise FramesError(
+            f'{path}: missing; {{"scenes": [0]}} says that the frames are one scene'
+        )
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise FramesError(f"{path}: not JSON ({error})") from error
+    starts = content.get("scenes") if isinstance(content, dict) else None
+    if not isinstance(starts, list) or not all(type(at) is int for at in starts):
+        raise FramesError(f'{path}: must hold {{"scenes": [0, ...]}}')
+    rising = all(a < b for a, b in itertools.pairwise(starts))
+    if not starts or starts[0] != 0 or not rising or starts[-1] >= count:
+        raise FramesError(
+            f"{path}: scenes must rise from 0 and stay below the {count} frames,"
+            f" found {starts}"
+        )
+    return tuple(starts)

@@ -1,0 +1,74 @@
+"""What every command prints with."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+console = Console()
+errors = Console(stderr=True, highlight=False)
+
+Advance = Callable[[int, int, str], None]
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Advance]:
+    """Show a bar on stderr; the value is called with done, total and what is done."""
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[what]}"),
+        TimeElapsedColumn(),
+        console=errors,
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task(title, total=1, what="")
+
+        def advance(done: int, total: int, what: str) -> None:
+            bar.update(task, completed=done, total=total, what=what)
+
+        yield advance
+
+
+def table(title: str, *columns: str, left: int = 1) -> Table:
+    """Make a table whose first ``left`` columns are words and the rest numbers."""
+    made = Table(title=title, title_justify="left", title_style="bold")
+    for at, name in enumerate(columns):
+        made.add_column(name, justify="left" if at < left else "right")
+    return made
+
+
+def print_json(data: object) -> None:
+    """Print one JSON document on stdout."""
+    sys.stdout.write(json.dumps(data, indent=2, default=_plain) + "\n")
+
+
+def megabytes(count: float) -> str:
+    """Write bytes as MB (1e6)."""
+    return f"{count / 1e6:.2f}"
+
+
+def number(value: float | None, form: str = ",.0f") -> str:
+    """Write a number, or a dash for what was not measured."""
+    return "-" if value is None else format(value, form)
+
+
+def file_bytes(path: Path) -> int:
+    """Count the bytes of a model: the file and the weights beside it."""
+    data = path.with_name(path.name + ".data")
+    return path.stat().st_size + (data.stat().st_size if data.exists() else 0)
+
+
+def _plain(value: object) -> object:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"cannot write {type(value).__name__} as JSON")

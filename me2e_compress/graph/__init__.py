@@ -1,0 +1,42 @@
+"""Graphs: read, write, measure, compare and rewrite them.
+
+The in-memory form is ``onnx_ir.Model``; these few words are all that the rest of the
+package says about it, besides walking nodes and values.
+"""
+
+from me2e_compress.graph.digest import digest
+from me2e_compress.graph.files import is_external, load, save, sha256_of, write_text
+from me2e_compress.graph.interface import Port, interface
+from me2e_compress.graph.measure import Size, macs, node_count, size
+from me2e_compress.graph.provenance import Provenance
+from me2e_compress.graph.rewrite import (
+    add_constant,
+    array_of,
+    replace_value,
+    sort,
+    sweep,
+)
+from me2e_compress.graph.shapes import infer_shapes, static_shape
+
+__all__ = [
+    "Port",
+    "Provenance",
+    "Size",
+    "add_constant",
+    "array_of",
+    "digest",
+    "infer_shapes",
+    "interface",
+    "is_external",
+    "load",
+    "macs",
+    "node_count",
+    "replace_value",
+    "save",
+    "sha256_of",
+    "size",
+    "sort",
+    "static_shape",
+    "sweep",
+    "write_text",
+]

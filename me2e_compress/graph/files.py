@@ -1,0 +1,144 @@
+"""Read and write ONNX files: weights mapped, outputs atomic, sources untouched."""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import onnx
+import onnx_ir as ir
+import onnx_ir.passes.common as common
+from google.protobuf.message import DecodeError
+
+from me2e_compress.errors import GraphError
+
+INLINE_LIMIT_BYTES = 1_900_000_000
+"""Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
+
+
+def load(path: Path) -> ir.Model:
+    """Read an ONNX file; external weights stay on disk and are mapped when read.
+
+    Initializers that the exporter also listed as inputs
+    (``keep_initializers_as_inputs``) stop being inputs.
+
+    Raises:
+        GraphError: no such file, not an ONNX model, cut short, or its data file is
+            missing or shorter than the model says.
+    """
+    if not path.is_file():
+        raise GraphError(f"{path}: no such file")
+    try:
+        model = ir.load(path, format="protobuf")
+    except DecodeError as error:
+        raise GraphError(f"{path}: not an ONNX file, or cut short ({error})") from error
+    except (ValueError, TypeError, KeyError) as error:
+        raise GraphError(f"{path}: not a valid ONNX graph ({error})") from error
+    if not model.opset_imports or not model.graph.outputs:
+        raise GraphError(f"{path}: not an ONNX model (no opset, no outputs)")
+    _check_external(model, path)
+    common.RemoveInitializersFromInputsPass()(model)
+    return model
+
+
+def save(model: ir.Model, path: Path, *, external: bool | None = None) -> None:
+    """Write an ONNX file, all or nothing.
+
+    Args:
+        model: what to write; it stays as it is.
+        path: the file; with external weights a ``<name>.data`` stands beside it.
+        external: weights in their own file; None decides: yes where some already
+            are, or where they would not fit one protobuf message.
+
+    Raises:
+        GraphError: the folder does not exist, or a data file of the model itself
+            stands where this one would go.
+    """
+    if not path.parent.is_dir():
+        raise GraphError(f"{path}: no such folder {path.parent}")
+    stored = list(_external(model))
+    data = path.with_name(path.name + ".data")
+    if any(Path(tensor.path).resolve() == data.resolve() for tensor in stored):
+        raise GraphError(f"{data}: holds the weights of the model that is being saved")
+    if external is None:
+        external = bool(stored) or _weight_bytes(model) > INLINE_LIMIT_BYTES
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder:
+        draft = Path(folder) / path.name
+        if external:
+            ir.save(model, draft, format="protobuf", external_data=data.name)
+        else:
+            onnx.save(ir.to_proto(_inlined(model)), draft, format="protobuf")
+        draft_data = draft.with_name(data.name)
+        if draft_data.exists():
+            os.replace(draft_data, data)
+        os.replace(draft, path)
+
+
+def is_external(model: ir.Model) -> bool:
+    """Say whether some of the weights lie in a file of their own."""
+    return any(True for _ in _external(model))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, all or nothing."""
+    draft = path.with_name(f".{path.name}.draft")
+    draft.write_text(text, encoding="utf-8")
+    os.replace(draft, path)
+
+
+def sha256_of(path: Path) -> str:
+    """Hash a file, and with it the external data it names, as lower-case hex."""
+    seal = hashlib.sha256()
+    files = [path]
+    model = onnx.load(path, load_external_data=False)
+    for tensor in model.graph.initializer:
+        for entry in tensor.external_data:
+            if entry.key == "location" and path.parent / entry.value not in files:
+                files.append(path.parent / entry.value)
+    for file in files:
+        with file.open("rb") as stream:
+            for block in iter(lambda: stream.read(1 << 22), b""):
+                seal.update(block)
+    return seal.hexdigest()
+
+
+def _external(model: ir.Model) -> Iterator[ir.ExternalTensor]:
+    for graph in model.graphs():
+        for value in graph.initializers.values():
+            if isinstance(value.const_value, ir.ExternalTensor):
+                yield value.const_value
+
+
+def _check_external(model: ir.Model, path: Path) -> None:
+    for tensor in _external(model):
+        data = Path(tensor.path)
+        if not data.is_file():
+            raise GraphError(f"{path}: its weights file {data} is missing")
+        end = (tensor.offset or 0) + (tensor.length or 0)
+        if data.stat().st_size < end:
+            raise GraphError(
+                f"{path}: {data} is cut short: {tensor.name} ends at byte {end},"
+                f" the file at {data.stat().st_size}"
+            )
+
+
+def _inlined(model: ir.Model) -> ir.Model:
+    if not is_external(model):
+        return model
+    copy = model.clone()
+    for graph in copy.graphs():
+        for value in graph.initializers.values():
+            tensor = value.const_value
+            if isinstance(tensor, ir.ExternalTensor):
+                value.const_value = ir.tensor(tensor.numpy(), name=value.name)
+    return copy
+
+
+def _weight_bytes(model: ir.Model) -> int:
+    return sum(
+        value.const_value.nbytes
+        for graph in model.graphs()
+        for value in graph.initializers.values()
+        if value.const_value is not None
+    )

@@ -1,0 +1,82 @@
+"""Where a node comes from: its module, its source nodes, the passes that made it.
+
+Stored in the node's ONNX metadata, so that it survives saving and every tool that
+keeps metadata. The manager refuses a pass that loses it.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterable
+
+import onnx_ir as ir
+
+MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
+
+
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """What is known of a node's past.
+
+    Attributes:
+        module: the ME2E module it belongs to, e.g. ``bev_encoder``.
+        origins: names of the nodes of the source file it stands for.
+        passes: names of the passes that made it, in order; empty if untouched.
+    """
+
+    module: str
+    origins: tuple[str, ...]
+    passes: tuple[str, ...] = ()
+
+
+def read(node: ir.Node) -> Provenance | None:
+    """Read a node's past; None if it has none."""
+    data = node.metadata_props
+    if MODULE not in data or ORIGINS not in data:
+        return None
+    return Provenance(
+        data[MODULE],
+        tuple(json.loads(data[ORIGINS])),
+        tuple(json.loads(data.get(PASSES, "[]"))),
+    )
+
+
+def module_of(node: ir.Node) -> str:
+    """Name the module a node belongs to; empty if nobody has said."""
+    return node.metadata_props.get(MODULE, "")
+
+
+def stamp(node: ir.Node, past: Provenance) -> None:
+    """Write a node's past."""
+    node.metadata_props[MODULE] = past.module
+    node.metadata_props[ORIGINS] = json.dumps(past.origins)
+    if past.passes:
+        node.metadata_props[PASSES] = json.dumps(past.passes)
+
+
+def inherit(node: ir.Node, sources: Iterable[ir.Node], *, by: str) -> None:
+    """Make a new (or changed) node the heir of the nodes it replaces.
+
+    Origins are united in order; the module is the first source's, the rule being
+    that the node whose value lives on is named first.
+
+    Args:
+        node: the node that a pass made or changed.
+        sources: the nodes it stands for, the leading one first.
+        by: the pass's name.
+    """
+    pasts = [past for source in sources if (past := read(source)) is not None]
+    if not pasts:
+        return
+    origins = dict.fromkeys(name for past in pasts for name in past.origins)
+    passes = dict.fromkeys(name for past in pasts for name in past.passes)
+    passes[by] = None
+    stamp(node, Provenance(pasts[0].module, tuple(origins), tuple(passes)))
+
+
+def missing(model: ir.Model) -> list[str]:
+    """Name the nodes of the main graph that have lost their past."""
+    return [
+        node.name or node.op_type
+        for node in model.graph.all_nodes()
+        if MODULE not in node.metadata_props or ORIGINS not in node.metadata_props
+    ]

@@ -1,0 +1,125 @@
+"""Give a graph back what a foreign tool made it forget."""
+
+from collections.abc import Iterable, Sequence
+
+import onnx_ir as ir
+
+from me2e_compress.graph import provenance
+
+
+def restore(
+    model: ir.Model, like: ir.Model, *, by: str, node_names: bool = False
+) -> None:
+    """Bring metadata and provenance back into a graph that a tool has rewritten.
+
+    onnxsim and onnx-graphsurgeon drop the metadata of models, functions, nodes and
+    values. Here a node is known again by the name of its first output, then by its own
+    name. One of the same operator gets all its metadata back; one that another operator
+    stands for now is the heir of that and of the nodes that vanished above it; one that
+    nobody knows is the heir of its nearest neighbour: the producer that comes last in
+    the graph, else the consumer that comes first. Linear in nodes.
+
+    Args:
+        model: what the tool gave, in graph order; changed in place.
+        like: what the tool was given, its nodes with their past.
+        by: the pass to name in the past of what is new.
+        node_names: give known nodes of the same operator their old names too.
+    """
+    _merge(model.metadata_props, like.metadata_props)
+    _merge(model.graph.metadata_props, like.graph.metadata_props)
+    for key, function in model.functions.items():
+        if key in like.functions:
+            _merge(function.metadata_props, like.functions[key].metadata_props)
+            _match(list(function.all_nodes()), list(like.functions[key].all_nodes()))
+    _restore_values(model, like)
+    nodes = list(model.graph.all_nodes())
+    found = _match(nodes, list(like.graph.all_nodes()))
+    if node_names:
+        _rename(nodes, found)
+    _bequeath(nodes, found, by)
+
+
+def _merge(props: dict[str, str], past: dict[str, str]) -> None:
+    for key, text in past.items():
+        props.setdefault(key, text)
+
+
+def _restore_values(model: ir.Model, like: ir.Model) -> None:
+    known = {value.name: value.metadata_props for value in _values(like)}
+    for value in _values(model):
+        if past := known.get(value.name):
+            _merge(value.metadata_props, past)
+
+
+def _values(model: ir.Model) -> Iterable[ir.Value]:
+    for graph in (model.graph, *model.graph.subgraphs()):
+        yield from graph.inputs
+        yield from graph.initializers.values()
+    for node in model.graph.all_nodes():
+        yield from node.outputs
+
+
+def _match(nodes: Sequence[ir.Node], past: Sequence[ir.Node]) -> dict[ir.Node, ir.Node]:
+    by_output = {node.outputs[0].name: node for node in past if node.outputs}
+    by_name = {node.name: node for node in past if node.name}
+    found: dict[ir.Node, ir.Node] = {}
+    for node in nodes:
+        known = by_output.get(node.outputs[0].name) if node.outputs else None
+        if known is None and node.name:
+            named = by_name.get(node.name)
+            known = named if named is not None and _alike(named, node) else None
+        if known is not None:
+            found[node] = known
+            if _alike(node, known):
+                _merge(node.metadata_props, known.metadata_props)
+    return found
+
+
+def _alike(one: ir.Node, other: ir.Node) -> bool:
+    return one.op_identifier() == other.op_identifier()
+
+
+def _rename(nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node]) -> None:
+    renamed = {n: p.name for n, p in found.items() if p.name and _alike(n, p)}
+    taken = {node.name for node in nodes if node not in renamed}
+    for node, name in renamed.items():
+        if name not in taken:
+            taken.add(name)
+            node.name = name
+
+
+def _bequeath(nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node], by: str) -> None:
+    alive = {value.name for node in nodes for value in node.outputs}
+    claimed: set[ir.Node] = set()
+    for node in nodes:
+        if provenance.read(node) is None and (known := found.get(node)) is not None:
+            vanished = _vanished_above(known, alive, claimed)
+            provenance.inherit(node, (known, *vanished), by=by)
+    place = {node: index for index, node in enumerate(nodes)}
+    for node in nodes:
+        makers = [value.producer() for value in node.inputs if value is not None]
+        heard = [m for m in makers if m in place and provenance.read(m) is not None]
+        if provenance.read(node) is None and heard:
+            provenance.inherit(node, (max(heard, key=place.__getitem__),), by=by)
+    for node in reversed(nodes):
+        readers = [reader for value in node.outputs for reader in value.consumers()]
+        heard = [r for r in readers if provenance.read(r) is not None]
+        if provenance.read(node) is None and heard:
+            provenance.inherit(node, (min(heard, key=place.__getitem__),), by=by)
+
+
+def _vanished_above(
+    node: ir.Node, alive: set[str | None], claimed: set[ir.Node]
+) -> list[ir.Node]:
+    found: list[ir.Node] = []
+    stack = [node]
+    while stack:
+        for value in stack.pop().inputs:
+            maker = None if value is None else value.producer()
+            if maker is None or maker in claimed:
+                continue
+            if not any(output.name in alive for output in maker.outputs):
+                claimed.add(maker)
+                found.append(maker)
+                stack.append(maker)
+    return found

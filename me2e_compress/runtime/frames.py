@@ -1,0 +1,37 @@
+"""What a model sees at one moment."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Array: TypeAlias = npt.NDArray[np.generic]
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """The inputs of one moment.
+
+    Attributes:
+        index: place in the recording, from 0.
+        starts_scene: True where a new scene begins: recurrent state is reset here.
+        arrays: one array for every input, by input name; recurrent inputs may lack.
+    """
+
+    index: int
+    starts_scene: bool
+    arrays: dict[str, Array]
+
+
+class Frames(Protocol):
+    """A finite recording that can be read again and again."""
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Read the frames in order, one in memory at a time."""
+        ...

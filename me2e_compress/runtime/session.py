@@ -1,0 +1,215 @@
+"""One graph, ready to run on the CPU."""
+
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import onnx_ir as ir
+import onnxruntime as ort
+
+from me2e_compress import graph
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph.files import INLINE_LIMIT_BYTES
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.native import REFUSALS, InvalidArgument
+from me2e_compress.runtime.recurrence import Port, recurrence
+from me2e_compress.runtime.supported import can_run
+
+__all__ = ["Port", "Session", "can_run", "replay", "run_once"]
+
+DTYPES: Mapping[str, np.dtype[np.generic]] = {
+    "tensor(float)": np.dtype(np.float32),
+    "tensor(double)": np.dtype(np.float64),
+    "tensor(float16)": np.dtype(np.float16),
+    "tensor(int8)": np.dtype(np.int8),
+    "tensor(int16)": np.dtype(np.int16),
+    "tensor(int32)": np.dtype(np.int32),
+    "tensor(int64)": np.dtype(np.int64),
+    "tensor(uint8)": np.dtype(np.uint8),
+    "tensor(uint16)": np.dtype(np.uint16),
+    "tensor(uint32)": np.dtype(np.uint32),
+    "tensor(uint64)": np.dtype(np.uint64),
+    "tensor(bool)": np.dtype(np.bool_),
+}
+
+
+class Session:
+    """An onnxruntime CPU session.
+
+    Args:
+        model: the graph, or the file that holds it.
+        threads: threads within an operator; 0 lets onnxruntime take every core.
+        optimize: False runs the nodes exactly as they stand (``ORT_DISABLE_ALL``).
+        frugal: True runs nodes in the priority-based order, in which a reduction
+            written right after its producer frees that tensor at once, and without the
+            memory pattern, which reserves one block for everything that ever lives.
+
+    Attributes:
+        inputs: by name, what must be fed, in order.
+        outputs: by name, what comes out, in order.
+        metadata: the model's own metadata.
+        recurrent: ``{input: output}`` of the state that is fed forward.
+
+    Raises:
+        GraphError: onnxruntime cannot run this graph; the message names the operator.
+    """
+
+    def __init__(
+        self,
+        model: ir.Model | Path,
+        *,
+        threads: int = 0,
+        optimize: bool = True,
+        frugal: bool = False,
+    ) -> None:
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 4
+        # Idle threads that spin slow down whatever else runs on the machine.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        if not optimize:
+            options.graph_optimization_level = (
+                ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+            )
+        if frugal:
+            options.execution_order = ort.ExecutionOrder.PRIORITY_BASED
+            options.enable_mem_pattern = False
+        self._ort = _open(model, options)
+        self.inputs = _ports(self._ort.get_inputs())
+        self.outputs = _ports(self._ort.get_outputs())
+        self.metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
+        self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
+
+    def run(
+        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
+    ) -> dict[str, Array]:
+        """Run once.
+
+        Args:
+            feeds: one array for every input; further names are left aside.
+            outputs: which to return; None for all.
+
+        Raises:
+            FramesError: an input is missing, or has not the type or shape it must.
+            GraphError: a node failed on these inputs.
+        """
+        if missing := [name for name in self.inputs if name not in feeds]:
+            raise FramesError(
+                f"input {missing[0]} is missing; there is {', '.join(feeds) or 'none'}"
+            )
+        names = list(self.outputs) if outputs is None else list(outputs)
+        try:
+            fed = {name: feeds[name] for name in self.inputs}
+            values = cast("list[Array]", self._ort.run(names, fed))
+        except InvalidArgument as error:
+            raise FramesError(f"these inputs do not fit: {_line(error)}") from error
+        except REFUSALS as error:
+            raise GraphError(f"onnxruntime failed: {_line(error)}") from error
+        return dict(zip(names, values, strict=True))
+
+
+def replay(
+    session: Session, frames: Iterable[Frame], outputs: Sequence[str] | None = None
+) -> Iterator[dict[str, Array]]:
+    """Run a model over a recording, its own recurrent state fed forward.
+
+    At the start of a scene a recurrent input is what the frame says or, where the
+    frame says nothing, zeros; afterwards it is what the model answered a frame ago,
+    whatever the frame says.
+
+    Args:
+        session: the model.
+        frames: the recording.
+        outputs: which to yield; None for all.
+
+    Yields:
+        The outputs of every frame, in order.
+
+    Raises:
+        FramesError: a frame does not fit; the message names it.
+        GraphError: a recurrent input of unknown shape has no first value.
+    """
+    wanted = list(session.outputs) if outputs is None else list(outputs)
+    fetched = list(dict.fromkeys([*wanted, *session.recurrent.values()]))
+    state: dict[str, Array] = {}
+    for frame in frames:
+        if frame.starts_scene:
+            state = {
+                name: frame.arrays[name]
+                if name in frame.arrays
+                else _zeros(name, session.inputs[name])
+                for name in session.recurrent
+            }
+        try:
+            values = session.run({**frame.arrays, **state}, fetched)
+        except FramesError as error:
+            raise FramesError(f"frame {frame.index}: {error}") from error
+        state = {name: values[answer] for name, answer in session.recurrent.items()}
+        yield {name: values[name] for name in wanted}
+
+
+def run_once(model: ir.Model, feeds: Mapping[str, Array]) -> dict[str, Array]:
+    """Build, run and drop: for evaluating a few constants.
+
+    Raises:
+        GraphError: onnxruntime cannot run this graph.
+        FramesError: an input is missing or does not fit.
+    """
+    return Session(model, threads=1, optimize=False).run(feeds)
+
+
+def _open(model: ir.Model | Path, options: ort.SessionOptions) -> ort.InferenceSession:
+    if isinstance(model, ir.Model):
+        if reason := can_run(model):
+            raise GraphError(reason)
+        if _needs_file(model):
+            with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:
+                path = Path(folder) / "model.onnx"
+                graph.save(model, path)
+                return _build(str(path), options)
+        return _build(ir.to_proto(model).SerializeToString(), options)
+    if not model.is_file():
+        raise GraphError(f"{model}: no such file")
+    return _build(str(model), options)
+
+
+def _needs_file(model: ir.Model) -> bool:
+    weights = [
+        value.const_value
+        for each in model.graphs()
+        for value in each.initializers.values()
+        if value.const_value is not None
+    ]
+    return (
+        any(isinstance(tensor, ir.ExternalTensor) for tensor in weights)
+        or sum(tensor.nbytes for tensor in weights) > INLINE_LIMIT_BYTES
+    )
+
+
+def _build(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
+    try:
+        return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+    except REFUSALS as error:
+        raise GraphError(
+            f"onnxruntime cannot run this graph: {_line(error)}"
+        ) from error
+
+
+def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, Port]:
+    return {each.name: Port(each.type, tuple(each.shape)) for each in arguments}
+
+
+def _zeros(name: str, port: Port) -> Array:
+    shape = [size for size in port.shape if isinstance(size, int)]
+    if len(shape) < len(port.shape) or port.type not in DTYPES:
+        raise GraphError(
+            f"recurrent input {name} is {port.type} {list(port.shape)}: its first value"
+            " must stand in the frame that opens a scene"
+        )
+    return np.zeros(shape, DTYPES[port.type])
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
