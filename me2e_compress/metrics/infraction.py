@@ -8,13 +8,16 @@ from pydantic import ConfigDict, with_config
 
 
 class InfractionKind(StrEnum):
-    """The keys of `infractions` in a leaderboard record."""
+    """The keys of `infractions` in a leaderboard record, and one of our own."""
 
     COLLISION_PEDESTRIAN = "collisions_pedestrian"
     COLLISION_VEHICLE = "collisions_vehicle"
     COLLISION_LAYOUT = "collisions_layout"
     RED_LIGHT = "red_light"
     STOP = "stop_infraction"
+    GIVE_WAY = "give_way_infraction"
+    """Crossing a give-way line close before priority traffic: CARLA has no such rule;
+    it costs as much as a stop sign that was run."""
     OUTSIDE_ROUTE_LANES = "outside_route_lanes"
     MIN_SPEED = "min_speed_infractions"
     YIELD_TO_EMERGENCY_VEHICLE = "yield_emergency_vehicle_infractions"
@@ -37,6 +40,7 @@ PENALTY = MappingProxyType(
         InfractionKind.COLLISION_LAYOUT: 0.65,
         InfractionKind.RED_LIGHT: 0.7,
         InfractionKind.STOP: 0.8,
+        InfractionKind.GIVE_WAY: 0.8,
         InfractionKind.SCENARIO_TIMEOUT: 0.7,
         InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: 0.7,
         InfractionKind.MIN_SPEED: 1.0,
@@ -48,6 +52,7 @@ PENALTY = MappingProxyType(
 """Factor per event: Bench2Drive 0.0.3, leaderboard/utils/statistics_manager.py.
 
 Leaving the lanes has no fixed factor: it costs the share of the way driven outside.
+GIVE_WAY is ours.
 """
 
 
