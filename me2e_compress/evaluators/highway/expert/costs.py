@@ -22,22 +22,35 @@ SWING_OUT_M = 8.0
 """Standing distance to an obstacle that has to be driven around."""
 BESIDE_M = 0.3
 """A leader is whoever is not passed with this much room."""
-EMERGENCY, EMERGENCY_M = 12.0, 60.0
-"""Staying in the way of an emergency vehicle that is this near behind."""
+EMERGENCY, EMERGENCY_PER_MPS, EMERGENCY_SHARE, EMERGENCY_M = 60.0, 4.0, 0.35, 60.0
+"""Staying in the way of an emergency vehicle that is this near behind, or driving
+faster than this share of its speed."""
 
 
 def rule_cost(
-    future: Candidates, path: RoutePath, ego: Ego, stop_m: float | None
+    future: Candidates,
+    path: RoutePath,
+    ego: Ego,
+    place: Place,
+    stop_m: float | None,
 ) -> Floats:
-    """[K] cost of leaving the road, of the wrong side, and of passing a stop line."""
-    half = ego.width / 2 + 0.1
+    """[K] cost of leaving the road, of the wrong side, and of passing a stop line.
+
+    Who is off the road already pays only for going farther.
+    """
+    half = ego.width / 2 - 0.05
     left = path.value(path.left_m, future.along_m)
     both = path.value(path.oncoming_m, future.along_m)
     right = path.value(path.right_m, future.along_m)
     edge = np.where(future.oncoming[:, None], both, left)
     over = np.maximum(future.lateral_m + half - both, -right - future.lateral_m + half)
+    already = max(
+        place.lateral_m + half - float(path.value(path.oncoming_m, place.s_m)),
+        half - place.lateral_m - float(path.value(path.right_m, place.s_m)),
+        0.0,
+    )
     wrong = np.clip(future.lateral_m + half - edge, 0.0, 1.0)
-    cost = OFF_ROAD * np.max(np.clip(over, 0.0, 1.0) * FADE, axis=1)
+    cost = OFF_ROAD * np.max(np.clip(over - already, 0.0, 1.0) * FADE, axis=1)
     cost += WRONG_SIDE * np.sum(wrong * FADE, axis=1)
     if stop_m is not None:
         cost += RUN_LINE * (np.max(future.along_m, axis=1) > stop_m + 0.25)
@@ -68,16 +81,20 @@ def headway_cost(
 def emergency_cost(
     future: Candidates, seen: Forecast, ego: Ego, place: Place
 ) -> Floats:
-    """[K] cost of staying in front of an emergency vehicle that comes from behind."""
+    """[K] cost of not letting an emergency vehicle pass that comes from behind.
+
+    First the ego leaves its lane, then it slows down.
+    """
     behind = place.s_m - seen.along_m[:, 0]
     urgent = seen.emergency & (behind > -ego.length) & (behind < EMERGENCY_M)
     urgent &= (np.cos(seen.away[:, 0]) > 0.5) & (seen.speed_mps[:, 0] > SLOW_MPS)
     if not np.any(urgent):
         return np.zeros(len(future.acceleration))
-    lateral = seen.lateral_m[urgent][:, -1]
+    lateral, speed = seen.lateral_m[urgent][:, -1], np.min(seen.speed_mps[urgent])
     room = ego.width / 2 + seen.width[urgent] / 2 + BESIDE_M
     blocked = np.abs(future.lateral_m[:, -1, None] - lateral) < room
-    return np.asarray(EMERGENCY * np.any(blocked, axis=1))
+    hasty = np.maximum(future.speed_mps[:, -1] - EMERGENCY_SHARE * speed, 0.0)
+    return np.asarray(EMERGENCY * np.any(blocked, axis=1) + EMERGENCY_PER_MPS * hasty)
 
 
 def drive_cost(future: Candidates, ego: Ego, place: Place, kept_m: float) -> Floats:

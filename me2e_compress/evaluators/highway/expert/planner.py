@@ -87,7 +87,7 @@ def decide(
     options = lateral_targets(path, place, ego, seen)
     future = sample(path, _slowed(top, stop), place, options, stop.line_m)
     cost = drive_cost(future, ego, place, memory.target_m)
-    cost += rule_cost(future, path, ego, stop.line_m)
+    cost += rule_cost(future, path, ego, place, stop.line_m)
     if len(seen.length):
         cost += collision_cost(future, seen, ego, place)
         cost += headway_cost(future, seen, ego, place, options.passable)

@@ -6,10 +6,14 @@ import numpy as np
 
 from me2e_compress.evaluators.highway.expert.forecast import Flags, Forecast
 from me2e_compress.evaluators.highway.geometry import Floats
-from me2e_compress.evaluators.highway.scene import Ego, RoutePath
+from me2e_compress.evaluators.highway.scene import Command, Ego, RoutePath
 
 NUDGES_M = (0.5, -0.5, 1.0, -1.0)
 """Small shifts within what is drivable: past a door, away from who cuts the bend."""
+ASIDE_M = 0.7
+"""The same in the lane beside, away from what is passed."""
+JUNCTION = (int(Command.LEFT), int(Command.RIGHT), int(Command.STRAIGHT))
+"""Nobody overtakes here."""
 SLOW_MPS = 3.0
 """What is slower than this in the own lane is passed, not followed."""
 CHAIN_M = 14.0
@@ -54,58 +58,6 @@ class Options:
     passable: bool
 
 
-def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> Options:
-    """Look at the road a little ahead.
-
-    The oncoming lane is offered only behind a blocked own lane and with a gap, or to
-    who is already in it.
-    """
-    ahead = place.s_m + max(6.0, 0.8 * place.speed_mps)
-    lane = float(path.value(path.lane_widths, ahead))
-    left = float(path.value(path.left_m, ahead))
-    right = float(path.value(path.right_m, ahead))
-    both = float(path.value(path.oncoming_m, ahead))
-    half = ego.width / 2
-    offsets = [0.0]
-    offsets += [n for n in NUDGES_M if -right < n - half - 0.1 and n + half < left]
-    offsets += [lane] if left > 1.4 * lane else []
-    offsets += [-lane] if right > 1.4 * lane else []
-    oncoming = [False] * len(offsets)
-    facing = left + lane / 2
-    around = both > facing + half - 0.1
-    passable = around or max(left, right) > 1.4 * lane
-    if around and left < 1.4 * lane:
-        inside = place.lateral_m + half > left + 0.3
-        if inside or gap_for_passing(place, ego, seen, left, lane):
-            offsets.append(facing)
-            oncoming.append(True)
-    return Options(np.array(offsets), np.array(oncoming), passable)
-
-
-def gap_for_passing(
-    place: Place, ego: Ego, seen: Forecast, left_m: float, lane_m: float
-) -> bool:
-    """Whether what blocks the own lane can be passed before anybody comes.
-
-    The stretch beside the blockers must be left before the first oncoming car
-    reaches its end, with `CLEAR_S` to spare.
-    """
-    block = blocked_stretch(place, ego, seen)
-    if block is None or block.start_m > max(30.0, 3.0 * place.speed_mps):
-        return False
-    top, seconds = min(place.top_mps, 10.0), 0.0
-    for _ in range(3):
-        distance = block.end_m + ego.length + 6.0 + block.speed_mps * seconds
-        seconds = _seconds_for(distance, place.speed_mps, top)
-    gap = seen.along_m[:, 0] - place.s_m
-    coming = (np.cos(seen.away[:, 0]) < -0.5) & (seen.speed_mps.max(axis=1) > 0.5)
-    coming &= np.abs(seen.lateral_m[:, 0] - left_m - lane_m / 2) < lane_m
-    coming &= gap > -2.0
-    closing = np.maximum(seen.speed_mps.max(axis=1), 3.0)
-    arrival = (gap - seen.length / 2 - distance) / closing
-    return bool(np.all(arrival[coming] > seconds + CLEAR_S))
-
-
 @dataclass(frozen=True)
 class Block:
     """What blocks the ego's lane.
@@ -119,6 +71,75 @@ class Block:
     start_m: float
     end_m: float
     speed_mps: float
+
+
+def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> Options:
+    """Look at the road a little ahead.
+
+    The oncoming lane is offered only behind a blocked own lane and with a gap, or to
+    who is already in it.
+    """
+    ahead = place.s_m + max(6.0, 0.8 * place.speed_mps)
+    columns = (path.lane_widths, path.left_m, path.right_m, path.oncoming_m)
+    lane, left, right, both = (float(path.value(c, ahead)) for c in columns)
+    room = ego.width / 2
+    beside = [lane, min(lane + ASIDE_M, left - room)]
+    beside += [-lane, max(-lane - ASIDE_M, room - right)]
+    offsets = [n for n in (*NUDGES_M, *beside) if room - right <= n <= left - room]
+    oncoming = [False] * (1 + len(offsets))
+    facing = left + lane / 2
+    around = both > facing + room
+    if around and left < 1.4 * lane and _may_face(path, place, ego, seen, left, lane):
+        extra = [facing + n for n in (0.0, ASIDE_M) if facing + n + room <= both]
+        offsets, oncoming = offsets + extra, oncoming + [True] * len(extra)
+    passable = around or max(left, right) > 1.4 * lane
+    return Options(np.array([0.0, *offsets]), np.array(oncoming), passable)
+
+
+def _may_face(
+    path: RoutePath,
+    place: Place,
+    ego: Ego,
+    seen: Forecast,
+    left_m: float,
+    lane_m: float,
+) -> bool:
+    """Whether the oncoming lane may be used: with a gap, or by who is in it."""
+    if place.lateral_m + ego.width / 2 > left_m + 0.3:
+        return True
+    block = blocked_stretch(place, ego, seen)
+    if block is None or block.start_m > max(30.0, 3.0 * place.speed_mps):
+        return False
+    low, high = int(max(place.s_m, 0.0)), int(place.s_m + block.end_m + 6.0)
+    if np.isin(path.commands[low:high], JUNCTION).any():
+        return False
+    return gap_for_passing(place, ego, seen, block, left_m, lane_m)
+
+
+def gap_for_passing(
+    place: Place,
+    ego: Ego,
+    seen: Forecast,
+    block: Block,
+    left_m: float,
+    lane_m: float,
+) -> bool:
+    """Whether what blocks the own lane can be passed before anybody comes.
+
+    The stretch beside the blockers must be left before the first oncoming car
+    reaches its end, with `CLEAR_S` to spare.
+    """
+    top, seconds = min(place.top_mps, 10.0), 0.0
+    for _ in range(3):
+        distance = block.end_m + ego.length + 6.0 + block.speed_mps * seconds
+        seconds = _seconds_for(distance, place.speed_mps, top)
+    gap = seen.along_m[:, 0] - place.s_m
+    coming = (np.cos(seen.away[:, 0]) < -0.5) & (seen.speed_mps.max(axis=1) > 0.5)
+    coming &= np.abs(seen.lateral_m[:, 0] - left_m - lane_m / 2) < lane_m
+    coming &= gap > -2.0
+    closing = np.maximum(seen.speed_mps.max(axis=1), 3.0)
+    arrival = (gap - seen.length / 2 - distance) / closing
+    return bool(np.all(arrival[coming] > seconds + CLEAR_S))
 
 
 def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:

@@ -23,6 +23,8 @@ FINE_M = 0.1
 WIDEST_M = 9.0
 """How far to the side we look for road."""
 PROBE_M = 0.25
+TOUCHING_M = 0.01
+"""Lanes side by side leave no hole, whatever the last digit says."""
 _CHANGES = (Command.CHANGE_LEFT, Command.CHANGE_RIGHT)
 
 
@@ -148,7 +150,7 @@ def _room_beside(
         probes = points[:, None, :] + reach[None, :, None] * normal[:, None, :]
         flat = probes.reshape(-1, 2) @ np.diag(flip(1.0, 1.0))
         s, r = table.coordinates(flat)
-        inside = (s > -0.5) & (s < table.length + 0.5) & (np.abs(r) <= widths / 2)
+        inside = (s > -0.5) & (s < table.length + 0.5) & (np.abs(r) <= widths / 2 + TOUCHING_M)
         if same_way:
             mine = -np.repeat(headings, len(reach))[:, None]
             way = np.cos(table.headings(s) - mine) > 0.5
