@@ -44,6 +44,8 @@ class Manners:
     headway_s: float = 1.2
     sees_ego: bool = True
     """False for actors that take their way whatever the ego does."""
+    obeys_limits: bool = True
+    """False for emergency vehicles."""
 
 
 class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
@@ -168,7 +170,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         ahead = -self.lane_s
         for index in self.lanes[self.leg :]:
             lane = self.network.lane(index)
-            here = float(lane.speed_limit)
+            here = float(lane.speed_limit) if self.manners.obeys_limits else math.inf
             radius = getattr(lane, "radius", None)
             if radius is not None:
                 here = min(here, math.sqrt(LATERAL_COMFORT_MPS2 * radius))

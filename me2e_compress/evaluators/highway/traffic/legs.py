@@ -150,7 +150,11 @@ def _room_beside(
         probes = points[:, None, :] + reach[None, :, None] * normal[:, None, :]
         flat = probes.reshape(-1, 2) @ np.diag(flip(1.0, 1.0))
         s, r = table.coordinates(flat)
-        inside = (s > -0.5) & (s < table.length + 0.5) & (np.abs(r) <= widths / 2 + TOUCHING_M)
+        inside = (
+            (s > -0.5)
+            & (s < table.length + 0.5)
+            & (np.abs(r) <= widths / 2 + TOUCHING_M)
+        )
         if same_way:
             mine = -np.repeat(headings, len(reach))[:, None]
             way = np.cos(table.headings(s) - mine) > 0.5

@@ -29,6 +29,7 @@ class Regulator:
         remaining_s: Until the phase changes; None if it depends on the ego.
         nearest_s: For a give-way sign: seconds until the next vehicle with priority
             reaches the conflict, infinity if there is none.
+        conflict_s: For a give-way sign: where on the route the conflict is.
     """
 
     id: int
@@ -39,6 +40,8 @@ class Regulator:
     remaining_s: float | None = None
     width_m: float = LANE_WIDTH_M
     nearest_s: Callable[[], float] = field(default=lambda: float("inf"), repr=False)
+    conflict_s: float = float("inf")
+    _conflict_passed: bool = False
     _front_passed: bool = False
     _tail_passed: bool = False
     _entered_on_red: bool = False
@@ -60,9 +63,13 @@ class Regulator:
         A red light is run if both the front and the tail of the ego cross the line
         on red (CARLA looks at the tail alone, which blames a car that entered on
         yellow). A stop sign is run if the ego did not come to rest before it; a
-        give-way sign if the front crosses it within `YIELD_GAP_S` of a vehicle with
-        priority. Each is reported once.
+        give-way sign if the front enters the conflict less than `YIELD_GAP_S` before
+        a vehicle with priority. Each is reported once.
         """
+        if front_s >= self.conflict_s and not self._conflict_passed:
+            self._conflict_passed = True
+            if self.nearest_s() < YIELD_GAP_S:
+                return EventKind.GIVE_WAY
         if self.line_s is None or self._tail_passed:
             return None
         low, high = STOP_ZONE_M
@@ -71,8 +78,6 @@ class Regulator:
         if front_s >= self.line_s and not self._front_passed:
             self._front_passed = True
             self._entered_on_red = self.state is SignalState.RED
-            if self.kind is SignalKind.GIVE_WAY and self.nearest_s() < YIELD_GAP_S:
-                return EventKind.GIVE_WAY
         if tail_s < self.line_s:
             return None
         self._tail_passed = True

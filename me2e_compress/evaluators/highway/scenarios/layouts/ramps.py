@@ -141,12 +141,13 @@ def four_lanes(stage: Stage) -> Street:
     section: Section = straight_section(4, LIMIT_MPS)
     road = carriageway(stage.network, "r", origin(stage), [Straight(TOTAL_M)], section)
     s, legs = BEFORE_M, list[Leg]()
-    stay = stage.uniform("stay_m", 14.0, 18.0)
+    stay = stage.uniform("first_m", 32.0, 38.0)
     for lane in range(4):
         command = Command.CHANGE_RIGHT if lane else Command.FOLLOW
         leave = s + stay if lane < 3 else None
         legs.append(Leg(road.ahead(lane)[0], command, s, leave))
         s += stay + CHANGE_M
+        stay = 11.0
     stage.drive(legs, start_speed(stage))
     return Street(road, 0, BEFORE_M)
 

@@ -1,12 +1,14 @@
 """People on foot and on bicycles who cross the ego's way."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from me2e_compress.evaluators.highway.scenarios.layouts.crossings import Crossing
 from me2e_compress.evaluators.highway.scenarios.scripts.timing import steps_out
 from me2e_compress.evaluators.highway.scene import ActorKind
 from me2e_compress.evaluators.highway.traffic.bodies import Walker
-from me2e_compress.evaluators.highway.traffic.network import LANE_WIDTH_M, Pose
+from me2e_compress.evaluators.highway.traffic.network import LANE_WIDTH_M
 from me2e_compress.evaluators.highway.traffic.stage import Script, Stage
 
 HALF_LANE_M = LANE_WIDTH_M / 2
@@ -52,45 +54,78 @@ def walkers_on_zebra(stage: Stage) -> Script:
     stage.fire("walkers_on_zebra", walkers[0])
 
 
-def pedestrian_on_exit(stage: Stage, crossing: Crossing) -> Script:
-    """While the ego turns, a pedestrian crosses the arm that it turns into."""
+def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:
+    """While the ego turns, three pedestrians cross the arm that it turns into."""
     speed = stage.uniform("walk_mps", 1.3, 2.0)
-    walker, reach, s = _across_arm(
-        stage, crossing, ActorKind.PEDESTRIAN, speed, 2.0, LANE_WIDTH_M + 1.5
-    )
-    yield from steps_out(stage, walker, s, reach)
-    stage.fire("pedestrian_on_exit", walker)
+    row = _row(stage, crossing, ActorKind.PEDESTRIAN, speed, LANE_WIDTH_M + 1.5, 3, 1.3)
+    yield from _set_off(stage, row, 1, "pedestrians_on_exit")
 
 
-def cyclist_on_exit(stage: Stage, crossing: Crossing) -> Script:
-    """While the ego turns, a cyclist crosses the arm that it turns into."""
+def cyclists_on_exit(stage: Stage, crossing: Crossing) -> Script:
+    """While the ego turns, three cyclists cross the arm that it turns into."""
     speed = stage.uniform("ride_mps", 2.8, 4.0)
-    walker, reach, s = _across_arm(
-        stage, crossing, ActorKind.BICYCLE, speed, 2.5, LANE_WIDTH_M + 5.5
-    )
-    yield from steps_out(stage, walker, s, reach)
-    stage.fire("cyclist_on_exit", walker)
+    row = _row(stage, crossing, ActorKind.BICYCLE, speed, LANE_WIDTH_M + 4.0, 3, 2.4)
+    yield from _set_off(stage, row, 1, "cyclists_on_exit")
 
 
 def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
-    """A row of cyclists crosses the arm that the ego turns into."""
+    """A long row of cyclists crosses the arm that the ego turns into."""
     speed = stage.uniform("ride_mps", 3.0, 4.0)
-    count = stage.integer("cyclists", 3, 5)
-    spacing = stage.uniform("spacing_m", 3.5, 5.0)
-    riders = list[Walker]()
-    reach = s = 0.0
+    count = stage.integer("cyclists", 4, 7)
+    spacing = stage.uniform("spacing_m", 2.6, 3.6)
+    start = LANE_WIDTH_M + 4.0
+    row = _row(stage, crossing, ActorKind.BICYCLE, speed, start, count, spacing)
+    yield from _set_off(stage, row, 1, "bicycle_stream")
+
+
+@dataclass(frozen=True)
+class Row:
+    """People behind each other.
+
+    Attributes:
+        people: The first one first.
+        reach_m: How far each walks to the middle of the ego's lane.
+        route_s: Where that is on the route.
+    """
+
+    people: list[Walker]
+    reach_m: list[float]
+    route_s: float
+
+
+def _row(
+    stage: Stage,
+    crossing: Crossing,
+    kind: ActorKind,
+    speed: float,
+    start_m: float,
+    count: int,
+    spacing_m: float,
+) -> Row:
+    """People who cross the arm that the ego leaves by, from a drawn side."""
+    side = -1.0 if stage.choice("side", ("right", "left")) == "right" else 1.0
+    out_m = 2.0 if kind is ActorKind.PEDESTRIAN else 3.0
+    target = crossing.arm(crossing.move, out_m, -HALF_LANE_M)
+    s, _ = stage.path.project(target.x, target.y)
+    row = Row([], [], s)
     for k in range(count):
-        start = LANE_WIDTH_M + 5.0 + spacing * k
-        rider, far, at = _across_arm(
-            stage, crossing, ActorKind.BICYCLE, speed, 3.0, start
-        )
-        riders.append(rider)
-        if k == 0:
-            reach, s = far, at
-    yield from steps_out(stage, riders[0], s, reach)
-    for rider in riders:
-        rider.going = True
-    stage.fire("bicycle_stream", riders[0])
+        start = start_m + spacing_m * k
+        end = LANE_WIDTH_M + 3.0 + spacing_m * (count - k)
+        begin = crossing.arm(crossing.move, out_m, side * start)
+        stop = crossing.arm(crossing.move, out_m, -side * end)
+        line = np.array([[begin.x, begin.y], [stop.x, stop.y]])
+        row.people.append(stage.walker(kind, line, speed))
+        row.reach_m.append(start + side * HALF_LANE_M)
+    return row
+
+
+def _set_off(stage: Stage, row: Row, timed: int, name: str) -> Script:
+    """Send a row off so that one of them meets the ego."""
+    who = row.people[timed]
+    yield from steps_out(stage, who, row.route_s, row.reach_m[timed])
+    for walker in row.people:
+        walker.going = True
+    stage.fire(name, who)
 
 
 def _across_route(
@@ -100,27 +135,3 @@ def _across_route(
     begin, end = stage.route_pose(s_m, from_m), stage.route_pose(s_m, to_m)
     line = np.array([[begin.x, begin.y], [end.x, end.y]])
     return stage.walker(ActorKind.PEDESTRIAN, line, speed)
-
-
-def _across_arm(
-    stage: Stage,
-    crossing: Crossing,
-    kind: ActorKind,
-    speed: float,
-    out_m: float,
-    start_m: float,
-) -> tuple[Walker, float, float]:
-    """Somebody who crosses the arm that the ego leaves by.
-
-    Returns:
-        Who, how far it is to the ego's lane, and where that is on the route.
-    """
-    side = -1.0 if stage.choice("side", ("right", "left")) == "right" else 1.0
-    end_m = -(LANE_WIDTH_M + 3.0)
-    begin = crossing.arm(crossing.move, out_m, side * start_m)
-    end = crossing.arm(crossing.move, out_m, side * end_m)
-    target: Pose = crossing.arm(crossing.move, out_m, -HALF_LANE_M)
-    s, _ = stage.path.project(target.x, target.y)
-    line = np.array([[begin.x, begin.y], [end.x, end.y]])
-    reach = start_m - HALF_LANE_M if side < 0 else start_m + HALF_LANE_M
-    return stage.walker(kind, line, speed), reach, s

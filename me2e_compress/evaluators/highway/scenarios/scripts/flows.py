@@ -8,7 +8,9 @@ from me2e_compress.evaluators.highway.scenarios.scripts.timing import (
     arrive_together,
     meeting,
     on_chain,
+    release,
 )
+from me2e_compress.evaluators.highway.scene import SignalKind
 from me2e_compress.evaluators.highway.traffic.cars import Car, Manners
 from me2e_compress.evaluators.highway.traffic.network import LaneIndex
 from me2e_compress.evaluators.highway.traffic.signals import Regulator
@@ -112,21 +114,26 @@ def side_flows(stage: Stage, street: Street) -> Script:
             stage.network, street.ahead(lane), street.start_m + 20.0 + ahead
         )
         stage.car(chain, s, float(stage.ego.speed), manners=DENSE)
-    change = float(stage.parameters["stay_m"]) + 12.5
+    change = float(stage.parameters["first_m"]) + 12.5
     yield from _beside(stage, street.ahead(1), 60.0, change, "side_flows", 2)
 
 
 def bay_flow(stage: Stage, street: Street) -> Script:
     """Cars pass the parking bay that the ego wants to leave."""
     chain = street.ahead(0)
-    route_s, station = meeting(stage, chain)
-    lead = stage.car(chain, station - route_s - stage.uniform("behind_m", 8.0, 14.0), 6)
+    route_s, _ = meeting(stage, chain)
+    begin = street.start_m - stage.uniform("behind_m", 3.0, 6.0)
+    lead = stage.car(chain, begin, 3.0, manners=HEEDLESS)
     for k in range(stage.integer("followers", 1, 3)):
-        s = street.start_m - 12.0 - 13.0 * (k + 1)
-        if s > 0:
-            stage.car(chain, s, 6.0, 9.0, manners=DENSE)
-    lead.manners = HEEDLESS
-    yield from arrive_together(stage, lead, route_s, station, "bay_flow")
+        stage.car(chain, begin - 11.0 * (k + 1), 3.0, 8.0, manners=DENSE)
+    while stage.ahead_m(route_s) > 9.0:
+        _keep_beside(stage, lead, 0.0, 3.0)
+        yield
+    stage.fire("bay_flow", lead)
+    while stage.ahead_m(route_s) > -6.0 and stage.gap_m(lead) < 0.0:
+        _keep_beside(stage, lead, 0.0, 3.5)
+        yield
+    release(lead, 8.0)
 
 
 def _platoon(
@@ -150,8 +157,9 @@ def _platoon(
         manners = DENSE if k else HEEDLESS
         row.append(stage.car(lanes, local, speed, 9.0, manners=manners))
     points = [meeting(stage, car.lanes) for car in row]
-    if sign is not None:
+    if sign is not None and sign.kind is SignalKind.GIVE_WAY:
         sign.nearest_s = lambda: _nearest(row, [at for _, at in points])
+        sign.conflict_s = route_s - 1.0
     yield from arrive_together(stage, row[0], route_s, points[0][1], name)
 
 
@@ -177,20 +185,20 @@ def _beside(
         yield
     stage.fire(name, lead)
     steady = float(stage.ego.speed)
-    while stage.ahead_m(change_s) > -12.0 and stage.ego.speed > 0.7 * steady:
-        _keep_beside(stage, lead, aside)
-        lead.forced_mps2 = min(lead.forced_mps2 or 0.0, 1.0)
-        if lead.speed < 0.9 * steady:
-            break
+    while stage.ahead_m(change_s) > -14.0 and abs(stage.gap_m(lead)) < 12.0:
+        lead.forced_mps2 = min(max((steady - lead.speed) / 0.3, -3.0), 3.0)
         yield
-    lead.forced_mps2, lead.target_speed = None, max(steady, 7.0)
+    release(lead, max(steady, 7.0))
 
 
-def _keep_beside(stage: Stage, car: Car, aside_m: float) -> None:
+def _keep_beside(
+    stage: Stage, car: Car, aside_m: float, slowest_mps: float = 0.0
+) -> None:
+    """Hold a car level with the ego, ``aside_m`` before it."""
     pose = car.pose
     s, _ = stage.path.project(pose.x, pose.y, stage.ego_s)
     error = s - stage.ego_s - aside_m
-    wanted = max(stage.ego.speed - 0.8 * error, 0.0)
+    wanted = max(stage.ego.speed - 0.8 * error, slowest_mps)
     car.forced_mps2 = min(max((wanted - car.speed) / 0.3, -6.0), 5.0)
 
 

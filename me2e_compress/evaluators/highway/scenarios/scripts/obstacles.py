@@ -12,12 +12,20 @@ from me2e_compress.evaluators.highway.traffic.network import LANE_WIDTH_M
 from me2e_compress.evaluators.highway.traffic.stage import Script, Stage
 
 
+def free_side(stage: Stage) -> float:
+    """+1 if the lane to pass by lies to the left of the route, -1 to the right."""
+    here = round(float(stage.parameters.get("obstacle_m", 60.0)))
+    left = float(stage.path.oncoming_m[here])
+    return 1.0 if left > LANE_WIDTH_M else -1.0
+
+
 def crashed_cars(stage: Stage) -> Script:
     """Two cars stand askew in the lane after an accident, a police van before them."""
     s = stage.uniform("obstacle_m", 62.0, 80.0)
     for k, name in enumerate(("first", "second")):
-        askew = stage.uniform(f"{name}_askew_rad", -0.5, 0.5)
-        place = stage.route_pose(s + 8.0 + 7.0 * k, 0.3 * (-1) ** k)
+        askew = stage.uniform(f"{name}_askew_rad", -0.35, 0.35)
+        aside = -0.4 * free_side(stage)
+        place = stage.route_pose(s + 8.0 + 7.0 * k, aside)
         stage.thing(ActorKind.PARKED, place.turned(askew))
     stage.thing(ActorKind.EMERGENCY, stage.route_pose(s))
     yield from met(stage, s, "crashed_cars")
@@ -40,7 +48,8 @@ def parked_car(stage: Stage) -> Script:
     """A car or van stands in the lane, its hazard lights on."""
     s = stage.uniform("obstacle_m", 62.0, 85.0)
     kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
-    stage.thing(kind, stage.route_pose(s, stage.uniform("aside_m", -0.5, 0.2)))
+    aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
+    stage.thing(kind, stage.route_pose(s, aside))
     yield from met(stage, s, "parked_car")
 
 
@@ -88,8 +97,9 @@ def spun_car(stage: Stage) -> Script:
     s = stage.uniform("spun_m", 80.0, 92.0)
     grip = stage.uniform("grip_mps2", 3.0, 4.0)
     begin = s - stage.uniform("slick_m", 35.0, 45.0)
-    askew = stage.uniform("askew_rad", 1.2, 1.9)
-    car = stage.thing(ActorKind.PARKED, stage.route_pose(s).turned(askew))
+    askew = stage.uniform("askew_rad", 0.4, 0.7)
+    place = stage.route_pose(s, -0.7 * free_side(stage))
+    car = stage.thing(ActorKind.PARKED, place.turned(askew))
     dry = stage.ego.grip_mps2
     while stage.ahead_m(begin) > 0:
         yield

@@ -76,15 +76,15 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
     Judged as scenario_runner does (YieldToEmergencyVehicleTest): at the end of the
     route it must be ahead of the ego.
     """
-    gap = stage.uniform("behind_m", 24.0, 34.0)
+    gap = stage.uniform("behind_m", 18.0, 26.0)
     lanes = street.ahead(street.lane)
     car = stage.car(
         lanes,
         street.start_m - gap,
-        float(stage.ego.speed) + 3.0,
-        14.0,
+        float(stage.ego.speed) + 5.0,
+        18.0,
         ActorKind.EMERGENCY,
-        Manners(headway_s=0.6, jam_gap_m=4.0, acceleration_mps2=3.5),
+        Manners(3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False),
     )
     passed = [False]
 

@@ -56,8 +56,8 @@ def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> tuple[float, float]:
     nearest = away.min(axis=1)
     touching = np.flatnonzero(nearest < TOUCH_M)
     i = int(touching[0]) if len(touching) else int(np.argmin(nearest))
-    while i + 1 < len(nearest) and nearest[i + 1] < nearest[i]:
-        i += 1
+    for _ in range(2):
+        i += int(i + 1 < len(nearest) and nearest[i + 1] < nearest[i])
     return float(i), float(stations[int(np.argmin(away[i]))])
 
 

@@ -13,8 +13,8 @@ from me2e_compress.evaluators.highway.scenarios.layouts.streets import (
     zebra_street,
 )
 from me2e_compress.evaluators.highway.scenarios.scripts.crossers import (
-    cyclist_on_exit,
-    pedestrian_on_exit,
+    cyclists_on_exit,
+    pedestrians_on_exit,
     walker_behind_van,
     walker_between_cars,
     walkers_on_zebra,
@@ -83,16 +83,16 @@ def static_cut_in(stage: Stage) -> None:
 
 
 def vehicle_turning_route(stage: Stage) -> None:
-    """A cyclist crosses the road that the ego turns into."""
+    """Cyclists cross the road that the ego turns into."""
     crossing = junction(stage, stage.choice("move", TURNS))
-    stage.play(cyclist_on_exit(stage, crossing))
+    stage.play(cyclists_on_exit(stage, crossing))
 
 
 def vehicle_turning_route_pedestrian(stage: Stage) -> None:
-    """A pedestrian crosses the road that the ego turns into."""
+    """Pedestrians cross the road that the ego turns into."""
     crossing = junction(stage, stage.choice("move", TURNS))
     crosswalk_on(stage, crossing, crossing.move)
-    stage.play(pedestrian_on_exit(stage, crossing))
+    stage.play(pedestrians_on_exit(stage, crossing))
 
 
 def control_loss(stage: Stage) -> None:
