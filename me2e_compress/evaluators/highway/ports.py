@@ -56,8 +56,8 @@ def check_inputs(
             continue
         if name not in contract:
             raise EvaluationError(
-                f"input {name} is none of {', '.join(CONTRACT)}, and no output is known "
-                "that answers it"
+                f"input {name} is none of {', '.join(CONTRACT)}, and no output "
+                "is known that answers it"
             )
         _check_shape(name, port.shape, CONTRACT[contract[name]])
 

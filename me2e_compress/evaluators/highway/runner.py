@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.base import PLAN_SHAPE, Observation, Policy
 from me2e_compress.evaluators.highway.cameras import (
     CLEAR,
@@ -25,7 +26,7 @@ from me2e_compress.evaluators.highway.scene import Control, Scene
 from me2e_compress.evaluators.highway.world import World
 from me2e_compress.evaluators.latency import FixedLatency, LatencySource
 from me2e_compress.evaluators.realtime import DT_US, HeldControl
-from me2e_compress.metrics.episode import Decision, Ending, Episode
+from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode
 
 Plan = npt.NDArray[np.float64]
 
@@ -36,15 +37,27 @@ class Conditions:
 
     Args:
         latency: What its decisions cost.
-        dt_us: Step of the world, see `realtime.skipped_decisions`.
+        dt_us: Step of the world, a whole part of 50 ms; what a finer one changes says
+            `realtime.skipped_decisions`. Frames are recorded every 50 ms all the same.
         image_size: Rows and columns of each camera.
         weather: Weather and sensor faults.
+
+    Raises:
+        EvaluationError: 50 ms are not a multiple of the step.
     """
 
     latency: LatencySource = field(default_factory=FixedLatency)
     dt_us: int = DT_US
     image_size: tuple[int, int] = (96, 160)
     weather: Weather = CLEAR
+
+    def __post_init__(self) -> None:
+        """Check the step."""
+        if self.dt_us <= 0 or FRAME_US % self.dt_us:
+            raise EvaluationError(
+                f"a step of {self.dt_us / 1e3:g} ms: it must be a whole part of "
+                f"{FRAME_US // 1000} ms"
+            )
 
 
 class PolicyFailedError(Exception):
@@ -117,7 +130,9 @@ class _Drive:
     def run(self) -> Episode:
         world, ending = self.world, None
         try:
+            self.to.asking(world)
             _reset(self.policy, self.route)
+            self.to.answered()
             while ending is None:
                 scene = world.scene()
                 self.recorder.see(scene)
