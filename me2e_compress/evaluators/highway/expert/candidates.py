@@ -11,6 +11,8 @@ from me2e_compress.evaluators.highway.reference import beyond, reentry
 from me2e_compress.evaluators.highway.scene import RoutePath
 
 ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)
+LAG_S = 0.2
+"""Of the ego's brakes and motor: an acceleration that is asked for comes late."""
 HARDEST_EASE_MPS2 = 3.0
 """Braking for what the road allows, never more."""
 CHANGE_S = 2.6
@@ -87,12 +89,16 @@ def sample(
 def _speeds(
     path: RoutePath, top: Floats, place: Place, rates: Floats
 ) -> tuple[Floats, Floats]:
-    """Arc lengths and speeds, each [rates, T]."""
+    """Arc lengths and speeds, each [rates, T], with the lag of the actuators."""
     along, speed = np.full_like(rates, place.s_m), np.full_like(rates, place.speed_mps)
     alongs, speeds = [], []
+    missing = place.acceleration_mps2 - rates
     for step in np.diff(TIMES_S, prepend=0.0):
+        left = np.exp(-step / LAG_S)
+        mean = rates + missing * (1 - left) * LAG_S / step
+        missing = missing * left
         allowed = np.maximum(path.value(top, along), speed - HARDEST_EASE_MPS2 * step)
-        after = np.clip(speed + rates * step, 0.0, allowed)
+        after = np.clip(speed + mean * step, 0.0, allowed)
         along = along + (speed + after) / 2 * step
         speed = after
         alongs.append(along)

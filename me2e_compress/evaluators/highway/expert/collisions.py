@@ -12,8 +12,10 @@ COLLISION, NEAR_MISS, CUT_OFF = 200.0, 8.0, 30.0
 FADE = np.exp(-TIMES_S / 3.0)
 """[18] far futures weigh less."""
 MARGIN_M, NEAR_M = 0.35, 1.3
-"""Beyond contact: certainly avoided (the discs miss 0.41 m at the corners), and
-preferably avoided."""
+"""Beyond contact: certainly avoided, and preferably avoided."""
+CORNER_M = 0.1
+"""Added to the discs, which miss 0.41 m at the corners of the ego; less than
+`MARGIN_M` remains."""
 PRIORITY_S = 1.3
 """Nobody is to be met within this time ahead of a moving car's bumper."""
 
@@ -23,7 +25,7 @@ def collision_cost(
 ) -> Floats:
     """[K] cost of touching, nearly touching, or cutting off an actor.
 
-    The ego is four discs of its own width, an actor its rectangle, longer in front by
+    The ego is four discs of its width, an actor its rectangle, longer in front by
     what it drives in `PRIORITY_S`. Who follows in the ego's own lane looks after
     himself.
     """
@@ -55,7 +57,7 @@ def _clearances(
     future: Candidates, seen: Forecast, ego: Ego, others: Flags
 ) -> tuple[Floats, Floats]:
     """Metres from the ego's discs to each actor, and to its way ahead: [A, K, T]."""
-    radius, reach = ego.width / 2, (ego.length - ego.width) / 2
+    radius, reach = ego.width / 2 + CORNER_M, (ego.length - ego.width) / 2
     x, y, heading, speed = (
         column[others, None, 1:]
         for column in (seen.x, seen.y, seen.heading, seen.speed_mps)

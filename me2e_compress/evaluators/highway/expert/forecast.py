@@ -14,10 +14,12 @@ Flags = npt.NDArray[np.bool_]
 TIMES_S = np.concatenate([np.arange(0.25, 3.01, 0.25), np.arange(3.5, 6.01, 0.5)])
 """[18] seconds: fine for the three seconds that are handed out, coarse after."""
 NOW_S = np.concatenate([[0.0], TIMES_S])
-REACH_M = 90.0
-"""Actors farther away than this cannot matter within six seconds."""
-ROUTE_SPAN_M = (-30.0, 110.0)
+REACH_M = 150.0
+"""Actors farther away than this do not matter; oncoming ones do matter early."""
+ROUTE_SPAN_M = (-60.0, 160.0)
 """Part of the route, from the ego, onto which actors are projected."""
+EASY_MPS2 = 0.3
+"""An actor below its wanted speed gains at least this; most are held up."""
 SETTLE_S = 1.0
 """Time constant with which an actor returns to the line it follows."""
 
@@ -31,6 +33,7 @@ class Forecast:
         y: [A, T] metres.
         heading: [A, T] radians.
         speed_mps: [A, T].
+        goal_mps: [A] the speed it wants.
         length: [A] metres.
         width: [A] metres.
         moves: [A] whether it can move at all.
@@ -46,6 +49,7 @@ class Forecast:
     y: Floats
     heading: Floats
     speed_mps: Floats
+    goal_mps: Floats
     length: Floats
     width: Floats
     moves: Flags
@@ -69,6 +73,7 @@ class Forecast:
         return (sin * self.length[:, None] + cos * self.width[:, None]) / 2
 
 
+ON_FOOT = (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
 FIXED = (ActorKind.PARKED, ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER)
 
 
@@ -95,6 +100,7 @@ def forecast(
     along, lateral, away = _on_route(path, x, y, heading, ego_s_m)
     return Forecast(
         *(x, y, heading, speed),
+        goal_mps=np.array([_goal(a, intents.get(a.id)) for a in near]),
         length=np.array([actor.length for actor in near]),
         width=np.array([actor.width for actor in near]),
         moves=np.array([actor.kind not in FIXED for actor in near], bool),
@@ -113,11 +119,12 @@ def _yields(intent: Intent | None) -> bool:
 
 def _roll_out(actor: Actor, intent: Intent | None) -> Floats:
     """[4, T] x, y, heading, speed at `NOW_S`."""
-    if actor.kind in FIXED:
-        intent = None
-    goal = actor.speed_mps if intent is None else intent.target_mps
     first = 0.0 if intent is None else intent.acceleration_mps2
-    speed, travel = _speeds(actor.speed_mps, first, goal)
+    briskest = max(first, EASY_MPS2)
+    goal = _goal(actor, intent)
+    if actor.kind in ON_FOOT:
+        first = briskest = 4.0 if goal > actor.speed_mps else 0.0
+    speed, travel = _speeds(actor.speed_mps, goal, first, briskest)
     if intent is None or len(intent.path) < 2:
         x = actor.x + travel * np.cos(actor.heading)
         y = actor.y + travel * np.sin(actor.heading)
@@ -125,17 +132,29 @@ def _roll_out(actor: Actor, intent: Intent | None) -> Floats:
     return np.vstack([_along(actor, intent.path, travel), speed])
 
 
-def _speeds(now: float, acceleration: float, goal: float) -> tuple[Floats, Floats]:
-    """Speeds and distances at `NOW_S`: this acceleration for 1 s, then to the goal."""
-    steps, hardest = np.diff(NOW_S), -2.0
-    if goal < now:
-        hardest = min(acceleration, hardest)
+def _goal(actor: Actor, intent: Intent | None) -> float:
+    return actor.speed_mps if intent is None else intent.target_mps
+
+
+def _speeds(
+    now: float, goal: float, first: float, briskest: float
+) -> tuple[Floats, Floats]:
+    """Speeds and distances at `NOW_S`: one acceleration for 1 s, then to the goal.
+
+    Args:
+        now: Speed.
+        goal: Wanted speed.
+        first: Acceleration of the first second.
+        briskest: Strongest acceleration later; who crawls behind somebody will not
+            leap ahead.
+    """
+    hardest = min(first, -2.0)
     speed, travel = [now], [0.0]
-    for begin, step in zip(NOW_S[:-1], steps, strict=True):
-        wish = min(max((goal - speed[-1]) / step, hardest), 2.0)
-        rate = acceleration if begin < 1.0 else wish
-        if begin < 1.0 and acceleration > 0:
-            rate = min(acceleration, max(wish, 0.0))
+    for begin, step in zip(NOW_S[:-1], np.diff(NOW_S), strict=True):
+        wish = min(max((goal - speed[-1]) / step, hardest), briskest)
+        rate = wish
+        if begin < 1.0:
+            rate = min(first, max(wish, 0.0)) if first > 0 else first
         after = max(speed[-1] + rate * step, 0.0)
         travel.append(travel[-1] + (speed[-1] + after) / 2 * step)
         speed.append(after)

@@ -80,10 +80,11 @@ def decide(
     s, lateral = path.project(ego.x, ego.y, memory.at_m)
     speed = max(ego.speed_mps, 0.0)
     here = float(path.value(top, s))
-    place = Place(s, lateral, slope_of(ego, path, s), speed, here)
-    stop = obey(scene, known.phases, s, memory.served)
+    slope, gaining = slope_of(ego, path, s), ego.acceleration_mps2
+    place = Place(s, lateral, slope, speed, gaining, here)
     intents = {intent.actor_id: intent for intent in known.intents}
     seen = forecast(scene, intents, path, s)
+    stop = obey(scene, known.phases, seen, s, memory.served)
     options = lateral_targets(path, place, ego, seen)
     future = sample(path, _slowed(top, stop), place, options, stop.line_m)
     cost = drive_cost(future, ego, place, memory.target_m)

@@ -33,6 +33,7 @@ class Place:
         lateral_m: Metres left of the route.
         slope: Metres to the left per metre of route, see `reference.slope_of`.
         speed_mps: Speed.
+        acceleration_mps2: Along the route.
         top_mps: What the road ahead allows.
     """
 
@@ -40,6 +41,7 @@ class Place:
     lateral_m: float
     slope: float
     speed_mps: float
+    acceleration_mps2: float
     top_mps: float
 
 
@@ -83,8 +85,8 @@ def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> 
     columns = (path.lane_widths, path.left_m, path.right_m, path.oncoming_m)
     lane, left, right, both = (float(path.value(c, ahead)) for c in columns)
     room = ego.width / 2
-    beside = [lane, min(lane + ASIDE_M, left - room)]
-    beside += [-lane, max(-lane - ASIDE_M, room - right)]
+    beside = [lane, min(lane + ASIDE_M, left - room), 2 * lane]
+    beside += [-lane, max(-lane - ASIDE_M, room - right), -2 * lane]
     offsets = [n for n in (*NUDGES_M, *beside) if room - right <= n <= left - room]
     oncoming = [False] * (1 + len(offsets))
     facing = left + lane / 2
@@ -154,7 +156,8 @@ def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:
     in_way = np.abs(lateral) < half + ego.width / 2 + 0.3
     gap = seen.along_m[:, 0] - place.s_m
     ends = gap + seen.half_span[:, 0]
-    blocking = in_way & (fastest < SLOW_MPS) & ~crosses & ~seen.walks
+    slow = (fastest < SLOW_MPS) & (seen.goal_mps < SLOW_MPS + 1.0)
+    blocking = in_way & slow & ~crosses & ~seen.walks
     blocking &= ends > -ego.length / 2
     if not np.any(blocking):
         return None

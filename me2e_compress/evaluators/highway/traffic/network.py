@@ -94,6 +94,7 @@ class Network:
     def __init__(self) -> None:
         self.graph = RoadNetwork()
         self.shoulders: list[LaneIndex] = []
+        self._centres: dict[LaneIndex, Floats] = {}
 
     def straight(
         self, start: str, end: str, pose: Pose, length_m: float, section: Section
@@ -166,7 +167,12 @@ class Network:
         return float(self.lane(index).length)
 
     def centre(self, index: LaneIndex) -> Floats:
-        """[N, 2] centre line, at most `CHORD_M` apart."""
+        """[N, 2] centre line, at most `CHORD_M` apart, computed once."""
+        if index not in self._centres:
+            self._centres[index] = self._sampled(index)
+        return self._centres[index]
+
+    def _sampled(self, index: LaneIndex) -> Floats:
         length = self.length(index)
         stations = np.linspace(0.0, length, max(2, math.ceil(length / CHORD_M) + 1))
         poses = [self.pose(index, float(s)) for s in stations]
