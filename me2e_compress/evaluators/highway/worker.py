@@ -1,5 +1,7 @@
 """A process that drives routes, and the watchdog that outlives it."""
 
+from __future__ import annotations
+
 import multiprocessing
 import signal
 import threading
@@ -70,7 +72,7 @@ class RouteWorker:
     job: Job
     _process: SpawnProcess | None = field(default=None, init=False)
     _pulse: Pulse | None = field(default=None, init=False)
-    _line: "Connection[Route, Driven | Me2eError] | None" = field(
+    _line: Connection[Route, Driven | Me2eError] | None = field(
         default=None, init=False
     )
 
@@ -120,7 +122,7 @@ class RouteWorker:
 
     def _started(
         self,
-    ) -> "tuple[SpawnProcess, Pulse, Connection[Route, Driven | Me2eError]]":
+    ) -> tuple[SpawnProcess, Pulse, Connection[Route, Driven | Me2eError]]:
         if self._process is None or self._pulse is None or self._line is None:
             context = multiprocessing.get_context("spawn")
             pulse = context.Array("d", 2)
@@ -149,16 +151,14 @@ class RouteWorker:
         return Driven(episode, time.perf_counter() - begun, 0)
 
 
-def _ready(line: "Connection[Route, Driven | Me2eError]") -> bool:
+def _ready(line: Connection[Route, Driven | Me2eError]) -> bool:
     try:
         return line.poll(POLL_S)
     except (BrokenPipeError, ConnectionResetError):
         return True
 
 
-def _serve(
-    line: "Connection[Driven | Me2eError, Route]", pulse: Pulse, job: Job
-) -> None:
+def _serve(line: Connection[Driven | Me2eError, Route], pulse: Pulse, job: Job) -> None:
     """Drive what comes down the line until the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     asked = 0
