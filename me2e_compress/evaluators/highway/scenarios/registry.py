@@ -75,8 +75,8 @@ BUILDERS: dict[str, Builder] = {
 """One short function each: a layout and one or two actor scripts."""
 
 
-def stage_of(route: Route) -> Stage:
+def stage_of(route: Route, builder: Builder | None = None) -> Stage:
     """Set up a route: its roads, its actors and their scripts."""
     stage = Stage(route)
-    BUILDERS[route.scenario](stage)
+    (builder or BUILDERS[route.scenario])(stage)
     return stage

@@ -43,6 +43,11 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._half = np.array([body.WIDTH / 2 for body in self._bodies])
         self._ego = np.array([body.id == 0 for body in self._bodies])
 
+    def seat(self, car: Car, index: LaneIndex) -> tuple[float, float]:
+        """Arc length and offset to the right of a car in a lane, at the last look."""
+        row, column = self._row[id(car)], self.table.column[index]
+        return float(self._s[row, column]), float(self._r[row, column])
+
     def lead(self, car: Car) -> tuple[RoadObject, float] | None:
         """The next body in a car's way, and the gap between their bumpers (m)."""
         row = self._row[id(car)]
@@ -103,22 +108,20 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
     def touching(self) -> list[tuple[RoadObject, RoadObject]]:
         """Pairs that overlap now and of which one moves."""
         bodies = [*self.vehicles, *self.objects]
-        movers = [i for i, body in enumerate(self.vehicles) if body.speed > 0]
-        if not movers:
+        if not any(body.speed > 0 for body in self.vehicles):
             return []
         points = np.array([body.position for body in bodies])
         reach = np.array([body.diagonal / 2 for body in bodies])
-        delta = points[movers, None, :] - points[None]
-        near = delta[..., 0] ** 2 + delta[..., 1] ** 2
-        near = near < (reach[movers, None] + reach[None]) ** 2
+        moves = np.array([body.speed > 0 for body in bodies])
+        delta = points[:, None] - points[None]
+        room = reach[:, None] + reach[None]
+        near = (delta * delta).sum(axis=2) < room * room
+        near &= moves[:, None] | moves[None]
         pairs = list[tuple[RoadObject, RoadObject]]()
-        for row, j in np.argwhere(near):
-            i = movers[row]
-            if i == j or (j < i and bodies[j].speed > 0):
-                continue
-            a, b = bodies[min(i, j)], bodies[max(i, j)]
-            if overlap(a, b):
-                pairs.append((a, b))
+        first, second = (side.tolist() for side in np.nonzero(np.triu(near, 1)))
+        for i, j in zip(first, second, strict=True):
+            if overlap(bodies[i], bodies[j]):
+                pairs.append((bodies[i], bodies[j]))
         return pairs
 
 

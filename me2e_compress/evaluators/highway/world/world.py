@@ -6,7 +6,7 @@ from enum import StrEnum
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.geometry import Roadmap, RoutePath
 from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scenarios.registry import stage_of
+from me2e_compress.evaluators.highway.scenarios.registry import Builder, stage_of
 from me2e_compress.evaluators.highway.scene import Actor, Control, Scene
 from me2e_compress.evaluators.highway.traffic.bodies import Standing, Walker
 from me2e_compress.evaluators.highway.traffic.cars import Car
@@ -43,6 +43,8 @@ class World:
         route: What to stage.
         dt_us: Frame length in microseconds. A finer one lets a policy act more
             often; actors still decide every 0.1 s.
+        builder: Sets the stage instead of the registered scenario type; for those who
+            write new types.
 
     Attributes:
         route: What is staged.
@@ -54,13 +56,15 @@ class World:
         reason: Why the world has ended, None while it has not.
     """
 
-    def __init__(self, route: Route, *, dt_us: int = DT_US) -> None:
+    def __init__(
+        self, route: Route, *, dt_us: int = DT_US, builder: Builder | None = None
+    ) -> None:
         if not 0 < dt_us <= DECISION_US:
             raise EvaluationError(
                 f"a frame of {dt_us} us: it must be within 1 and {DECISION_US}"
             )
         self.route, self.dt_us = route, dt_us
-        self._stage = stage = stage_of(route)
+        self._stage = stage = stage_of(route, builder)
         self.path: RoutePath = stage.path
         self.parameters = dict(stage.parameters)
         self.roadmap: Roadmap = stage.network.roadmap(
