@@ -8,7 +8,7 @@ from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags
 from me2e_compress.evaluators.highway.expert.targets import Options, Place
 from me2e_compress.evaluators.highway.geometry import Floats
 from me2e_compress.evaluators.highway.reference import beyond, reentry
-from me2e_compress.evaluators.highway.scene import RoutePath
+from me2e_compress.evaluators.highway.scene import Ego, RoutePath
 
 ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)
 LAG_S = 0.2
@@ -28,7 +28,8 @@ class Candidates:
     Args:
         x: [K, T] metres.
         y: [K, T] metres.
-        heading: [K, T] radians.
+        heading: [K, T] radians, of the body: in a bend it points out of the way that
+            the centre goes, by the slip angle.
         along_m: [K, T] arc length.
         lateral_m: [K, T] metres left of the route.
         speed_mps: [K, T].
@@ -51,6 +52,7 @@ class Candidates:
 def sample(
     path: RoutePath,
     top: Floats,
+    ego: Ego,
     place: Place,
     options: Options,
     stop_m: float | None,
@@ -60,7 +62,8 @@ def sample(
     Args:
         path: The route.
         top: [N] speed ceiling along it.
-        place: The ego.
+        ego: The ego.
+        place: The same on its route.
         options: Lateral targets.
         stop_m: Arc length at which the ego's centre should stand, if any: one more
             acceleration, that stops exactly there.
@@ -77,7 +80,8 @@ def sample(
     x, y, heading = beyond(path, along, lateral)
     moved = np.diff(along, axis=1, prepend=place.s_m)
     shifted = np.diff(lateral, axis=1, prepend=place.lateral_m)
-    heading = heading + np.arctan2(shifted, np.maximum(moved, 0.3))
+    slip = np.clip(path.value(path.curvature, along) * ego.length / 2, -0.5, 0.5)
+    heading = heading + np.arctan2(shifted, np.maximum(moved, 0.3)) - np.arcsin(slip)
     return Candidates(
         *(x, y, heading, along, lateral, speed),
         acceleration=np.tile(np.array(rates), repeat),

@@ -16,6 +16,8 @@ MARGIN_M, NEAR_M = 0.35, 1.3
 CORNER_M = 0.1
 """Added to the discs, which miss 0.41 m at the corners of the ego; less than
 `MARGIN_M` remains."""
+SWEEP_S = 0.12
+"""Everybody is this much longer at both ends, since the times are 0.25 s apart."""
 PRIORITY_S = 1.3
 """Nobody is to be met within this time ahead of a moving car's bumper."""
 
@@ -57,13 +59,14 @@ def _clearances(
     future: Candidates, seen: Forecast, ego: Ego, others: Flags
 ) -> tuple[Floats, Floats]:
     """Metres from the ego's discs to each actor, and to its way ahead: [A, K, T]."""
-    radius, reach = ego.width / 2 + CORNER_M, (ego.length - ego.width) / 2
+    radius = ego.width / 2 + CORNER_M
+    reach = (ego.length - ego.width) / 2 + SWEEP_S * future.speed_mps
     x, y, heading, speed = (
         column[others, None, 1:]
         for column in (seen.x, seen.y, seen.heading, seen.speed_mps)
     )
     cos, sin = np.cos(heading), np.sin(heading)
-    half_length = seen.length[others, None, None] / 2
+    half_length = seen.length[others, None, None] / 2 + SWEEP_S * speed
     half_width = seen.width[others, None, None] / 2
     front = half_length + speed * PRIORITY_S * seen.moves[others, None, None]
     shift = reach * np.stack([np.cos(future.heading), np.sin(future.heading)])

@@ -13,7 +13,7 @@ from me2e_compress.evaluators.highway.expert.targets import SLOW_MPS, Place
 from me2e_compress.evaluators.highway.geometry import Floats
 from me2e_compress.evaluators.highway.scene import Ego, RoutePath
 
-OFF_ROAD, RUN_LINE, WRONG_SIDE, HEADWAY = 120.0, 500.0, 1.5, 14.0
+OFF_ROAD, RUN_LINE, WRONG_SIDE, HEADWAY = 120.0, 500.0, 1.5, 24.0
 PROGRESS_PER_M, SPEED_PER_MPS = 0.40, 0.8
 OFFSET_PER_M, SWITCH, BRAKE_HARD, EFFORT, JERK = 0.6, 3.0, 3.0, 0.4, 0.15
 STANDOFF_M, GAP_S = 2.0, 0.8
@@ -75,7 +75,8 @@ def headway_cost(
     standing = np.where(slow & passable, SWING_OUT_M, STANDOFF_M)
     wanted = standing + GAP_S * future.speed_mps[None]
     short = np.where(leads, np.clip((wanted - gap) / wanted, 0.0, 1.2), 0.0)
-    return np.asarray(HEADWAY * np.max(short, axis=(0, 2), initial=0.0))
+    closest = np.max(short, axis=0, initial=0.0)
+    return np.asarray(HEADWAY * np.mean(closest, axis=1))
 
 
 def emergency_cost(

@@ -86,7 +86,7 @@ def decide(
     seen = forecast(scene, intents, path, s)
     stop = obey(scene, known.phases, seen, s, memory.served)
     options = lateral_targets(path, place, ego, seen)
-    future = sample(path, _slowed(top, stop), place, options, stop.line_m)
+    future = sample(path, _slowed(top, stop), ego, place, options, stop.line_m)
     cost = drive_cost(future, ego, place, memory.target_m)
     cost += rule_cost(future, path, ego, place, stop.line_m)
     if len(seen.length):
