@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.objects import RoadObject
 
 from me2e_compress.evaluators.highway.geometry import Floats
 from me2e_compress.evaluators.highway.scene import DIMENSIONS, ActorKind
@@ -150,25 +151,23 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         wanted = self.forced_mps2
         if wanted is None:
             lead, gap = self.road.lead(self) or (None, math.inf)
-            wanted = self.acceleration(self, lead, gap, self.allowed_mps(s))
+            wanted = self.idm(lead, gap, self.allowed_mps(s))
         wanted = min(max(wanted, -self.manners.hardest_mps2), self.COMFORT_ACC_MAX)
         self.action = {"acceleration": wanted, "steering": self._steering(s, r)}
         self.braking = wanted < -0.7 or self.speed < 0.2
 
-    def acceleration(
-        self,
-        ego_vehicle: "Car",
-        front_vehicle: object = None,
-        gap_m: float = math.inf,
-        allowed_mps: float = math.inf,
-    ) -> float:
-        """IDM's acceleration for a leader at a gap between bumpers (m/s2)."""
+    def idm(self, leader: RoadObject | None, gap_m: float, allowed_mps: float) -> float:
+        """IDM's acceleration (m/s2) for a leader at a gap between bumpers.
+
+        highway-env's own `acceleration`, but for the gap: that one subtracts
+        coordinates of the present lane, which means nothing around a corner.
+        """
         allowed = max(min(allowed_mps, float(self.target_speed)), 0.01)
         free = self.COMFORT_ACC_MAX * (1 - (self.speed / allowed) ** self.DELTA)
         free = float(max(free, self.COMFORT_ACC_MIN))
-        if front_vehicle is None:
+        if leader is None:
             return free
-        wanted = max(self.desired_gap(self, front_vehicle), self.DISTANCE_WANTED)
+        wanted = max(self.desired_gap(self, leader), self.DISTANCE_WANTED)
         return float(free - self.COMFORT_ACC_MAX * (wanted / max(gap_m, 0.3)) ** 2)
 
     def allowed_mps(self, lane_s: float) -> float:

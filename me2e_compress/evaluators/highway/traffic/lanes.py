@@ -27,10 +27,10 @@ class LaneTable:
         self._straight: npt.NDArray[np.int64] = np.array(straight, dtype=np.int64)
         self._circular: npt.NDArray[np.int64] = np.array(circular, dtype=np.int64)
         values = list(lanes.values())
-        lines: list[StraightLane] = [values[i] for i in straight]
+        lines = [lane for lane in values if isinstance(lane, StraightLane)]
         self._start = np.array([lane.start for lane in lines]).reshape(-1, 2)
         self._along = np.array([lane.direction for lane in lines]).reshape(-1, 2)
-        arcs: list[CircularLane] = [values[i] for i in circular]
+        arcs = [lane for lane in values if isinstance(lane, CircularLane)]
         self._centre = np.array([lane.center for lane in arcs]).reshape(-1, 2)
         self._radius = np.array([lane.radius for lane in arcs])
         self._phase = np.array([lane.start_phase for lane in arcs])
