@@ -2,7 +2,6 @@
 
 import json
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -98,15 +97,13 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
         EvaluationError: The file cannot be written.
     """
     lines = ",\n".join(json.dumps(asdict(route)) for route in routes)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(f"[\n{lines}\n]\n")
+            temporary.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
             os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        finally:
+            temporary.unlink(missing_ok=True)
     except OSError as error:
         raise EvaluationError(f"{path}: cannot be written: {error.strerror}") from error
 
