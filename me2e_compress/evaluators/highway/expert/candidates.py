@@ -72,7 +72,7 @@ def sample(
     if stop_m is not None:
         room = max(stop_m - place.s_m, 0.05)
         rates.append(max(-(place.speed_mps**2) / (2 * room), -8.0))
-    along, speed = _speeds(path, top, place, np.array(rates))
+    along, speed = _speeds(top, place, np.array(rates))
     repeat, count = len(options.target_m), len(rates)
     along, speed = np.tile(along, (repeat, 1)), np.tile(speed, (repeat, 1))
     target = np.repeat(options.target_m, count)
@@ -90,18 +90,18 @@ def sample(
     )
 
 
-def _speeds(
-    path: RoutePath, top: Floats, place: Place, rates: Floats
-) -> tuple[Floats, Floats]:
+def _speeds(top: Floats, place: Place, rates: Floats) -> tuple[Floats, Floats]:
     """Arc lengths and speeds, each [rates, T], with the lag of the actuators."""
-    along, speed = np.full_like(rates, place.s_m), np.full_like(rates, place.speed_mps)
+    along = np.full_like(rates, max(place.s_m, 0.0))
+    speed = np.full_like(rates, place.speed_mps)
     alongs, speeds = [], []
     missing = place.acceleration_mps2 - rates
     for step in np.diff(TIMES_S, prepend=0.0):
         left = np.exp(-step / LAG_S)
         mean = rates + missing * (1 - left) * LAG_S / step
         missing = missing * left
-        allowed = np.maximum(path.value(top, along), speed - HARDEST_EASE_MPS2 * step)
+        limit = top[np.minimum(along.astype(np.int64), len(top) - 1)]
+        allowed = np.maximum(limit, speed - HARDEST_EASE_MPS2 * step)
         after = np.clip(speed + mean * step, 0.0, allowed)
         along = along + (speed + after) / 2 * step
         speed = after

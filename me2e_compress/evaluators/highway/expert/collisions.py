@@ -18,6 +18,8 @@ CORNER_M = 0.1
 `MARGIN_M` remains."""
 SWEEP_S = 0.12
 """Everybody is this much longer at both ends, since the times are 0.25 s apart."""
+REACH_M = 12.0
+"""Half of two long vehicles and the margins; who is farther away needs no look."""
 PRIORITY_S = 1.3
 """Nobody is to be met within this time ahead of a moving car's bumper."""
 
@@ -31,7 +33,7 @@ def collision_cost(
     what it drives in `PRIORITY_S`. Who follows in the ego's own lane looks after
     himself.
     """
-    others = ~followers(seen, ego, place)
+    others = ~followers(seen, ego, place) & _in_reach(future, seen)
     if not np.any(others):
         return np.zeros(len(future.acceleration))
     apart, cut = _clearances(future, seen, ego, others)
@@ -47,6 +49,16 @@ def followers(seen: Forecast, ego: Ego, place: Place) -> Flags:
     beside = apart < seen.half_breadth[:, 0] + ego.width / 2
     behind = seen.along_m[:, 0] < place.s_m
     return np.asarray(aligned & beside & behind & seen.yields)
+
+
+def _in_reach(future: Candidates, seen: Forecast) -> Flags:
+    """[A] whether an actor comes near anything that the ego might do."""
+    margin = REACH_M + PRIORITY_S * seen.speed_mps[:, 1:]
+    near = np.ones_like(margin, bool)
+    for mine, other in ((future.x, seen.x), (future.y, seen.y)):
+        near &= other[:, 1:] + margin > np.min(mine, axis=0)
+        near &= other[:, 1:] - margin < np.max(mine, axis=0)
+    return np.asarray(near.any(axis=1))
 
 
 def _worst(clearance: Floats, margin: float) -> Floats:

@@ -15,7 +15,10 @@ from me2e_compress.evaluators.highway.scene import Ego, RoutePath
 
 OFF_ROAD, RUN_LINE, WRONG_SIDE, HEADWAY = 120.0, 500.0, 1.5, 24.0
 PROGRESS_PER_M, SPEED_PER_MPS = 0.40, 0.8
-OFFSET_PER_M, SWITCH, BRAKE_HARD, EFFORT, JERK = 0.6, 3.0, 3.0, 0.4, 0.15
+OFFSET_PER_M, NUDGE_PER_M, SWITCH = 0.6, 0.3, 3.0
+BRAKE_HARD, EFFORT, JERK = 3.0, 0.4, 0.15
+LANE_CHANGE_M = 1.6
+"""Targets farther apart than this are different lanes: the expert hesitates."""
 STANDOFF_M, GAP_S = 2.0, 0.8
 """Distance kept to a leader: standing, and per m/s."""
 SWING_OUT_M = 8.0
@@ -39,9 +42,8 @@ def rule_cost(
     Who is off the road already pays only for going farther.
     """
     half = ego.width / 2 - 0.05
-    left = path.value(path.left_m, future.along_m)
-    both = path.value(path.oncoming_m, future.along_m)
-    right = path.value(path.right_m, future.along_m)
+    metre = np.clip(np.rint(future.along_m).astype(np.int64), 0, len(path.left_m) - 1)
+    left, both, right = path.left_m[metre], path.oncoming_m[metre], path.right_m[metre]
     edge = np.where(future.oncoming[:, None], both, left)
     over = np.maximum(future.lateral_m + half - both, -right - future.lateral_m + half)
     already = max(
@@ -114,5 +116,6 @@ def drive_cost(future: Candidates, ego: Ego, place: Place, kept_m: float) -> Flo
     cost += EFFORT * np.abs(rate) + BRAKE_HARD * (rate < -3.5)
     cost += JERK * np.abs(begun - ego.acceleration_mps2)
     cost += OFFSET_PER_M * np.abs(future.target_m)
-    cost += SWITCH * np.minimum(np.abs(future.target_m - kept_m), 1.0)
+    moved = np.abs(future.target_m - kept_m)
+    cost += np.where(moved > LANE_CHANGE_M, SWITCH, NUDGE_PER_M * moved)
     return np.asarray(cost)

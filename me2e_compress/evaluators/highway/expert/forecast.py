@@ -1,5 +1,6 @@
 """Where every actor will be, by its own intent, for the next six seconds."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -20,8 +21,6 @@ ROUTE_SPAN_M = (-60.0, 160.0)
 """Part of the route, from the ego, onto which actors are projected."""
 EASY_MPS2 = 0.3
 """An actor below its wanted speed gains at least this; most are held up."""
-SETTLE_S = 1.0
-"""Time constant with which an actor returns to the line it follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +91,7 @@ def forecast(
     near = [
         actor
         for actor in scene.actors
-        if np.hypot(actor.x - ego.x, actor.y - ego.y) < REACH_M
+        if math.hypot(actor.x - ego.x, actor.y - ego.y) < REACH_M
     ]
     rolled = [_roll_out(actor, intents.get(actor.id)) for actor in near]
     poses = np.array(rolled).reshape(len(near), 4, len(NOW_S))
@@ -162,23 +161,15 @@ def _speeds(
 
 
 def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
-    """[3, T] x, y, heading on a line, the offset from it fading within seconds."""
-    steps = np.diff(line, axis=0)
-    lengths = np.maximum(np.hypot(steps[:, 0], steps[:, 1]), 1e-9)
-    arc = np.concatenate([[0.0], np.cumsum(lengths)])
-    offset = np.array([actor.x, actor.y]) - line[:-1]
-    share = np.clip(np.sum(offset * steps, axis=1) / lengths**2, 0.0, 1.0)
-    miss = offset - share[:, None] * steps
-    i = int(np.argmin(np.sum(miss * miss, axis=1)))
-    side = (steps[i, 0] * miss[i, 1] - steps[i, 1] * miss[i, 0]) / lengths[i]
-    at = arc[i] + share[i] * lengths[i] + travel
+    """[3, T] x, y, heading on a line that begins where the actor stands."""
+    steps = line[1:] - line[:-1]
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
     headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
-    heading = np.interp(at, (arc[:-1] + arc[1:]) / 2, headings)
-    over = np.maximum(at - arc[-1], 0.0)
-    lateral = side * np.exp(-NOW_S / SETTLE_S)
-    x = np.interp(at, arc, line[:, 0]) + over * np.cos(heading)
-    y = np.interp(at, arc, line[:, 1]) + over * np.sin(heading)
-    x, y = x - lateral * np.sin(heading), y + lateral * np.cos(heading)
+    heading = np.interp(travel, (arc[:-1] + arc[1:]) / 2, headings)
+    over = np.maximum(travel - arc[-1], 0.0)
+    x = np.interp(travel, arc, line[:, 0]) + over * np.cos(heading)
+    y = np.interp(travel, arc, line[:, 1]) + over * np.sin(heading)
+    heading[0] = actor.heading
     return np.stack([x, y, heading])
 
 
