@@ -2,7 +2,7 @@
 
 A route is admitted if the privileged expert solves it and the blind driver, who keeps
 one speed on the route's centre, commits an infraction on it at every one of
-`blind.SPEEDS_MPS`. Running out of time is no infraction.
+`blind.SPEEDS_MPS`. Running out of time, standing blocked or going astray is none.
 """
 
 from dataclasses import dataclass
@@ -41,8 +41,9 @@ class Verdict:
             return "two actors collide while the expert drives"
         if self.expert.infractions:
             return f"the expert commits: {', '.join(self.expert.infractions)}"
-        if not self.expert.completed:
-            return f"the expert has not arrived after {self.expert.seconds:g} s"
+        if not self.expert.solved:
+            why = self.expert.failure or self.expert.ending.value
+            return f"the expert ends after {self.expert.seconds:g} s: {why}"
         if not self.expert.triggered:
             return "the scenario's event never happened"
         return None
@@ -57,7 +58,7 @@ def examine(route: Route) -> Verdict:
     """Put one route through the gate; the cheap blind drives come first."""
     drives = list[Rehearsal]()
     for speed in SPEEDS_MPS:
-        drives.append(rehearse(route, Blind(speed), to_the_end=False))
+        drives.append(rehearse(route, Blind(speed)))
         if not drives[-1].infractions:
             return Verdict(route, None, tuple(drives))
     return Verdict(route, rehearse(route, Expert()), tuple(drives))

@@ -1,17 +1,20 @@
-"""Drive a route once without cameras, latency or bookkeeping, and say how it went."""
+"""Drive a route once, without cameras or latency, and say in short how it went."""
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from me2e_compress.evaluators.base import CAN_BUS_SIZE, Observation, Policy
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.base import Policy
 from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.world import INFRACTIONS, EndReason, EventKind
-from me2e_compress.evaluators.highway.world.world import World
+from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
+from me2e_compress.evaluators.highway.world import Event, EventKind, World
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import InfractionKind
 
-TIME_LIMIT_S = 90.0
-"""A route of 150 m at 12 m/s takes 13 s; the longest admitted waits add 40 s."""
+ENDS_ONLY = (
+    InfractionKind.ROUTE_TIMEOUT,
+    InfractionKind.VEHICLE_BLOCKED,
+    InfractionKind.ROUTE_DEVIATION,
+)
+"""What says only that a route was not finished; no infraction for the gate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,61 +22,52 @@ class Rehearsal:
     """How one drive of one route went.
 
     Attributes:
-        infractions: Kinds of infractions in order, none repeated.
-        completed: Whether the goal was reached.
+        infractions: Kinds of infractions in order, none repeated, none of `ENDS_ONLY`.
+        ending: Why the route ended.
         triggered: Whether the scenario's event happened.
         actors_crashed: Whether two actors collided: a fault of the scenario.
         seconds: Simulated time at the end.
+        failure: What the policy raised, if it did.
     """
 
-    infractions: tuple[EventKind, ...]
-    completed: bool
+    infractions: tuple[InfractionKind, ...]
+    ending: Ending
     triggered: bool
     actors_crashed: bool
     seconds: float
+    failure: str | None = None
 
     @property
     def solved(self) -> bool:
         """Goal reached and nothing done wrong."""
-        return self.completed and not self.infractions
+        return self.ending is Ending.COMPLETED and not self.infractions
 
 
-def rehearse(route: Route, policy: Policy, *, to_the_end: bool = True) -> Rehearsal:
-    """Drive a route with a privileged policy that decides at every frame.
-
-    Args:
-        route: What to drive.
-        policy: A privileged policy: it sees the world, no images.
-        to_the_end: Go on after infractions that do not end a route.
-    """
-    world, controller = World(route), Controller()
-    policy.reset(route)
-    while not world.done and world.time_us < TIME_LIMIT_S * 1e6:
-        scene = world.scene()
-        plan = policy.plan(_observation(world))
-        anchored = AnchoredPlan.of(plan, scene.ego, world.time_us)
-        world.step(controller.control(anchored, scene.ego, world.time_us))
-        if not to_the_end and any(e.kind in INFRACTIONS for e in world.events):
-            break
-    kinds = [event.kind for event in world.events]
+def rehearse(route: Route, policy: Policy) -> Rehearsal:
+    """Drive a route with a privileged policy that decides at every frame."""
+    seen = _Witness()
+    episode = drive(route, policy, Conditions(), Listeners(asking=seen.watch))
+    kinds = [event.kind for event in seen.events]
+    faults = [found.kind for found in episode.infractions]
     return Rehearsal(
-        tuple(dict.fromkeys(kind for kind in kinds if kind in INFRACTIONS)),
-        world.reason is EndReason.GOAL,
+        tuple(dict.fromkeys(kind for kind in faults if kind not in ENDS_ONLY)),
+        episode.ending,
         EventKind.TRIGGER in kinds,
         EventKind.ACTOR_COLLISION in kinds,
-        world.time_us / 1e6,
+        episode.frames[-1].time_us / 1e6 if episode.frames else 0.0,
+        episode.failure,
     )
 
 
-def _observation(world: World) -> Observation:
-    scene = world.scene()
-    return Observation(
-        world.time_us,
-        None,
-        np.zeros((6, 4, 4), np.float32),
-        np.zeros(CAN_BUS_SIZE, np.float32),
-        int(world.path.command_at(world.ego_s)),
-        scene.ego.speed_mps,
-        scene,
-        world,
-    )
+class _Witness:
+    """Keeps hold of the world that the runner drives in."""
+
+    def __init__(self) -> None:
+        self._world: World | None = None
+
+    def watch(self, world: World) -> None:
+        self._world = world
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        return () if self._world is None else self._world.events

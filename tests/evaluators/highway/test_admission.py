@@ -13,13 +13,17 @@ from me2e_compress.evaluators.highway.generate import (
 )
 from me2e_compress.evaluators.highway.rehearsal import Rehearsal
 from me2e_compress.evaluators.highway.routes import load_routes, pick_routes
-from me2e_compress.evaluators.highway.world import EventKind, World
+from me2e_compress.evaluators.highway.world import World
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import InfractionKind
 from tests.evaluators.highway.world.driving import route_of
 
 SAMPLE = pick_routes(load_routes(), "11")
-SOLVED = Rehearsal((), True, True, False, 20.0)
-FAILED = Rehearsal((EventKind.COLLISION,), False, True, False, 9.0)
-LATE = Rehearsal((), False, True, False, 90.0)
+HIT = (InfractionKind.COLLISION_VEHICLE,)
+SOLVED = Rehearsal((), Ending.COMPLETED, True, False, 20.0)
+FAILED = Rehearsal(HIT, Ending.COLLISION, True, False, 9.0)
+LATE = Rehearsal((), Ending.BLOCKED, True, False, 75.0)
+BROKEN = Rehearsal((), Ending.POLICY_FAILED, True, False, 1.0, "ValueError: no")
 
 
 @pytest.mark.parametrize("route", SAMPLE, ids=lambda route: route.id)
@@ -35,8 +39,9 @@ def test_what_ships_is_admitted(route: object) -> None:
     [
         (None, (SOLVED,), "no infraction at 4 m/s"),
         (None, (FAILED, FAILED, LATE), "no infraction at 12 m/s"),
-        (FAILED, (FAILED,) * 3, "the expert commits: collision"),
-        (LATE, (FAILED,) * 3, "has not arrived after 90 s"),
+        (FAILED, (FAILED,) * 3, "the expert commits: collisions_vehicle"),
+        (LATE, (FAILED,) * 3, "ends after 75 s: blocked"),
+        (BROKEN, (FAILED,) * 3, "ends after 1 s: ValueError: no"),
         (replace(SOLVED, triggered=False), (FAILED,) * 3, "never happened"),
         (replace(SOLVED, actors_crashed=True), (FAILED,) * 3, "two actors collide"),
     ],

@@ -29,7 +29,7 @@ def coast(world: World, frames: int, control: Control | None = None) -> None:
 
 
 def sleepwalk(route: Route, speed_mps: float) -> Rehearsal:
-    return rehearse(route, Blind(speed_mps), to_the_end=False)
+    return rehearse(route, Blind(speed_mps))
 
 
 def trace(route: Route, frames: int = 200, dt_us: int = 50_000) -> list[object]:

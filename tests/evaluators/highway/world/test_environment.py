@@ -25,11 +25,12 @@ def test_it_is_registered() -> None:
 def test_reward_is_progress_and_a_collision_costs() -> None:
     env = HighwayEnv([route_of("Accident", 1)])
     env.reset(seed=0)
-    rewards, ended = list[float](), False
-    while not ended:
-        _, reward, ended, late, info = env.step(np.array([0.35, 0.0], np.float32))
-        ended = ended or late
+    rewards, push = list[float](), np.array([0.35, 0.0], np.float32)
+    while True:
+        _, reward, ended, late, info = env.step(push)
         rewards.append(reward)
+        if ended or late:
+            break
 
     assert rewards[-1] < -45
     assert 40 < sum(rewards[:-1]) < 90

@@ -11,6 +11,8 @@ from me2e_compress.evaluators.highway.scenarios.layouts.streets import two_way
 from me2e_compress.evaluators.highway.scene import ActorKind, Control
 from me2e_compress.evaluators.highway.traffic.stage import Script, Stage
 from me2e_compress.evaluators.highway.world import EndReason, EventKind, World
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import InfractionKind
 from tests.evaluators.highway.world.driving import (
     coast,
     empty_road,
@@ -222,8 +224,8 @@ def test_a_slick_patch_takes_grip_away() -> None:
     assert -4.0 <= hardest < -2.5
 
 
-def test_the_same_infraction_twice_is_a_fault_of_the_driver_only() -> None:
+def test_running_a_red_light_does_not_end_a_route() -> None:
     drive = sleepwalk(route_of("VanillaSignalizedTurnEncounterRedLight", 1), 8.0)
 
-    assert drive.infractions == (EventKind.RED_LIGHT,)
-    assert not drive.actors_crashed
+    assert drive.infractions == (InfractionKind.RED_LIGHT,)
+    assert drive.ending is Ending.COMPLETED
