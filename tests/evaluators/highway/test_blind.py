@@ -8,7 +8,7 @@ from me2e_compress.evaluators.base import CAN_BUS_SIZE, Observation
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind, centre_plan
 from me2e_compress.evaluators.highway.rehearsal import rehearse
 from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.world import EventKind
+from me2e_compress.metrics.infraction import InfractionKind
 from tests.evaluators.highway.tiny_world import circle, ego_at, straight
 
 
@@ -35,7 +35,7 @@ def test_it_bends_with_the_route() -> None:
 
 def test_it_drives_into_what_stands_there() -> None:
     drive = rehearse(Route("a", "ParkedObstacle", "Overtaking", 7), Blind(8.0))
-    assert drive.infractions == (EventKind.COLLISION,)
+    assert drive.infractions == (InfractionKind.COLLISION_VEHICLE,)
 
 
 def test_without_a_world_it_says_what_is_missing() -> None:

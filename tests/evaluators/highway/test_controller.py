@@ -40,6 +40,7 @@ def follow(
     """Drive the route's centre line at one speed; all lateral offsets."""
     world = TinyWorld(path, ego_at(5.0, offset, speed=speed))
     controller, offsets, s = Controller(), list[float](), 5.0
+    plan = AnchoredPlan.of(np.zeros((6, 2)), world.ego, 0)
     for frame in range(round(seconds * 1e6 / DT_US)):
         if frame % every == 0:
             s, _ = path.project(world.ego.x, world.ego.y, s)

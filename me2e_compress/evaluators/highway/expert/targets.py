@@ -132,8 +132,10 @@ def gap_for_passing(
     reaches its end, with `CLEAR_S` to spare.
     """
     top, seconds = min(place.top_mps, 10.0), 0.0
+    beside = block.end_m + ego.length + 6.0
+    distance = beside
     for _ in range(3):
-        distance = block.end_m + ego.length + 6.0 + block.speed_mps * seconds
+        distance = beside + block.speed_mps * seconds
         seconds = _seconds_for(distance, place.speed_mps, top)
     gap = seen.along_m[:, 0] - place.s_m
     coming = (np.cos(seen.away[:, 0]) < -0.5) & (seen.speed_mps.max(axis=1) > 0.5)
