@@ -3,6 +3,7 @@ import pytest
 
 from me2e_compress.evaluators.highway.abilities import ABILITIES, SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.scenarios.registry import BUILDERS, stage_of
+from me2e_compress.evaluators.highway.scenarios.relatives import RELATIVES
 from me2e_compress.evaluators.highway.traffic.road import overlap
 from me2e_compress.evaluators.highway.world import World
 from tests.evaluators.highway.world.driving import route_of, sleepwalk
@@ -68,3 +69,8 @@ def test_the_room_beside_a_route_is_what_the_map_shows(name: str) -> None:
             if room < 8.5:
                 far = world.roadmap.outside_m(float(outside[0]), float(outside[1]))
                 assert far > 0
+
+
+def test_what_stands_in_for_a_type_is_documented() -> None:
+    assert set(RELATIVES) <= set(TYPES)
+    assert all(words[0].islower() for words in RELATIVES.values())
