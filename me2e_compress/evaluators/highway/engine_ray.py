@@ -1,5 +1,6 @@
 """Routes on a Ray cluster: the same job in the same process of its own."""
 
+import socket
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,6 +8,8 @@ from typing import Any
 from me2e_compress.errors import EvaluationError, MissingExtraError
 from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.worker import Driven, Job, RouteWorker
+
+KNOCK_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -49,9 +52,21 @@ class RayEngine:
             )
             return
         try:
+            _knock(self.address)
             ray.init(address=self.address, log_to_driver=False)
-        except ConnectionError as error:
+        except OSError as error:
             raise EvaluationError(f"ray: no cluster at {self.address}") from error
+
+
+def _knock(address: str) -> None:
+    """Find out in seconds that nobody is there: Ray itself tries for minutes.
+
+    Raises:
+        OSError: Nobody listens.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=KNOCK_S).close()
 
 
 def _ray() -> Any:
