@@ -9,10 +9,9 @@ from me2e_compress.evaluators.highway.expert.targets import Options, Place
 from me2e_compress.evaluators.highway.geometry import Floats
 from me2e_compress.evaluators.highway.reference import beyond, reentry
 from me2e_compress.evaluators.highway.scene import Ego, RoutePath
+from me2e_compress.evaluators.highway.traffic.bodies import ACCELERATION_LAG_S
 
 ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)
-LAG_S = 0.2
-"""Of the ego's brakes and motor: an acceleration that is asked for comes late."""
 HARDEST_EASE_MPS2 = 3.0
 """Braking for what the road allows, never more."""
 CHANGE_S = 2.6
@@ -97,8 +96,8 @@ def _speeds(top: Floats, place: Place, rates: Floats) -> tuple[Floats, Floats]:
     alongs, speeds = [], []
     missing = place.acceleration_mps2 - rates
     for step in np.diff(TIMES_S, prepend=0.0):
-        left = np.exp(-step / LAG_S)
-        mean = rates + missing * (1 - left) * LAG_S / step
+        left = np.exp(-step / ACCELERATION_LAG_S)
+        mean = rates + missing * (1 - left) * ACCELERATION_LAG_S / step
         missing = missing * left
         limit = top[np.minimum(along.astype(np.int64), len(top) - 1)]
         allowed = np.maximum(limit, speed - HARDEST_EASE_MPS2 * step)
