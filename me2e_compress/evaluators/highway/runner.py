@@ -1,5 +1,6 @@
 """One route: the policy decides, the world charges for it, the episode remains."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ from me2e_compress.evaluators.highway.picture import Moment
 from me2e_compress.evaluators.highway.record import Recorder
 from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.rules import Rules
-from me2e_compress.evaluators.highway.scene import Control, Scene
+from me2e_compress.evaluators.highway.scene import Control, Ego, Scene
 from me2e_compress.evaluators.highway.world import World
 from me2e_compress.evaluators.latency import FixedLatency, LatencySource
 from me2e_compress.evaluators.realtime import DT_US, HeldControl
@@ -71,8 +72,8 @@ class Listeners:
     Args:
         asking: Called with the world before the policy is asked.
         answered: Called when it has answered.
-        moment: Called at every frame with what a picture needs; makes the cameras
-            render even if the policy sees no images.
+        moment: Called at every frame with what a picture needs, the latest plan as
+            seen from the ego now; makes the cameras render for any policy.
     """
 
     asking: Callable[[World], None] = lambda world: None
@@ -125,7 +126,7 @@ class _Drive:
             self.cameras = Cameras(texture, rig, conditions.weather)
         needed = self.cameras if policy.needs_images else None
         self.observer = Observer(world, policy, rig, needed)
-        self.plan: Plan | None = None
+        self.plan: tuple[Ego, Plan] | None = None
 
     def run(self) -> Episode:
         world, ending = self.world, None
@@ -156,10 +157,11 @@ class _Drive:
         answer = _ask(self.policy, observation)
         took_us = (time.perf_counter_ns() - begun) // 1_000
         self.to.answered()
-        self.plan = _checked(answer)
+        plan = _checked(answer)
+        self.plan = scene.ego, plan
         latency_us = self.charge(took_us)
         self.recorder.decisions.append(Decision(scene.time_us, latency_us))
-        anchored = AnchoredPlan.of(self.plan, scene.ego, scene.time_us)
+        anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
         control = self.controller.control(anchored, scene.ego, scene.time_us)
         self.held.decide(control, latency_us)
 
@@ -167,7 +169,16 @@ class _Drive:
         """Render this frame for whoever draws pictures."""
         if self.to.moment is not None and self.cameras is not None:
             images = self.cameras.render(scene)
-            self.to.moment(Moment(scene, images, self.plan, self.world.events))
+            plan = None if self.plan is None else _seen_from(scene.ego, *self.plan)
+            self.to.moment(Moment(scene, images, plan, self.world.events))
+
+
+def _seen_from(ego: Ego, planned_at: Ego, plan: Plan) -> Plan:
+    """Turn the waypoints of an earlier ego frame into today's."""
+    cos, sin = math.cos(planned_at.heading), math.sin(planned_at.heading)
+    world = plan @ np.array([[cos, sin], [-sin, cos]]) + (planned_at.x, planned_at.y)
+    cos, sin = math.cos(ego.heading), math.sin(ego.heading)
+    return np.asarray((world - (ego.x, ego.y)) @ np.array([[cos, -sin], [sin, cos]]))
 
 
 def _reset(policy: Policy, route: Route) -> None:

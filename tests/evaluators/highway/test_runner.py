@@ -223,3 +223,26 @@ def test_watching_changes_nothing() -> None:
     images = moments[0].images
     assert images is not None
     assert images.shape == (6, 16, 16, 3)
+
+
+def test_a_held_plan_stays_where_it_was_made() -> None:
+    """Seen from an ego that has moved on, its waypoints come nearer."""
+    moments = list[Moment]()
+    slow = Conditions(FixedLatency(500_000), image_size=(16, 16))
+    drive(PARKED, Standing(plans=8.0), slow, Listeners(moment=moments.append))
+    first, later = moments[0], moments[9]
+    assert first.plan is not None
+    assert later.plan is not None
+
+    def in_world(moment: Moment, point: npt.NDArray[np.floating]) -> list[float]:
+        ego = moment.scene.ego
+        cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+        return [
+            ego.x + cos * point[0] - sin * point[1],
+            ego.y + sin * point[0] + cos * point[1],
+        ]
+
+    assert in_world(later, later.plan[3]) == pytest.approx(
+        in_world(first, first.plan[3])
+    )
+    assert later.plan[3, 0] < first.plan[3, 0] - 1.0
