@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.base import Evaluator
 from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.jobs import (
@@ -67,10 +68,10 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_bytes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
-    one, two = (
-        tuple(evaluator(tmp_path / str(workers), workers=workers).episodes())
-        for workers in (1, 2)
-    )
+    judged: list[Evaluator] = [
+        evaluator(tmp_path / str(workers), workers=workers) for workers in (1, 2)
+    ]
+    one, two = (tuple(each.episodes()) for each in judged)
 
     assert one == two
     assert [episode.route for episode in one] == [route.id for route in ROUTES]
