@@ -20,7 +20,7 @@ CARS = (0, 5, 20, 50)
 
 def traffic(cars: int) -> Callable[[Stage], None]:
     def build(stage: Stage) -> None:
-        street = multilane(stage, 3, 3)
+        street = multilane(stage)
         for k in range(cars):
             lane, row = 2 * (k % 2), k // 2
             s = street.start_m - 20.0 + 10.0 * row

@@ -62,13 +62,20 @@ def start_speed(stage: Stage) -> float:
     return stage.uniform("speed_mps", 7.0, 10.0)
 
 
-def multilane(stage: Stage, fewest: int = 2, most: int = 3) -> Street:
-    """A straight one-way road of several lanes and a shoulder."""
+def multilane(stage: Stage) -> Street:
+    """A straight one-way road of two or three lanes and a narrow shoulder."""
     stage.layout = "multilane"
-    lanes = stage.integer("lanes", fewest, most)
+    lanes = stage.integer("lanes", 2, 3)
     lane = min(stage.integer("ego_lane", 0, lanes - 1), lanes - 1)
     pieces = [Straight(BEFORE_M + GOAL_M + BEYOND_M)]
-    return _street(stage, pieces, lanes, lane, oncoming=0, limit_mps=14.0, shoulder=2.0)
+    return _street(stage, pieces, lanes, lane, oncoming=0, limit_mps=14.0, shoulder=1.0)
+
+
+def single_lane(stage: Stage) -> Street:
+    """A straight one-way road of one lane: nobody gets past anybody."""
+    stage.layout = "single_lane"
+    pieces = [Straight(BEFORE_M + GOAL_M + BEYOND_M)]
+    return _street(stage, pieces, 1, 0, oncoming=0, limit_mps=14.0, shoulder=0.5)
 
 
 def bend(stage: Stage) -> Street:
@@ -77,7 +84,7 @@ def bend(stage: Stage) -> Street:
     lanes = stage.integer("lanes", 2, 3)
     lane = min(stage.integer("ego_lane", 0, lanes - 1), lanes - 1)
     pieces = _curve(stage, 60.0, 100.0)
-    return _street(stage, pieces, lanes, lane, oncoming=0, limit_mps=14.0, shoulder=2.0)
+    return _street(stage, pieces, lanes, lane, oncoming=0, limit_mps=14.0, shoulder=1.0)
 
 
 def two_way(stage: Stage) -> Street:

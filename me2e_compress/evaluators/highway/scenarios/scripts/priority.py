@@ -3,6 +3,7 @@
 from me2e_compress.evaluators.highway.scenarios.layouts.crossings import Crossing
 from me2e_compress.evaluators.highway.scenarios.layouts.streets import Street
 from me2e_compress.evaluators.highway.scenarios.scripts.timing import (
+    hold,
     met,
     nearest_station,
     on_chain,
@@ -14,6 +15,8 @@ from me2e_compress.evaluators.highway.traffic.events import Event, EventKind
 from me2e_compress.evaluators.highway.traffic.stage import Script, Stage
 
 YELLOW_S = 2.0
+ALL_RED_S = 1.0
+"""Phases of the cross traffic's light before the ego's turns green: our choice."""
 
 
 def red_light(stage: Stage, crossing: Crossing) -> Script:
@@ -29,9 +32,15 @@ def red_light(stage: Stage, crossing: Crossing) -> Script:
         yield
     stage.fire("red_light")
     yield from patience(stage, line_s, 12.0)
-    for arm, regulator in crossing.signals.items():
-        mine = arm in ("back", "ahead")
-        regulator.state = SignalState.GREEN if mine else SignalState.RED
+    for state, seconds in (
+        (SignalState.YELLOW, YELLOW_S),
+        (SignalState.RED, ALL_RED_S),
+    ):
+        for arm in ("left", "right"):
+            crossing.signals[arm].state = state
+        yield from hold(stage, seconds)
+    for arm in ("back", "ahead"):
+        crossing.signals[arm].state = SignalState.GREEN
 
 
 def stop_sign(stage: Stage, crossing: Crossing) -> Script:

@@ -9,6 +9,7 @@ from me2e_compress.evaluators.highway.scenarios.layouts.streets import (
     bend,
     multilane,
     parking_street,
+    single_lane,
     two_way,
     zebra_street,
 )
@@ -47,7 +48,7 @@ def dynamic_object_crossing(stage: Stage) -> None:
 
 def hard_break_route(stage: Stage) -> None:
     """The car ahead brakes hard."""
-    stage.play(hard_brake(stage, multilane(stage, 1, 1)))
+    stage.play(hard_brake(stage, single_lane(stage)))
 
 
 def opposite_vehicle_taking_priority(stage: Stage) -> None:
