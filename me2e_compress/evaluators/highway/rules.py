@@ -30,32 +30,36 @@ class Rules:
     _astray_m: float = field(default=0.0, init=False)
     _last_us: int = field(default=0, init=False)
 
-    def ending(self, world: World) -> Ending | None:
+    def ending(self, world: World, speed_mps: float) -> Ending | None:
         """Return why the route is over after the world's last step, None if it is not.
 
         Must be asked after every step.
+
+        Args:
+            world: After the step.
+            speed_mps: Of its ego.
         """
         if world.reason is not None:
             reached = world.reason is EndReason.GOAL
             return Ending.COMPLETED if reached else Ending.COLLISION
-        if self._deviated(world):
+        if self._deviated(world, speed_mps):
             return Ending.DEVIATION
-        if self._blocked(world):
+        if self._blocked(world, speed_mps):
             return Ending.BLOCKED
         return Ending.TIMEOUT if world.time_us >= TIMEOUT_US else None
 
-    def _deviated(self, world: World) -> bool:
+    def _deviated(self, world: World, speed_mps: float) -> bool:
         away_m = abs(world.lateral_m)
         passed_s = (world.time_us - self._last_us) / 1e6
         self._last_us = world.time_us
         if away_m >= ASTRAY_M:
-            self._astray_m += world.scene().ego.speed_mps * passed_s
+            self._astray_m += speed_mps * passed_s
         return (
             away_m >= DEVIATION_M or self._astray_m > ASTRAY_SHARE * world.path.goal_m
         )
 
-    def _blocked(self, world: World) -> bool:
-        if world.scene().ego.speed_mps > BLOCKED_MPS:
+    def _blocked(self, world: World, speed_mps: float) -> bool:
+        if speed_mps > BLOCKED_MPS:
             self._stopped_at_us = None
             return False
         if self._stopped_at_us is None:

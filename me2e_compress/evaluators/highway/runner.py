@@ -130,21 +130,21 @@ class _Drive:
 
     def run(self) -> Episode:
         world, ending = self.world, None
+        scene = world.scene()
         try:
             self.to.asking(world)
             _reset(self.policy, self.route)
             self.to.answered()
             while ending is None:
-                scene = world.scene()
                 self.recorder.see(scene)
                 if self.held.decision_is_due:
                     self.decide(scene)
                 self.show(scene)
                 world.step(self.held.advance())
-                ending = self.rules.ending(world)
+                scene = world.scene()
+                ending = self.rules.ending(world, scene.ego.speed_mps)
         except PolicyFailedError as failure:
             return self.recorder.episode(Ending.POLICY_FAILED, str(failure))
-        scene = world.scene()
         self.recorder.see(scene)
         self.show(scene)
         return self.recorder.episode(ending)
