@@ -37,7 +37,8 @@ def local_fit(values: Floats, dt: float) -> tuple[Floats, Floats]:
     for k in range(len(values)):
         start = min(max(k - 3, 0), len(values) - 7)
         times = (np.arange(start, start + 7) - k) * dt
-        value, slope, _ = np.polynomial.polynomial.polyfit(times, values[start : start + 7], 2)
+        seven = values[start : start + 7]
+        value, slope, _ = np.polynomial.polynomial.polyfit(times, seven, 2)
         fitted[k], slopes[k] = value, slope
     return fitted, slopes
 

@@ -5,13 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.durations import longest_first
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scenarios.registry import stage_of
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
@@ -96,12 +94,6 @@ class HighwayEvaluator:
         return LocalEngine(1)
 
 
-def longest_first(routes: Sequence[Route]) -> list[Route]:
-    """Order routes by the time they take at the speed limit, the longest first."""
-    seconds = {route.id: _seconds_at_limit(route) for route in routes}
-    return sorted(routes, key=lambda route: (-seconds[route.id], route.id))
-
-
 def progress_of(episodes: Sequence[Episode], total: int) -> Progress:
     """Sum up the episodes that there are."""
     if not episodes:
@@ -112,9 +104,3 @@ def progress_of(episodes: Sequence[Episode], total: int) -> Progress:
         sum(route_score(one).composed for one in episodes) / len(episodes),
         100.0 * sum(one.succeeded for one in episodes) / len(episodes),
     )
-
-
-def _seconds_at_limit(route: Route) -> float:
-    path = stage_of(route).path
-    limits = path.speed_limits_mps[: int(path.goal_m)]
-    return float(np.sum(1.0 / limits))

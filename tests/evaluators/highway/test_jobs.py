@@ -12,12 +12,13 @@ import pytest
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.base import Evaluator
+from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.durations import EXPERT_S, longest_first
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.jobs import (
     HighwayEvaluator,
     Progress,
-    longest_first,
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.routes import Route, save_routes
@@ -275,11 +276,12 @@ def test_unknown_policies_are_refused_before_driving(tmp_path: Path) -> None:
     assert not (tmp_path / "r").exists()
 
 
-def test_the_longest_route_begins() -> None:
+def test_long_types_begin_in_whatever_order_they_come() -> None:
     ordered = longest_first(ROUTES)
 
-    assert ordered == longest_first(ROUTES[::-1])
-    assert sorted(route.id for route in ordered) == sorted(r.id for r in ROUTES)
+    assert [route.id for route in ordered] == ["green", "exit", "crossing", "parked"]
+    assert longest_first(ROUTES[::-1]) == ordered
+    assert set(EXPERT_S) == set(SCENARIO_ABILITIES)
 
 
 def test_progress_runs_with_the_scores(tmp_path: Path) -> None:
