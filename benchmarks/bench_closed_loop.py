@@ -34,6 +34,7 @@ from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.evaluators.latency import FixedLatency
 from me2e_compress.metrics.abilities import ABILITIES
+from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
 
 LATENCIES_S = (0.0, 0.05, 0.15, 0.25, 0.45, 0.85)
@@ -162,21 +163,19 @@ def bench_drivers(out: Path, workers: int) -> None:
             found.bench2drive_efficiency,
             found.bench2drive_smoothness,
         ]
-        cells = [
-            "-"
-            if e.value is None
-            else f"{e.value:.1f}"
-            if e.measure.unit == "%"
-            else f"{e.value:.3f}"
-            for e in (*shown, *last)
-        ]
+        cells = [_cell(estimate) for estimate in (*shown, *last)]
         print(f"| {name} | " + " | ".join(cells) + " |")
+
+
+def _cell(estimate: Estimate) -> str:
+    form = ".1f" if estimate.measure.unit == "%" else ".3f"
+    return "-" if estimate.value is None else format(estimate.value, form)
 
 
 def bench_latency(out: Path, workers: int) -> None:
     print("| t (s) | success of the expert (%) | 95 % | DS |\n|---|---|---|---|")
     for seconds in LATENCIES_S:
-        folder = out / f"expert-{seconds:g}s"
+        folder = out / (f"expert-{seconds:g}s" if seconds else "expert")
         scores, _ = evaluate(
             folder, Driver("expert"), load_routes(), workers, round(seconds * 1e6)
         )
