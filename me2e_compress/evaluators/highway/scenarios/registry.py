@@ -76,7 +76,13 @@ BUILDERS: dict[str, Builder] = {
 
 
 def stage_of(route: Route, builder: Builder | None = None) -> Stage:
-    """Set up a route: its roads, its actors and their scripts."""
+    """Set up a route: its roads, its actors and their scripts.
+
+    Raises:
+        EvaluationError: A parameter that the route gives is wrong or not one of its
+            scenario's.
+    """
     stage = Stage(route)
     (builder or BUILDERS[route.scenario])(stage)
+    stage.complete()
     return stage

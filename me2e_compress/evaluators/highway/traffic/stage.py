@@ -63,6 +63,7 @@ class Stage:
         self._path: RoutePath | None = None
         self._ego: EgoVehicle | None = None
         self._next_id = 1
+        self._complete = False
 
     @property
     def path(self) -> RoutePath:
@@ -102,6 +103,22 @@ class Stage:
                 f"there are {', '.join(options)}"
             )
         return value
+
+    def complete(self) -> None:
+        """Setting up is over: every parameter has been drawn.
+
+        Raises:
+            EvaluationError: The route gives a parameter that nothing asked for.
+        """
+        self._complete = True
+        unasked = [
+            name for name in self.route.parameters if name not in self.parameters
+        ]
+        if unasked:
+            raise EvaluationError(
+                f"route {self.route.id}: {self.route.scenario} has no parameter "
+                f"{', '.join(unasked)} here; there are {', '.join(self.parameters)}"
+            )
 
     def play(self, script: Script) -> None:
         """Let a generator play its part.
@@ -218,6 +235,10 @@ class Stage:
         )
 
     def _given(self, name: str, drawn: Parameter) -> Parameter:
+        if self._complete:
+            raise EvaluationError(
+                f"{self.route.scenario}: parameter {name} is drawn after the setup"
+            )
         value = self.route.parameters.get(name, drawn)
         if isinstance(value, str) != isinstance(drawn, str):
             raise EvaluationError(

@@ -77,6 +77,24 @@ def test_a_parameter_of_the_wrong_kind_is_named() -> None:
         World(route_of(obstacle_m="far"))
 
 
+def test_a_parameter_that_nothing_asks_for_is_named() -> None:
+    with pytest.raises(EvaluationError, match="has no parameter obstacle here; there"):
+        World(route_of(obstacle=70.0))
+
+
+def test_a_script_must_draw_its_parameters_before_it_starts() -> None:
+    def late(stage: Stage) -> None:
+        two_way(stage)
+        stage.play(dice(stage))
+
+    def dice(stage: Stage) -> Script:
+        yield
+        stage.uniform("dice", 1.0, 6.0)
+
+    with pytest.raises(EvaluationError, match="parameter dice is drawn after"):
+        coast(World(route_of(), builder=late), 1)
+
+
 def test_a_word_that_is_no_option_is_named() -> None:
     with pytest.raises(EvaluationError, match="move is 'up'; there are left, right"):
         World(route_of("VehicleTurningRoute", move="up"))

@@ -1,7 +1,7 @@
 """A road of straights and arcs with lanes either way: what most layouts are."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from me2e_compress.evaluators.highway.geometry import LaneMarking
@@ -100,30 +100,11 @@ def carriageway(
         shoulder_m: Width of a paved shoulder on the right, 0 for none. A two-way road
             gets one on its other side too.
     """
-    width, rows = section.width, [(f"{name}f", section, 0.0, True)]
-    if oncoming:
-        centre = LaneMarking.DASHED
-        rows[0] = (f"{name}f", replace(section, left=centre), 0.0, True)
-        opposite = replace(section, lanes=oncoming, left=centre)
-        rows.append((f"{name}o", opposite, width, False))
-    if shoulder_m:
-        verge = replace(
-            section,
-            lanes=1,
-            width=shoulder_m,
-            left=LaneMarking.NONE,
-            right=LaneMarking.NONE,
-            shoulder=True,
-        )
-        beside = -(section.lanes - 0.5) * width - shoulder_m / 2
-        rows.append((f"{name}v", verge, beside, True))
-        if oncoming:
-            beyond = (oncoming + 0.5) * width + shoulder_m / 2
-            rows.append((f"{name}w", verge, beyond, False))
-    edges = dict[str, list[tuple[str, str]]]()
+    edges = {
+        row.prefix: _lay(network, row, start, pieces)
+        for row in _rows(name, section, oncoming, shoulder_m)
+    }
     end = start
-    for prefix, row, left, forward in rows:
-        edges[prefix] = _lay(network, prefix, start, pieces, row, left, forward)
     for piece in pieces:
         end = _after(end, piece)
     return Carriageway(
@@ -136,36 +117,62 @@ def carriageway(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """Parallel lanes of one direction, ``left_m`` beside the reference line."""
+
+    prefix: str
+    section: Section
+    left_m: float
+    forward: bool
+
+
+def _rows(
+    name: str, section: Section, oncoming: int, shoulder_m: float
+) -> Iterator[_Row]:
+    width, centre = section.width, LaneMarking.DASHED
+    verge = replace(
+        section,
+        lanes=1,
+        width=shoulder_m,
+        left=LaneMarking.NONE,
+        right=LaneMarking.NONE,
+        shoulder=True,
+    )
+    ahead = replace(section, left=centre) if oncoming else section
+    yield _Row(f"{name}f", ahead, 0.0, True)
+    if oncoming:
+        opposite = replace(section, lanes=oncoming, left=centre)
+        yield _Row(f"{name}o", opposite, width, False)
+    if shoulder_m:
+        beside = (section.lanes - 0.5) * width + shoulder_m / 2
+        yield _Row(f"{name}v", verge, -beside, True)
+    if shoulder_m and oncoming:
+        beyond = (oncoming + 0.5) * width + shoulder_m / 2
+        yield _Row(f"{name}w", verge, beyond, False)
+
+
 def _lay(
-    network: Network,
-    prefix: str,
-    start: Pose,
-    pieces: Sequence[Piece],
-    section: Section,
-    left_m: float,
-    forward: bool,
+    network: Network, row: _Row, start: Pose, pieces: Sequence[Piece]
 ) -> list[tuple[str, str]]:
-    """Lay one row of lanes, ``left_m`` beside the reference line."""
-    edges, pose = list[tuple[str, str]](), start
+    """Lay one row of lanes along the pieces."""
+    edges, pose, left = list[tuple[str, str]](), start, row.left_m
     for k, piece in enumerate(pieces):
         after = _after(pose, piece)
-        here, there = f"{prefix}{k}", f"{prefix}{k + 1}"
-        if forward:
-            a, b, begin = here, there, pose.moved(0.0, left_m)
+        here, there = f"{row.prefix}{k}", f"{row.prefix}{k + 1}"
+        if row.forward:
+            a, b, begin = here, there, pose.moved(0.0, left)
         else:
-            a, b, begin = there, here, after.moved(0.0, left_m).turned(_HALF_TURN)
+            a, b, begin = there, here, after.moved(0.0, left).turned(math.pi)
         if isinstance(piece, Straight):
-            network.straight(a, b, begin, piece.length_m, section)
+            network.straight(a, b, begin, piece.length_m, row.section)
         else:
-            inwards = left_m if piece.angle_rad > 0 else -left_m
-            angle = piece.angle_rad if forward else -piece.angle_rad
-            network.arc(a, b, begin, piece.radius_m - inwards, angle, section)
+            inwards = left if piece.angle_rad > 0 else -left
+            angle = piece.angle_rad if row.forward else -piece.angle_rad
+            network.arc(a, b, begin, piece.radius_m - inwards, angle, row.section)
         edges.append((a, b))
         pose = after
     return edges
-
-
-_HALF_TURN = math.pi
 
 
 def _after(pose: Pose, piece: Piece) -> Pose:

@@ -28,6 +28,7 @@ def hard_brake(stage: Stage, street: Street) -> Script:
     """The car ahead keeps its distance, then brakes to a stop and waits."""
     gap = stage.uniform("gap_m", 13.0, 18.0)
     where = stage.uniform("brake_m", 35.0, 60.0)
+    hardest = stage.uniform("brake_mps2", 5.0, 7.0)
     lanes = street.ahead(street.lane)
     speed = float(stage.ego.speed)
     car = stage.car(lanes, street.start_m + gap + 5.0, speed)
@@ -37,7 +38,7 @@ def hard_brake(stage: Stage, street: Street) -> Script:
         car.forced_mps2 = min(max((wanted - car.speed) / 0.5, -5.0), 4.0)
         yield
     stage.fire("hard_brake", car)
-    car.forced_mps2 = -stage.uniform("brake_mps2", 5.0, 7.0)
+    car.forced_mps2 = -hardest
     waited = 0.0
     while waited < 1.5:
         yield
