@@ -4,15 +4,10 @@ Source: `tools/ability_benchmark.py` of Thinklab-SJTU/Bench2Drive (branch 0.0.4)
 type counts under one ability or under two, of which the second is Traffic_Signs.
 """
 
-ABILITIES: tuple[str, ...] = (
-    "Overtaking",
-    "Merging",
-    "Emergency_Brake",
-    "Give_Way",
-    "Traffic_Signs",
-)
+from me2e_compress.metrics.abilities import ABILITIES, TRAFFIC_SIGNS
 
-_SIGNS = "Traffic_Signs"
+__all__ = ["ABILITIES", "SCENARIO_ABILITIES"]
+
 _BY_ABILITY: dict[str, tuple[str, ...]] = {
     "Overtaking": (
         "Accident",
@@ -86,7 +81,7 @@ _ALSO_SIGNS: frozenset[str] = frozenset(
 )
 
 SCENARIO_ABILITIES: dict[str, tuple[str, ...]] = {
-    scenario: (ability, _SIGNS) if scenario in _ALSO_SIGNS else (ability,)
+    scenario: (ability, TRAFFIC_SIGNS) if scenario in _ALSO_SIGNS else (ability,)
     for ability, scenarios in _BY_ABILITY.items()
     for scenario in scenarios
 }

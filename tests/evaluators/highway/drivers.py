@@ -1,6 +1,7 @@
 """Drivers that misbehave, and routes that are short."""
 
 import os
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +48,8 @@ class Misbehaving:
             time.sleep(3600)
         if self.way == "die":
             os._exit(7)
+        if self.way == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
         if self.way == "not-finite":
             return np.where(np.arange(12).reshape(6, 2) == 5, np.nan, plan)
         return {"shape": plan[:5], "integers": plan.astype(int), "list": [1, 2]}[

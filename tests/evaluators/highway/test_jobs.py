@@ -237,6 +237,14 @@ def test_a_policy_that_takes_its_process_down_fails(tmp_path: Path) -> None:
     }
 
 
+def test_a_process_that_was_killed_is_not_the_policys_fault(tmp_path: Path) -> None:
+    words = r"route \w+: its process was killed \(out of memory\?\)"
+
+    with pytest.raises(EvaluationError, match=words):
+        failed(tmp_path / "results", "killed")
+    assert list(content(tmp_path / "results")) == ["evaluation.json"]
+
+
 def test_a_failed_route_is_a_result_like_any_other(tmp_path: Path) -> None:
     folder = tmp_path / "results"
     episodes = failed(folder, "raise")
