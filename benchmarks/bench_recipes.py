@@ -31,7 +31,7 @@ HEAD = "recipe            MB   nodes  int8 MB  ego dB  plan m (max)  least move 
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--calibration", type=int, default=8)
     parser.add_argument("--held-out", type=int, default=4)

@@ -11,8 +11,10 @@ from me2e_compress.cli.console import errors
 from me2e_compress.cli.demo import demo
 from me2e_compress.cli.doctor import doctor
 from me2e_compress.cli.export import export
+from me2e_compress.cli.extras import closed_loop
 from me2e_compress.cli.frames import frames
 from me2e_compress.cli.inspect import inspect
+from me2e_compress.cli.profile import profile
 from me2e_compress.errors import Me2eError
 
 __all__ = ["app", "main"]
@@ -24,8 +26,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (demo, doctor, export, inspect, frames, compress, compare):
+for command in (demo, doctor, export, inspect, frames, compress, compare, profile):
     app.command()(command)
+closed_loop(app)
 
 
 def main() -> int:

@@ -1,0 +1,30 @@
+"""Commands that an extra brings: with it the command, without it one line of advice."""
+
+import importlib.util
+
+import typer
+
+from me2e_compress.errors import MissingExtraError
+
+_NEEDED = ("highway_env", "cv2", "matplotlib", "scipy")
+
+
+def closed_loop(app: typer.Typer) -> None:
+    """Add ``evaluate``, ``routes`` and ``score``: the extra ``highway`` brings them."""
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        for name in ("evaluate", "routes", "score"):
+            anything = {"allow_extra_args": True, "ignore_unknown_options": True}
+            app.command(name, context_settings=anything)(_advise)
+        return
+    from me2e_compress.cli.evaluate import evaluate
+    from me2e_compress.cli.routes import routes
+    from me2e_compress.cli.score import score
+
+    for command in (evaluate, routes, score):
+        app.command()(command)
+
+
+def _advise(context: typer.Context) -> None:
+    """Say what to install: this command drives in closed loop."""
+    raise MissingExtraError(f"what {context.info_name} needs", "highway")

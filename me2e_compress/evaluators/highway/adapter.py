@@ -1,0 +1,154 @@
+"""How a model of another house is made to keep the policy contract."""
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal, Self, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.adapter import PlanAdapter
+
+IMAGE = "me2e.image"
+"""Metadata key: JSON of `ImageNormalization`."""
+
+Floats: TypeAlias = npt.NDArray[np.float32]
+Triple: TypeAlias = tuple[float, float, float]
+
+
+class ImageNormalization(BaseModel):
+    """How pixels become the image input: (pixel - mean) / std, channel by channel.
+
+    Attributes:
+        input: Name of the image input.
+        mean: In grey levels 0 to 255, in the order of `order`.
+        std: The same.
+        order: Channels of the model: red first or blue first.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    input: str = "img"
+    mean: Triple
+    std: Triple
+    order: Literal["rgb", "bgr"]
+
+    def apply(self, images: npt.NDArray[np.uint8]) -> Floats:
+        """Return float32 [1, 6, 3, H, W] of uint8 RGB [6, H, W, 3]."""
+        channels = images if self.order == "rgb" else images[..., ::-1]
+        scale = (1.0 / np.array(self.std)).astype(np.float32)
+        shift = (-np.array(self.mean) / np.array(self.std)).astype(np.float32)
+        ready = np.moveaxis(channels, -1, 1) * scale[:, None, None]
+        ready += shift[:, None, None]
+        return np.ascontiguousarray(ready[None], np.float32)
+
+
+class Axes(StrEnum):
+    """Ground frame of a model's waypoints and of its lidar2img."""
+
+    FORWARD_LEFT = "forward-left"
+    """x forward, y left: ours."""
+    RIGHT_FORWARD = "right-forward"
+    """x right, y forward: the lidar of nuScenes, of UniAD and of VAD."""
+
+    @property
+    def to_ego(self) -> npt.NDArray[np.float64]:
+        """Rotation [3, 3] from this frame to the ego frame."""
+        if self is Axes.FORWARD_LEFT:
+            return np.eye(3)
+        return np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+class Adapter(BaseModel):
+    """What a TOML adapter says; everything left out follows from the model.
+
+    Attributes:
+        inputs: The contract's name (img, lidar2img, can_bus, command) to the graph's.
+        recurrent: Recurrent input to the output that answers it.
+        plan: Which output is the plan, whether it holds steps, which mode is taken;
+            ``command_input = "command"`` lets the navigator's command pick it.
+        image: Normalisation.
+        axes: Ground frame of the model.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    inputs: dict[Literal["img", "lidar2img", "can_bus", "command"], str] = {}
+    recurrent: dict[str, str] | None = None
+    plan: PlanAdapter | None = None
+    image: ImageNormalization | None = None
+    axes: Axes = Axes.FORWARD_LEFT
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a TOML file.
+
+        Raises:
+            EvaluationError: No such file, no TOML, or a key or value that is not known.
+        """
+        try:
+            return cls.model_validate(tomllib.loads(path.read_text("utf-8")))
+        except OSError as error:
+            raise EvaluationError(f"{path}: {error.strerror}") from error
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"]))
+            raise EvaluationError(f"{path}: adapter {where}: {first['msg']}") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise EvaluationError(f"{path}: not TOML: {error}") from error
+
+    def normalization(self, metadata: Mapping[str, str]) -> ImageNormalization:
+        """Return the adapter's normalisation, or else the model's own.
+
+        Raises:
+            EvaluationError: Neither says how, or the metadata is malformed.
+        """
+        if self.image is not None:
+            return self.image
+        text = metadata.get(IMAGE)
+        if text is None:
+            raise EvaluationError(
+                f"the model does not say how its images are normalised: it has no "
+                f"metadata {IMAGE}, and the adapter no [image]"
+            )
+        try:
+            return ImageNormalization.model_validate(json.loads(text))
+        except (json.JSONDecodeError, ValidationError) as error:
+            line = " ".join(str(error).split())
+            raise EvaluationError(f"metadata {IMAGE} is malformed: {line}") from error
+
+    def plan_of(
+        self, metadata: Mapping[str, str], outputs: Sequence[str]
+    ) -> PlanAdapter:
+        """Return the adapter's reading of the plan, or else the model's own.
+
+        Raises:
+            EvaluationError: Nothing says where the plan is, or it is not an output.
+        """
+        found = self.plan or PlanAdapter.of(metadata, outputs)
+        there = ", ".join(outputs)
+        if found is None:
+            raise EvaluationError(
+                f"the model has no output plan, and nothing says which one it is; "
+                f"there are {there}"
+            )
+        if found.output not in outputs:
+            raise EvaluationError(
+                f"the adapter's plan is output {found.output}; there are {there}"
+            )
+        return found
+
+    def projection(self, lidar2img: Floats) -> Floats:
+        """Turn [6, 4, 4] of the ego frame into that of the model's frame."""
+        turn = np.eye(4)
+        turn[:3, :3] = self.axes.to_ego
+        return np.asarray(lidar2img @ turn, np.float32)
+
+    def to_ego(self, waypoints: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Turn [6, 2] waypoints of the model's frame into the ego frame."""
+        return np.asarray(waypoints @ self.axes.to_ego[:2, :2].T)

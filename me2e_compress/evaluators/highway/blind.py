@@ -1,0 +1,77 @@
+"""A driver that sees nothing: constant speed along the centre of the route.
+
+What it survives asks nothing of a driver, so no such route is admitted.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.base import PLAN_SHAPE, PLAN_STEP_US, Observation, Plan
+from me2e_compress.evaluators.highway.reference import (
+    beyond,
+    in_ego_frame,
+    reentry,
+    slope_of,
+)
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.scene import Ego, RoutePath
+
+SPEEDS_MPS = (4.0, 8.0, 12.0)
+"""The speeds at which the admission gate tries it."""
+ACCELERATION_MPS2 = 3.0
+"""How fast it reaches its speed."""
+REENTRY_S = 1.5
+
+
+@dataclass
+class Blind:
+    """Follows the centre of the route at one speed, whatever stands there.
+
+    It is privileged in one thing: it knows the route's centre line and its own pose.
+
+    Args:
+        speed_mps: The speed.
+    """
+
+    speed_mps: float = 8.0
+    needs_images: bool = field(default=False, init=False)
+    privileged: bool = field(default=True, init=False)
+    _at_m: float | None = field(default=None, init=False, repr=False)
+
+    def reset(self, route: Route) -> None:
+        """Forget where it was."""
+        self._at_m = None
+
+    def plan(self, observation: Observation) -> Plan:
+        """Return waypoints [6, 2] of the route ahead; see `centre_plan`."""
+        if observation.scene is None or observation.world is None:
+            raise EvaluationError(
+                "driver blind: the observation has no world, and the route is there"
+            )
+        ego, path = observation.scene.ego, observation.world.path
+        self._at_m, _ = path.project(ego.x, ego.y, self._at_m)
+        return centre_plan(ego, path, self._at_m, self.speed_mps)
+
+
+def centre_plan(ego: Ego, path: RoutePath, near_m: float, speed_mps: float) -> Plan:
+    """Waypoints [6, 2] (m, ego frame) along the centre of a route.
+
+    Args:
+        ego: The ego.
+        path: The route.
+        near_m: Where on the route the ego was last seen.
+        speed_mps: Speed to reach at 3 m/s2 and to keep.
+    """
+    s, lateral = path.project(ego.x, ego.y, near_m)
+    times = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
+    short = speed_mps - ego.speed_mps
+    ramp_s = np.minimum(times, abs(short) / ACCELERATION_MPS2)
+    lost = np.sign(short) * ACCELERATION_MPS2 * ramp_s**2 / 2
+    travel = ego.speed_mps * ramp_s + lost + speed_mps * (times - ramp_s)
+    length = np.array([max(6.0, REENTRY_S * speed_mps)])
+    slope = slope_of(ego, path, s)
+    offsets = reentry(travel[None], lateral, slope, np.zeros(1), length)[0]
+    x, y, _ = beyond(path, s + travel, offsets)
+    return in_ego_frame(x, y, ego)

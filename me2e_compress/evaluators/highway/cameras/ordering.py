@@ -1,0 +1,110 @@
+"""Which solid hides which: the painting order of every camera.
+
+Far to near by distance is wrong for a long truck beside a small car. Two convex
+footprints that do not overlap have an edge of one of them that separates them; the
+solid on the camera's side of that edge is the nearer one. Distance orders first; where
+two solids share columns of an image and their edges contradict it, the edges win.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.intp]
+Flags = npt.NDArray[np.bool_]
+
+TOUCH_M = 0.05
+"""Footprints that sink into each other by less still count as apart."""
+
+
+class Edges(NamedTuple):
+    """Corners [4, V], the outward normals of the edges after them and their places."""
+
+    x: Floats
+    y: Floats
+    normal_x: Floats
+    normal_y: Floats
+    at: Floats
+    """Of the edge along its normal: negative if the camera is outside."""
+
+
+def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints, Ints]:
+    """Order the visible solids of every camera from far to near.
+
+    Args:
+        right: [K, 4, S] corners of the solids' footprints in the frame of each of K
+            cameras, which sit at the origin; convex, counter-clockwise from above.
+        forward: [K, 4, S] the other coordinate.
+        visible: [K, S] which solids a camera may see.
+
+    Returns:
+        Camera and solid, [V] each: camera by camera, the first to paint first.
+    """
+    nearest = np.hypot(right, forward).min(axis=1)
+    camera, solid = np.nonzero(visible)
+    order = np.lexsort((-nearest[camera, solid], camera))
+    camera, solid = camera[order], solid[order]
+    x, y = right[camera, :, solid].T, forward[camera, :, solid].T
+    first, second = _rivals(x, y, camera)
+    if len(first) == 0:
+        return camera, solid
+    edges = _edges(x, y)
+    before, after = _hides(edges, second, first), _hides(edges, first, second)
+    wrong = after & ~before
+    for k in np.unique(camera[first[wrong]]).tolist():
+        low, high = np.searchsorted(camera, [k, k + 1]).tolist()
+        behind = np.zeros((high - low, high - low), np.bool_)
+        mine = camera[first] == k
+        p, q = first[mine] - low, second[mine] - low
+        behind[p, q] = (before & ~after)[mine]
+        behind[q, p] = wrong[mine]
+        solid[low:high] = solid[low:high][_sorted(behind)]
+    return camera, solid
+
+
+def _rivals(x: Floats, y: Floats, camera: Ints) -> tuple[Ints, Ints]:
+    """Pairs (farther, nearer) of one camera that may share columns of its image."""
+    bearing = np.arctan2(x, y)
+    low, high = bearing.min(axis=0), bearing.max(axis=0)
+    wide = high - low > np.pi  # a footprint across the line straight behind
+    apart = (low[:, None] > high) | (high[:, None] < low)
+    shared = ~apart | wide[:, None] | wide
+    first, second = np.nonzero(np.triu(shared & (camera[:, None] == camera), 1))
+    return first, second
+
+
+def _edges(x: Floats, y: Floats) -> Edges:
+    following = [1, 2, 3, 0]
+    normal_x, normal_y = y[following] - y, x - x[following]
+    length = np.maximum(np.hypot(normal_x, normal_y), 1e-9)
+    normal_x, normal_y = normal_x / length, normal_y / length
+    return Edges(x, y, normal_x, normal_y, normal_x * x + normal_y * y)
+
+
+def _hides(edges: Edges, front: Ints, back: Ints) -> Flags:
+    """Whether an edge shows that solid front[i] stands on the camera's side.
+
+    Either an edge of the one at the back, with the camera and the one in front both
+    outside of it, or an edge of the one in front, with the camera inside.
+    """
+    shown = _outside(edges, back, front) & (edges.at[:, back] < 0.0)
+    shown |= _outside(edges, front, back) & (edges.at[:, front] >= 0.0)
+    return np.asarray(shown.any(axis=0))
+
+
+def _outside(edges: Edges, of: Ints, other: Ints) -> Flags:
+    """[4, P] whether all corners of one footprint lie outside each edge of another."""
+    reach = edges.normal_x[:, None, of] * edges.x[:, other]
+    reach += edges.normal_y[:, None, of] * edges.y[:, other]
+    return np.asarray(reach.min(axis=1) - edges.at[:, of] > -TOUCH_M)
+
+
+def _sorted(behind: Flags) -> list[int]:
+    """Topological order; the farthest of the free ones first, also out of a cycle."""
+    left, result = list(range(len(behind))), list[int]()
+    while left:
+        waits = behind[np.ix_(left, left)].any(axis=0)
+        result.append(left.pop(int(np.argmin(waits))))
+    return result

@@ -1,0 +1,132 @@
+"""Where the six cameras sit on the ego and how they project.
+
+Conventions: the ego frame is x forward, y left, z up, its origin on the ground under
+the centre of the ego's box. A camera frame is x right, y down, z forward. Pixels are
+continuous: the pixel of row r and column c covers [c, c + 1) x [r, r + 1), so its
+centre is at (c + 0.5, r + 0.5).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import EvaluationError
+
+Floats = npt.NDArray[np.float64]
+
+CAMERA_HEIGHT_M = 1.6
+HORIZON = 0.42
+"""Row of the horizon as a part of the image height: nuScenes-like crops show more
+road than sky. The cameras look along the horizon (no pitch, no roll)."""
+SMALLEST_SIDE_PX, LARGEST_SIDE_PX = 16, 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """One pinhole camera.
+
+    Args:
+        name: As in nuScenes and Bench2Drive, without ``CAM_``.
+        yaw_deg: Where it looks, counter-clockwise from straight ahead.
+        fov_deg: Horizontal field of view.
+        x_m: Metres forward of the ego's centre.
+        y_m: Metres to the left.
+    """
+
+    name: str
+    yaw_deg: float
+    fov_deg: float
+    x_m: float
+    y_m: float
+
+
+CAMERAS = (
+    Camera("FRONT", 0, 70, 1.5, 0.0),
+    Camera("FRONT_LEFT", 55, 70, 1.3, 0.5),
+    Camera("FRONT_RIGHT", -55, 70, 1.3, -0.5),
+    Camera("BACK", 180, 110, -1.0, 0.0),
+    Camera("BACK_LEFT", 110, 70, 0.8, 0.5),
+    Camera("BACK_RIGHT", -110, 70, 0.8, -0.5),
+)
+"""Order, yaws and fields of view of nuScenes' six cameras (Caesar et al., 2020)."""
+CAMERA_NAMES = tuple(camera.name for camera in CAMERAS)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraRig:
+    """The six cameras at one image size.
+
+    Args:
+        height: Rows of an image, 16 to 4096.
+        width: Columns of an image, 16 to 4096.
+
+    Raises:
+        EvaluationError: The size is out of range.
+    """
+
+    height: int = 96
+    width: int = 160
+
+    def __post_init__(self) -> None:
+        """Check the size."""
+        for name, side in (("height", self.height), ("width", self.width)):
+            if not SMALLEST_SIDE_PX <= side <= LARGEST_SIDE_PX:
+                raise EvaluationError(
+                    f"camera {name} {side} px is out of range: "
+                    f"{SMALLEST_SIDE_PX} to {LARGEST_SIDE_PX} px"
+                )
+
+    @cached_property
+    def focals_px(self) -> Floats:
+        """[6] focal lengths in pixels, the same in both directions."""
+        fov = np.deg2rad([camera.fov_deg for camera in CAMERAS])
+        return np.asarray(self.width / 2 / np.tan(fov / 2))
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Principal point (column, row) of every camera."""
+        return self.width / 2, self.height * HORIZON
+
+    @cached_property
+    def intrinsics(self) -> Floats:
+        """[6, 3, 3] K: camera frame to pixels."""
+        matrices = np.zeros((len(CAMERAS), 3, 3))
+        matrices[:, 0, 0] = matrices[:, 1, 1] = self.focals_px
+        matrices[:, 0, 2], matrices[:, 1, 2] = self.centre_px
+        matrices[:, 2, 2] = 1.0
+        return matrices
+
+    @cached_property
+    def rotations(self) -> Floats:
+        """[6, 3, 3] R: ego frame to camera frame; rows are right, down, forward."""
+        yaw = np.deg2rad([camera.yaw_deg for camera in CAMERAS])
+        zero, one = np.zeros_like(yaw), np.ones_like(yaw)
+        right = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
+        down = np.stack([zero, zero, -one], axis=1)
+        forward = np.stack([np.cos(yaw), np.sin(yaw), zero], axis=1)
+        return np.stack([right, down, forward], axis=1)
+
+    @cached_property
+    def positions(self) -> Floats:
+        """[6, 3] optical centres in the ego frame, metres."""
+        return np.array([(c.x_m, c.y_m, CAMERA_HEIGHT_M) for c in CAMERAS])
+
+    @cached_property
+    def translations(self) -> Floats:
+        """[6, 3] t: a point p of the ego frame is R p + t in the camera frame."""
+        return np.asarray(-np.einsum("kij,kj->ki", self.rotations, self.positions))
+
+    @cached_property
+    def lidar2img(self) -> npt.NDArray[np.float32]:
+        """[6, 4, 4] ego frame to pixels, as nuScenes-style models expect it.
+
+        For a point (x, y, z): M @ (x, y, z, 1) = (u * d, v * d, d, 1), with d the
+        depth in metres and (u, v) the continuous pixel (column, row).
+        """
+        matrices = np.zeros((len(CAMERAS), 4, 4))
+        matrices[:, :3, :3] = self.intrinsics @ self.rotations
+        matrices[:, :3, 3] = np.einsum("kij,kj->ki", self.intrinsics, self.translations)
+        matrices[:, 3, 3] = 1.0
+        return matrices.astype(np.float32)

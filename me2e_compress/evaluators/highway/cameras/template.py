@@ -1,0 +1,217 @@
+"""Shapes that the painter knows: lists of quadrilaterals in painting order.
+
+A template lives in the box it is scaled to: x from -0.5 (rear) to 0.5 (front), y from
+-0.5 (right) to 0.5 (left), z from 0 (ground) to 1 (top). Quadrilaterals wind counter-
+clockwise seen from outside, so those that turn their back are not drawn.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+
+class Slot(IntEnum):
+    """Which of the colours of a solid a quadrilateral wears."""
+
+    SHADOW = 0
+    BODY = 1
+    TRIM = 2
+    GLASS = 3
+    TYRE = 4
+    SKIN = 5
+    LEGS = 6
+    STRIPE = 7
+    # from here on: lamps, which shine by themselves
+    HEADLAMP = 8
+    TAIL_LAMP = 9
+    THIRD_LAMP = 10
+    INDICATOR_LEFT = 11
+    INDICATOR_RIGHT = 12
+    BEACON = 13
+    LAMP_RED = 14
+    LAMP_YELLOW = 15
+    LAMP_GREEN = 16
+
+
+FIRST_LAMP = Slot.HEADLAMP
+
+
+class Quad(NamedTuple):
+    """One face: corners [4, 3], its colour and how it is lit."""
+
+    corners: Floats
+    slot: Slot
+    shade: float
+    detail: bool
+    """Lies on another face: not needed from afar, nor for the class raster."""
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """A convex piece of something, or a stack of such pieces, lowest first.
+
+    Attributes:
+        corners: [3, 4, Q] x, y, z of the four corners of each face, in the unit box.
+        slots: [Q] values of `Slot`.
+        shades: [Q] brightness of the colour, by which way the face looks.
+        details: [Q] whether it lies on another face.
+        footprint: [2, 4] x, y of its rectangle on the ground, counter-clockwise.
+    """
+
+    corners: Floats
+    slots: npt.NDArray[np.intp]
+    shades: Floats
+    details: npt.NDArray[np.bool_]
+    footprint: Floats
+
+
+FULL = (-0.5, 0.5)
+"""The whole unit box."""
+SHADES = {"top": 1.08, "front": 0.90, "back": 0.78, "left": 0.96, "right": 0.70}
+"""A sun from the upper left; faces differ enough to be told apart."""
+
+
+class Box:
+    """A box whose upper side may be smaller (a cabin, a cone): five faces.
+
+    Args:
+        x: Rear and front at the foot.
+        y: Right and left at the foot.
+        z: Bottom and top.
+        slot: Colour.
+        top_x: Rear and front at the top, if different.
+        top_y: Right and left at the top, if different.
+    """
+
+    def __init__(
+        self,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        z: tuple[float, float],
+        slot: Slot,
+        top_x: tuple[float, float] | None = None,
+        top_y: tuple[float, float] | None = None,
+    ) -> None:
+        (rear, front), (right, left) = x, y
+        (rear_t, front_t), (right_t, left_t) = top_x or x, top_y or y
+        low, high = z
+        foot = [(rear, right), (front, right), (front, left), (rear, left)]
+        roof = [(rear_t, right_t), (front_t, right_t), (front_t, left_t)]
+        roof.append((rear_t, left_t))
+        a, b, c, d = (np.array([*p, low]) for p in foot)
+        e, f, g, h = (np.array([*p, high]) for p in roof)
+        self.slot = slot
+        self.faces: dict[str, Floats] = {
+            "right": np.array([a, b, f, e]),
+            "front": np.array([b, c, g, f]),
+            "left": np.array([c, d, h, g]),
+            "back": np.array([d, a, e, h]),
+            "top": np.array([e, f, g, h]),
+        }
+
+    def quads(self, decals: Iterable[Quad] = ()) -> list[Quad]:
+        """Return the faces and, after them, what lies on them."""
+        faces = [
+            Quad(corners, self.slot, SHADES[name], False)
+            for name, corners in self.faces.items()
+        ]
+        return [*faces, *decals]
+
+    def on(
+        self, face: str, u: tuple[float, float], v: tuple[float, float], slot: Slot
+    ) -> Quad:
+        """Return a patch of a face.
+
+        Args:
+            face: Its name.
+            u: From and to, along its lower edge (from the right end seen from the
+                side it faces away from: counter-clockwise seen from above).
+            v: From and to, upwards.
+            slot: Colour.
+        """
+        corners = ((u[0], v[0]), (u[1], v[0]), (u[1], v[1]), (u[0], v[1]))
+        return self._patch(face, corners, slot)
+
+    def disc(
+        self,
+        face: str,
+        centre: tuple[float, float],
+        radii: tuple[float, float],
+        slot: Slot,
+    ) -> list[Quad]:
+        """Return an octagon on a face, as three quadrilaterals.
+
+        Args:
+            face: Its name.
+            centre: (u, v) as in `on`.
+            radii: In u and in v.
+            slot: Colour.
+        """
+        (u, v), (wide, high) = centre, radii
+        narrow, low = 0.4142 * wide, 0.4142 * high
+        bands = (
+            (-high, narrow, -low, wide),
+            (-low, wide, low, wide),
+            (low, wide, high, narrow),
+        )
+        return [
+            self._patch(
+                face,
+                ((u - a, v + p), (u + a, v + p), (u + b, v + q), (u - b, v + q)),
+                slot,
+            )
+            for p, a, q, b in bands
+        ]
+
+    def _patch(
+        self, face: str, corners: tuple[tuple[float, float], ...], slot: Slot
+    ) -> Quad:
+        a, b, c, d = self.faces[face]
+        points = [
+            (1 - s) * ((1 - t) * a + t * d) + s * ((1 - t) * b + t * c)
+            for s, t in corners
+        ]
+        shade = 1.0 if slot >= FIRST_LAMP else SHADES[face]
+        return Quad(np.array(points), slot, shade, True)
+
+
+def shadow(x: tuple[float, float], y: tuple[float, float]) -> Quad:
+    """Return the contact shadow on the ground."""
+    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    ground = np.array([(*corner, 0.0) for corner in corners])
+    return Quad(ground, Slot.SHADOW, 1.0, True)
+
+
+def plate(corners: Iterable[tuple[float, float, float]], slot: Slot) -> list[Quad]:
+    """Return a flat quadrilateral that is seen from both sides."""
+    face = np.array(list(corners))
+    return [Quad(face, slot, 0.95, False), Quad(face[::-1], slot, 0.85, False)]
+
+
+def facing(
+    corners: Iterable[tuple[float, float]], x: float, slot: Slot, *, detail: bool
+) -> Quad:
+    """Return a flat face at x that looks backwards, from four (y, z) corners."""
+    return Quad(np.array([(x, y, z) for y, z in corners]), slot, 1.0, detail)
+
+
+def template(
+    quads: Iterable[Quad],
+    x: tuple[float, float] = (-0.5, 0.5),
+    y: tuple[float, float] = (-0.5, 0.5),
+) -> Template:
+    """Put quadrilaterals together; x and y say where they stand."""
+    faces = list(quads)
+    return Template(
+        corners=np.stack([quad.corners.T for quad in faces], axis=2),
+        slots=np.array([quad.slot for quad in faces], np.intp),
+        shades=np.array([quad.shade for quad in faces]),
+        details=np.array([quad.detail for quad in faces]),
+        footprint=np.array([(x[0], x[1], x[1], x[0]), (y[0], y[0], y[1], y[1])], float),
+    )

@@ -1,0 +1,78 @@
+"""Routes on a Ray cluster: the same job in the same process of its own."""
+
+import socket
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.errors import EvaluationError, MissingExtraError
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.worker import Driven, Job, RouteWorker
+
+KNOCK_S = 5.0
+
+
+@dataclass(frozen=True)
+class RayEngine:
+    """One Ray task a worker; model files must be readable from every node.
+
+    Args:
+        workers: How many routes at a time; each takes one CPU of the cluster.
+        address: Of a running cluster; None starts one on this machine, for as long
+            as the evaluation takes.
+    """
+
+    workers: int = 1
+    address: str | None = None
+
+    def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
+        """Yield each route as it finishes.
+
+        Raises:
+            MissingExtraError: Ray is not installed.
+            EvaluationError: There is no cluster at the address.
+        """
+        ray = _ray()
+        self._connect(ray)
+        try:
+            remote = ray.remote(num_cpus=1)(RouteWorker)
+            actors = [remote.remote(job) for _ in range(min(self.workers, len(routes)))]
+            pool: Any = ray.util.ActorPool(actors)
+            yield from pool.map_unordered(
+                lambda actor, route: actor.drive.remote(route), routes
+            )
+            ray.get([actor.close.remote() for actor in actors])
+        finally:
+            ray.shutdown()
+
+    def _connect(self, ray: Any) -> None:
+        if self.address is None:
+            ray.init(
+                num_cpus=self.workers, include_dashboard=False, log_to_driver=False
+            )
+            return
+        try:
+            _knock(self.address)
+            ray.init(address=self.address, log_to_driver=False)
+        except OSError as error:
+            raise EvaluationError(f"ray: no cluster at {self.address}") from error
+
+
+def _knock(address: str) -> None:
+    """Find out in seconds that nobody is there: Ray itself tries for minutes.
+
+    Raises:
+        OSError: Nobody listens.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=KNOCK_S).close()
+
+
+def _ray() -> Any:
+    try:
+        import ray
+        import ray.util
+    except ImportError as error:
+        raise MissingExtraError("ray", "ray") from error
+    return ray

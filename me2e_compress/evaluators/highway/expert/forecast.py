@@ -1,0 +1,190 @@
+"""Where every actor will be, by its own intent, for the next six seconds."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.evaluators.highway.geometry import Floats
+from me2e_compress.evaluators.highway.scene import Actor, ActorKind, RoutePath, Scene
+from me2e_compress.evaluators.highway.world.privileged import Intent
+
+Flags = npt.NDArray[np.bool_]
+TIMES_S = np.concatenate([np.arange(0.25, 3.01, 0.25), np.arange(3.5, 6.01, 0.5)])
+"""[18] seconds: fine for the three seconds that are handed out, coarse after."""
+NOW_S = np.concatenate([[0.0], TIMES_S])
+REACH_M = 150.0
+"""Actors farther away than this do not matter; oncoming ones do matter early."""
+ROUTE_SPAN_M = (-60.0, 160.0)
+"""Part of the route, from the ego, onto which actors are projected."""
+EASY_MPS2 = 0.3
+"""An actor below its wanted speed gains at least this; most are held up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Boxes of A actors now and at the 18 times of `TIMES_S` (T = 19 columns).
+
+    Args:
+        x: [A, T] metres.
+        y: [A, T] metres.
+        heading: [A, T] radians.
+        speed_mps: [A, T].
+        goal_mps: [A] the speed it wants.
+        length: [A] metres.
+        width: [A] metres.
+        moves: [A] whether it can move at all.
+        yields: [A] whether it brakes for the ego.
+        emergency: [A] whether it is an emergency vehicle.
+        walks: [A] whether it is a pedestrian.
+        along_m: [A, T] arc length on the route.
+        lateral_m: [A, T] metres left of the route.
+        away: [A, T] heading against the route's (radians).
+    """
+
+    x: Floats
+    y: Floats
+    heading: Floats
+    speed_mps: Floats
+    goal_mps: Floats
+    length: Floats
+    width: Floats
+    moves: Flags
+    yields: Flags
+    emergency: Flags
+    walks: Flags
+    along_m: Floats
+    lateral_m: Floats
+    away: Floats
+
+    @property
+    def half_span(self) -> Floats:
+        """[A, T] half of the room that a box takes along the route."""
+        cos, sin = np.abs(np.cos(self.away)), np.abs(np.sin(self.away))
+        return (cos * self.length[:, None] + sin * self.width[:, None]) / 2
+
+    @property
+    def half_breadth(self) -> Floats:
+        """[A, T] half of the room that a box takes across the route."""
+        cos, sin = np.abs(np.cos(self.away)), np.abs(np.sin(self.away))
+        return (sin * self.length[:, None] + cos * self.width[:, None]) / 2
+
+
+ON_FOOT = (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
+FIXED = (ActorKind.PARKED, ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER)
+
+
+def forecast(
+    scene: Scene, intents: Mapping[int, Intent], path: RoutePath, ego_s_m: float
+) -> Forecast:
+    """Roll every actor near the ego out along its intent.
+
+    Args:
+        scene: What there is.
+        intents: By actor id; an actor without one keeps its course and speed.
+        path: The route, onto which the actors are projected.
+        ego_s_m: Arc length of the ego.
+    """
+    ego = scene.ego
+    near = [
+        actor
+        for actor in scene.actors
+        if math.hypot(actor.x - ego.x, actor.y - ego.y) < REACH_M
+    ]
+    rolled = [_roll_out(actor, intents.get(actor.id)) for actor in near]
+    poses = np.array(rolled).reshape(len(near), 4, len(NOW_S))
+    x, y, heading, speed = poses.transpose(1, 0, 2)
+    along, lateral, away = _on_route(path, x, y, heading, ego_s_m)
+    return Forecast(
+        *(x, y, heading, speed),
+        goal_mps=np.array([_goal(a, intents.get(a.id)) for a in near]),
+        length=np.array([actor.length for actor in near]),
+        width=np.array([actor.width for actor in near]),
+        moves=np.array([actor.kind not in FIXED for actor in near], bool),
+        yields=np.array([_yields(intents.get(actor.id)) for actor in near], bool),
+        emergency=np.array([a.kind is ActorKind.EMERGENCY for a in near], bool),
+        walks=np.array([a.kind is ActorKind.PEDESTRIAN for a in near], bool),
+        along_m=along,
+        lateral_m=lateral,
+        away=away,
+    )
+
+
+def _yields(intent: Intent | None) -> bool:
+    return intent is not None and intent.sees_ego
+
+
+def _roll_out(actor: Actor, intent: Intent | None) -> Floats:
+    """[4, T] x, y, heading, speed at `NOW_S`."""
+    first = 0.0 if intent is None else intent.acceleration_mps2
+    briskest = max(first, EASY_MPS2)
+    goal = _goal(actor, intent)
+    if actor.kind in ON_FOOT:
+        first = briskest = 4.0 if goal > actor.speed_mps else 0.0
+    speed, travel = _speeds(actor.speed_mps, goal, first, briskest)
+    if intent is None or len(intent.path) < 2:
+        x = actor.x + travel * np.cos(actor.heading)
+        y = actor.y + travel * np.sin(actor.heading)
+        return np.stack([x, y, np.full_like(x, actor.heading), speed])
+    return np.vstack([_along(actor, intent.path, travel), speed])
+
+
+def _goal(actor: Actor, intent: Intent | None) -> float:
+    return actor.speed_mps if intent is None else intent.target_mps
+
+
+def _speeds(
+    now: float, goal: float, first: float, briskest: float
+) -> tuple[Floats, Floats]:
+    """Speeds and distances at `NOW_S`: one acceleration for 1 s, then to the goal.
+
+    Args:
+        now: Speed.
+        goal: Wanted speed.
+        first: Acceleration of the first second.
+        briskest: Strongest acceleration later; who crawls behind somebody will not
+            leap ahead.
+    """
+    hardest = min(first, -2.0)
+    speed, travel = [now], [0.0]
+    for begin, step in zip(NOW_S[:-1], np.diff(NOW_S), strict=True):
+        wish = min(max((goal - speed[-1]) / step, hardest), briskest)
+        rate = wish
+        if begin < 1.0:
+            rate = min(first, max(wish, 0.0)) if first > 0 else first
+        after = max(speed[-1] + rate * step, 0.0)
+        travel.append(travel[-1] + (speed[-1] + after) / 2 * step)
+        speed.append(after)
+    return np.array(speed), np.array(travel)
+
+
+def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
+    """[3, T] x, y, heading on a line that begins where the actor stands."""
+    steps = line[1:] - line[:-1]
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    heading = np.interp(travel, (arc[:-1] + arc[1:]) / 2, headings)
+    over = np.maximum(travel - arc[-1], 0.0)
+    x = np.interp(travel, arc, line[:, 0]) + over * np.cos(heading)
+    y = np.interp(travel, arc, line[:, 1]) + over * np.sin(heading)
+    heading[0] = actor.heading
+    return np.stack([x, y, heading])
+
+
+def _on_route(
+    path: RoutePath, x: Floats, y: Floats, heading: Floats, ego_s_m: float
+) -> tuple[Floats, Floats, Floats]:
+    """Arc length, lateral offset and relative heading on the route: each [A, T]."""
+    low = int(max(ego_s_m + ROUTE_SPAN_M[0], 0))
+    high = int(min(ego_s_m + ROUTE_SPAN_M[1], len(path.points)))
+    points, headings = path.points[low:high], path.headings[low:high]
+    gap_x, gap_y = x[..., None] - points[:, 0], y[..., None] - points[:, 1]
+    nearest = np.argmin(gap_x * gap_x + gap_y * gap_y, axis=-1)
+    at, course = points[nearest], headings[nearest]
+    dx, dy = x - at[..., 0], y - at[..., 1]
+    along = low + nearest + np.cos(course) * dx + np.sin(course) * dy
+    lateral = np.cos(course) * dy - np.sin(course) * dx
+    away = np.mod(heading - course + np.pi, 2 * np.pi) - np.pi
+    return along, lateral, away

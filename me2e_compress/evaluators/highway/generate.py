@@ -1,0 +1,110 @@
+"""Fresh routes: proposed by the scenario types, admitted by the gate."""
+
+import zlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
+
+import numpy as np
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
+from me2e_compress.evaluators.highway.admission import examine
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.scenarios.registry import stage_of
+
+VARIANTS = 5
+"""Routes of each type, as in Bench2Drive's 220."""
+MOST_TRIES = 8
+"""Proposals of a type for every route wanted, before we give up."""
+
+
+@dataclass(frozen=True)
+class Harvest:
+    """What one scenario type gave.
+
+    Attributes:
+        scenario: Which.
+        routes: The admitted routes.
+        refusals: Why the others were not, in the order they were tried.
+    """
+
+    scenario: str
+    routes: tuple[Route, ...]
+    refusals: tuple[str, ...]
+
+    @property
+    def tried(self) -> int:
+        """Proposals that were put through the gate."""
+        return len(self.routes) + len(self.refusals)
+
+
+def propose(scenario: str, seed: int, name: str) -> Route:
+    """One route of a type, with every parameter written out.
+
+    Args:
+        scenario: One of the 44 types.
+        seed: Decides the parameters.
+        name: The route's id.
+
+    Raises:
+        EvaluationError: There is no such type.
+    """
+    known = SCENARIO_ABILITIES.get(scenario)
+    if known is None:
+        there = ", ".join(sorted(SCENARIO_ABILITIES))
+        raise EvaluationError(f"no scenario {scenario!r}; there are {there}")
+    route = Route(name, scenario, known[0], seed)
+    return replace(route, parameters=dict(stage_of(route).parameters))
+
+
+def seed_of(seed: int, scenario: str, attempt: int) -> int:
+    """The seed of the n-th proposal of a type, different for every type."""
+    words = [seed, zlib.crc32(scenario.encode()), attempt]
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+
+def harvest(scenario: str, seed: int, variants: int = VARIANTS) -> Harvest:
+    """Propose routes of a type until enough are admitted.
+
+    Raises:
+        EvaluationError: `MOST_TRIES` proposals for each route were not enough.
+    """
+    routes, refusals = list[Route](), list[str]()
+    for attempt in range(MOST_TRIES * variants):
+        name = f"{scenario}_{len(routes)}"
+        verdict = examine(propose(scenario, seed_of(seed, scenario, attempt), name))
+        if verdict.refusal is None:
+            routes.append(verdict.route)
+        else:
+            refusals.append(verdict.refusal)
+        if len(routes) == variants:
+            return Harvest(scenario, tuple(routes), tuple(refusals))
+    raise EvaluationError(
+        f"{scenario}: {len(routes)} of {variants} routes after {len(refusals)} "
+        f"refusals with seed {seed}; the last: {refusals[-1] if refusals else 'none'}"
+    )
+
+
+def generate(
+    seed: int,
+    scenarios: Sequence[str] = tuple(SCENARIO_ABILITIES),
+    variants: int = VARIANTS,
+    workers: int = 1,
+) -> Iterator[Harvest]:
+    """Harvest several types, in their order, whatever the number of workers.
+
+    Args:
+        seed: Decides everything.
+        scenarios: Types.
+        variants: Routes of each type.
+        workers: Processes; 1 stays in this one.
+    """
+    reap = partial(harvest, seed=seed, variants=variants)
+    if workers == 1:
+        yield from map(reap, scenarios)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(reap, scenarios)

@@ -1,0 +1,214 @@
+"""Geometry of a route and of the roads around it, in the right-handed plane."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Point = tuple[float, float]
+SPACING_M = 1.0
+"""Distance between two points of a route, as Bench2Drive's dense routes."""
+LANE_SPACING_M = 2.0
+"""Longest chord that stands for a piece of a lane when we ask who is inside it."""
+
+
+class Command(IntEnum):
+    """What the navigator says; the order of Bench2Drive's one-hot command."""
+
+    LEFT = 0
+    RIGHT = 1
+    STRAIGHT = 2
+    FOLLOW = 3
+    CHANGE_LEFT = 4
+    CHANGE_RIGHT = 5
+
+
+class LaneMarking(StrEnum):
+    """How the edge of a lane is painted."""
+
+    NONE = "none"
+    DASHED = "dashed"
+    SOLID = "solid"
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """One lane: its centre line in driving direction.
+
+    Args:
+        name: Unique name, ``from>to:index``.
+        centre: [N, 2] metres, at most 2 m apart.
+        width: Metres.
+        left: Marking of the left edge, seen in driving direction.
+        right: Marking of the right edge.
+        speed_limit_mps: Speed limit.
+        shoulder: Paved but not meant for driving: nobody is routed over it, yet
+            standing on it is not off-road.
+    """
+
+    name: str
+    centre: Floats
+    width: float
+    left: LaneMarking
+    right: LaneMarking
+    speed_limit_mps: float
+    shoulder: bool = False
+
+    @cached_property
+    def headings(self) -> Floats:
+        """[N] radians, of the chord after each point (the last repeats)."""
+        return polyline_headings(self.centre)
+
+
+@dataclass(frozen=True, eq=False)
+class Roadmap:
+    """All lanes, stop lines and crosswalks of a world."""
+
+    lanes: tuple[Lane, ...]
+    stop_lines: tuple[tuple[Point, Point], ...] = ()
+    crosswalks: tuple[tuple[Point, Point, Point, Point], ...] = ()
+    """Four corners each, in order around the rectangle."""
+
+    def outside_m(self, x: float, y: float) -> float:
+        """Metres between a point and the nearest lane's surface, 0 inside any lane."""
+        return float(self.outside_all(np.array([[x, y]]))[0])
+
+    def outside_all(self, points: Floats) -> Floats:
+        """`outside_m` of [N, 2] points at once: [N]."""
+        start, direction, length, half_width = self._chords
+        away = _distance_to_chords(points, start, direction, length) - half_width
+        return np.asarray(np.maximum(np.min(away, axis=1), 0.0))
+
+    @cached_property
+    def _chords(self) -> tuple[Floats, Floats, Floats, Floats]:
+        starts = np.concatenate([lane.centre[:-1] for lane in self.lanes])
+        steps = np.concatenate([np.diff(lane.centre, axis=0) for lane in self.lanes])
+        lengths = np.hypot(steps[:, 0], steps[:, 1])
+        half_widths = [
+            np.full(len(lane.centre) - 1, lane.width / 2) for lane in self.lanes
+        ]
+        return starts, steps / lengths[:, None], lengths, np.concatenate(half_widths)
+
+
+@dataclass(frozen=True, eq=False)
+class RoutePath:
+    """The route's centre line, one point every metre, from start past the goal.
+
+    It runs on beyond `goal_m` (about 60 m) so that planners can look ahead.
+
+    Args:
+        points: [N, 2] metres, 1 m apart.
+        headings: [N] radians, unwrapped.
+        lane_widths: [N] metres, width of the lane that the route uses.
+        speed_limits_mps: [N].
+        commands: [N] values of `Command`.
+        goal_m: Route length: reaching this arc length ends the route.
+        left_m: [N] drivable metres left of the point, up to the edge of the last
+            lane that runs the same way.
+        right_m: [N] the same to the right, shoulders included.
+        oncoming_m: [N] drivable metres to the left with oncoming lanes and
+            shoulders included (>= left_m).
+    """
+
+    points: Floats
+    headings: Floats
+    lane_widths: Floats
+    speed_limits_mps: Floats
+    commands: Ints
+    goal_m: float
+    left_m: Floats
+    right_m: Floats
+    oncoming_m: Floats
+    _direction: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Precompute the chord directions."""
+        object.__setattr__(self, "_direction", np.diff(self.points, axis=0))
+
+    @property
+    def length_m(self) -> float:
+        """Arc length of the whole path, the part beyond the goal included."""
+        return (len(self.points) - 1) * SPACING_M
+
+    def project(
+        self, x: float, y: float, near_m: float | None = None
+    ) -> tuple[float, float]:
+        """(arc length, lateral offset) of a point; lateral is positive to the left.
+
+        Args:
+            x: Metres.
+            y: Metres.
+            near_m: Where the point was last seen; only the path from 10 m before to
+                30 m after is searched then. Routes may cross themselves.
+        """
+        low, high = 0, len(self._direction)
+        if near_m is not None:
+            low = min(max(0, int(near_m) - 10), high - 1)
+            high = min(high, int(near_m) + 30)
+            high = max(high, low + 1)
+        start, direction = self.points[low:high], self._direction[low:high]
+        dx, dy = x - start[:, 0], y - start[:, 1]
+        along = np.clip(dx * direction[:, 0] + dy * direction[:, 1], 0.0, SPACING_M)
+        miss_x = dx - along * direction[:, 0]
+        miss_y = dy - along * direction[:, 1]
+        i = int(np.argmin(miss_x * miss_x + miss_y * miss_y))
+        side = direction[i, 0] * miss_y[i] - direction[i, 1] * miss_x[i]
+        lateral = float(np.copysign(np.hypot(miss_x[i], miss_y[i]), side))
+        return float(low + i + along[i]), lateral
+
+    def at(
+        self, s_m: npt.ArrayLike, lateral_m: npt.ArrayLike = 0.0
+    ) -> tuple[Floats, Floats, Floats]:
+        """(x, y, heading) at arc lengths and lateral offsets (broadcast together)."""
+        s, lateral = np.asarray(s_m, float), np.asarray(lateral_m, float)
+        heading = self.value(self.headings, s)
+        x = self.value(self.points[:, 0], s) - lateral * np.sin(heading)
+        y = self.value(self.points[:, 1], s) + lateral * np.cos(heading)
+        return x, y, heading
+
+    def value(self, column: Floats, s_m: npt.ArrayLike) -> Floats:
+        """One of the [N] columns, interpolated at arc lengths."""
+        stations = np.arange(len(column)) * SPACING_M
+        return np.asarray(np.interp(np.asarray(s_m, float), stations, column))
+
+    def command_at(self, s_m: float) -> Command:
+        """The navigator's command at an arc length."""
+        i = int(np.clip(s_m, 0, len(self.commands) - 1))
+        return Command(int(self.commands[i]))
+
+    @cached_property
+    def curvature(self) -> Floats:
+        """[N] 1/m, positive to the left, smoothed over 3 m."""
+        raw = np.gradient(self.headings, SPACING_M)
+        return np.convolve(np.pad(raw, 1, mode="edge"), np.full(3, 1 / 3), "valid")
+
+
+def polyline_headings(points: Floats) -> Floats:
+    """[N] unwrapped headings of the chords of [N, 2] points; the last repeats."""
+    steps = np.diff(points, axis=0)
+    headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    return np.append(headings, headings[-1])
+
+
+def resample(points: Floats, spacing_m: float) -> Floats:
+    """Points every ``spacing_m`` along a polyline (chord length), the first kept."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    stations = np.arange(0.0, arc[-1] + 1e-9, spacing_m)
+    columns: Iterable[Floats] = (np.interp(stations, arc, c) for c in points.T)
+    return np.stack(list(columns), axis=1)
+
+
+def _distance_to_chords(
+    points: Floats, start: Floats, direction: Floats, length: Floats
+) -> Floats:
+    """[N, C] distances of N points to C chords."""
+    offset = points[:, None, :] - start[None]
+    along = np.clip(np.sum(offset * direction, axis=2), 0.0, length)
+    miss = offset - along[..., None] * direction
+    return np.asarray(np.hypot(miss[..., 0], miss[..., 1]))

@@ -1,0 +1,106 @@
+"""A whole evaluation: routes as independent jobs, resumable, the same bytes always."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.durations import longest_first
+from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.episode import Episode
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far an evaluation is.
+
+    Attributes:
+        done: Routes finished, those of earlier runs included.
+        total: Routes of this evaluation.
+        driving_score: Mean over the finished ones, percent; None before the first.
+        success_rate: The same.
+    """
+
+    done: int
+    total: int
+    driving_score: float | None
+    success_rate: float | None
+
+
+@dataclass(frozen=True)
+class HighwayEvaluator:
+    """Drives routes of highway-env and keeps the episodes in a folder.
+
+    Running it again with the same folder drives what is missing. The files do not
+    depend on the number of workers, on the engine or on the clock, unless latency is
+    measured here and now.
+
+    Args:
+        job: Who drives under what.
+        routes: What to drive, at least one.
+        folder: Where the results go.
+        set_size: How many routes the whole set has.
+        engine: Where the routes are driven.
+        on_progress: Called at the start and after every route.
+        on_warning: Called with one line a surprise.
+    """
+
+    name: ClassVar[str] = "highway"
+    job: Job
+    routes: tuple[Route, ...]
+    folder: Path
+    set_size: int
+    engine: Engine = field(default_factory=LocalEngine)
+    on_progress: Callable[[Progress], None] = lambda progress: None
+    on_warning: Callable[[str], None] = lambda line: None
+
+    def episodes(self) -> Iterator[Episode]:
+        """Drive what is missing, then yield all routes in the order given.
+
+        Raises:
+            EvaluationError: The policy cannot be opened, the folder is of another
+                evaluation or cannot be written, or a process was killed.
+        """
+        if not self.routes:
+            raise EvaluationError("there is no route to drive")
+        self.job.driver.open()
+        made_by = fingerprint(self.job, self.routes, self.set_size)
+        folder = ResultsFolder.create(self.folder, made_by)
+        done = folder.episodes()
+        for path, reason in folder.corrupt.items():
+            self.on_warning(f"{path}: {reason}: driven again")
+        missing = [route for route in self.routes if route.id not in done]
+        self.on_progress(progress_of(tuple(done.values()), len(self.routes)))
+        for driven in self._engine.drive(self.job, longest_first(missing)):
+            folder.save(driven)
+            done[driven.episode.route] = driven.episode
+            self.on_progress(progress_of(tuple(done.values()), len(self.routes)))
+        yield from (done[route.id] for route in self.routes)
+
+    @property
+    def _engine(self) -> Engine:
+        if not self.job.conditions.latency.measures:
+            return self.engine
+        if self.engine != LocalEngine(1):
+            self.on_warning(
+                "latency is measured here: routes driven in parallel would disturb "
+                "it, so they are driven one at a time"
+            )
+        return LocalEngine(1)
+
+
+def progress_of(episodes: Sequence[Episode], total: int) -> Progress:
+    """Sum up the episodes that there are."""
+    if not episodes:
+        return Progress(0, total, None, None)
+    return Progress(
+        len(episodes),
+        total,
+        sum(route_score(one).composed for one in episodes) / len(episodes),
+        100.0 * sum(one.succeeded for one in episodes) / len(episodes),
+    )

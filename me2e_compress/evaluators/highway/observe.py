@@ -1,0 +1,64 @@
+"""What a policy is shown."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.evaluators.base import CAN_BUS_SIZE, Observation, Policy
+from me2e_compress.evaluators.highway.cameras import CameraRig, Cameras
+from me2e_compress.evaluators.highway.scene import Ego, Scene
+from me2e_compress.evaluators.highway.world import World
+
+
+@dataclass
+class Observer:
+    """Makes the observations of one route.
+
+    Args:
+        world: Which is observed.
+        policy: Decides what is shown.
+        rig: Gives lidar2img, also to a policy that sees no images.
+        cameras: Render the images; None if there are none to see.
+    """
+
+    world: World
+    policy: Policy
+    rig: CameraRig
+    cameras: Cameras | None
+    _last: Ego | None = field(default=None, init=False)
+
+    def observe(self, scene: Scene) -> Observation:
+        """Return what the policy decides on: it is asked at this scene, and only then.
+
+        The CAN bus counts metres and degrees since the last call.
+        """
+        images = self.cameras.render(scene) if self.cameras is not None else None
+        can_bus = can_bus_of(scene.ego, self._last)
+        self._last = scene.ego
+        return Observation(
+            scene.time_us,
+            images if self.policy.needs_images else None,
+            self.rig.lidar2img,
+            can_bus,
+            int(self.world.path.command_at(self.world.ego_s)),
+            scene.ego.speed_mps,
+            scene if self.policy.privileged else None,
+            self.world if self.policy.privileged else None,
+        )
+
+
+def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:
+    """Return float32 [18], see `Observation`; ``last`` is the ego a decision ago."""
+    bus = np.zeros(CAN_BUS_SIZE, np.float64)
+    bus[3], bus[6] = math.cos(ego.heading / 2), math.sin(ego.heading / 2)
+    bus[7] = ego.speed_mps
+    bus[10:12] = ego.acceleration_mps2, ego.lateral_acceleration_mps2
+    bus[15] = ego.yaw_rate_radps
+    bus[16] = ego.heading % (2 * math.pi)
+    if last is not None:
+        bus[0:2] = ego.x - last.x, ego.y - last.y
+        turned = math.remainder(ego.heading - last.heading, 2 * math.pi)
+        bus[17] = math.degrees(turned)
+    return bus.astype(np.float32)

@@ -1,0 +1,155 @@
+"""A driver from an ONNX file."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.evaluators.base import CAN_BUS_SIZE, PLAN_SHAPE, Observation, Plan
+from me2e_compress.evaluators.highway.adapter import Adapter, ImageNormalization
+from me2e_compress.evaluators.highway.ports import (
+    CAMERAS,
+    CONTRACT,
+    DEFAULT_IMAGE_SIZE,
+    check_inputs,
+    fed,
+    fits,
+    image_size,
+    zeros,
+)
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.metrics.adapter import PlanAdapter
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.session import Session
+
+
+@dataclass
+class OnnxPolicy:
+    """Keeps the policy contract with an ONNX graph, one onnxruntime thread, no spin.
+
+    Inputs ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus`` [18]
+    and ``command`` int64 [1], of which a model may lack any; recurrent inputs ``X``
+    answered by ``X_out``, zeros at the start of a route; output ``plan`` [1, 6, 2]. An
+    `Adapter` explains what is named or laid out otherwise.
+
+    Attributes:
+        session: The loaded graph.
+        adapter: How its ports relate to the contract.
+        plan_adapter: How its plan is read.
+        names: The graph's name for each input of the contract.
+        recurrent: Recurrent input to the output that answers it.
+        normalization: Of the images; None if it sees none.
+        image_size: Rows and columns that it sees.
+    """
+
+    session: Session
+    adapter: Adapter
+    plan_adapter: PlanAdapter
+    names: dict[str, str]
+    recurrent: dict[str, str]
+    normalization: ImageNormalization | None
+    image_size: tuple[int, int]
+    privileged: bool = field(default=False, init=False)
+    _state: dict[str, Array] = field(default_factory=dict, init=False)
+
+    @classmethod
+    def open(cls, path: Path, adapter: Adapter | None = None) -> Self:
+        """Load a model and run it once on zeros.
+
+        Raises:
+            EvaluationError: It cannot be run, or does not keep the contract.
+        """
+        try:
+            policy = cls._of(Session(path, threads=1), adapter or Adapter())
+            policy._rehearse()
+        except (GraphError, FramesError, EvaluationError) as error:
+            words = str(error).removeprefix(f"{path}: ")
+            raise EvaluationError(f"{path}: {words}") from error
+        return policy
+
+    @classmethod
+    def _of(cls, session: Session, adapter: Adapter) -> Self:
+        names = {ours: ours for ours in CONTRACT} | {**adapter.inputs}
+        recurrent = dict(
+            session.recurrent if adapter.recurrent is None else adapter.recurrent
+        )
+        check_inputs(session.inputs, session.outputs, names, recurrent)
+        image = session.inputs.get(names["img"])
+        return cls(
+            session,
+            adapter,
+            adapter.plan_of(session.metadata, list(session.outputs)),
+            names,
+            recurrent,
+            None if image is None else adapter.normalization(session.metadata),
+            DEFAULT_IMAGE_SIZE if image is None else image_size(image),
+        )
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether the model has an image input."""
+        return self.normalization is not None
+
+    def reset(self, route: Route | None) -> None:
+        """Begin a route: recurrent inputs are zeros again."""
+        self._state = {
+            name: zeros(name, self.session.inputs[name]) for name in self.recurrent
+        }
+
+    def plan(self, observation: Observation) -> Plan:
+        """Run the model once.
+
+        Raises:
+            EvaluationError: It sees images and there are none.
+            GraphError: A node of the model failed.
+        """
+        feeds = self._feeds(observation)
+        outputs = self.session.run({**self._state, **feeds})
+        self._state = {name: outputs[to] for name, to in self.recurrent.items()}
+        command = np.array([observation.command])
+        waypoints = self.plan_adapter.plan(outputs, {"command": command, **feeds})
+        return self.adapter.to_ego(waypoints)
+
+    def _feeds(self, observation: Observation) -> dict[str, Array]:
+        arrays: dict[str, Array] = {
+            "lidar2img": self.adapter.projection(observation.lidar2img),
+            "can_bus": observation.can_bus,
+            "command": np.asarray(observation.command),
+        }
+        if self.normalization is not None:
+            if observation.images is None:
+                raise EvaluationError("the model sees images, and none were rendered")
+            arrays["img"] = self.normalization.apply(observation.images)
+        ports = self.session.inputs
+        return {
+            self.names[ours]: fed(array, ports[self.names[ours]])
+            for ours, array in arrays.items()
+            if self.names[ours] in ports
+        }
+
+    def _rehearse(self) -> None:
+        """Run once on zeros: what does not fit here would not on any route."""
+        self.reset(None)
+        nothing = Observation(
+            0,
+            np.zeros((CAMERAS, *self.image_size, 3), np.uint8),
+            np.tile(np.eye(4, dtype=np.float32), (CAMERAS, 1, 1)),
+            np.zeros(CAN_BUS_SIZE, np.float32),
+            int(self.plan_adapter.default_mode),
+            0.0,
+        )
+        found = self.plan(nothing).shape
+        if found != PLAN_SHAPE:
+            raise EvaluationError(
+                f"output {self.plan_adapter.output} holds a plan of shape "
+                f"{list(found)}, it must be {list(PLAN_SHAPE)}"
+            )
+        for name, answer in self.recurrent.items():
+            given, wanted = self._state[name].shape, self.session.inputs[name].shape
+            if not fits(given, wanted):
+                raise EvaluationError(
+                    f"output {answer} has shape {list(given)}, the recurrent input "
+                    f"{name} takes {list(wanted)}"
+                )

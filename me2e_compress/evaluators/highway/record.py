@@ -1,0 +1,185 @@
+"""From what happens in a world to the episode that is scored."""
+
+import math
+from dataclasses import dataclass, field
+from statistics import fmean
+
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.scene import (
+    ActorKind,
+    Command,
+    RoutePath,
+    Scene,
+)
+from me2e_compress.evaluators.highway.traffic.legs import ANNOUNCED_M
+from me2e_compress.evaluators.highway.world import Event, EventKind, World
+from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode, Frame
+from me2e_compress.metrics.infraction import Infraction, InfractionKind
+
+NEAR_M = 50.0
+"""Vehicles no farther than this are the traffic that the ego is compared with."""
+
+VEHICLES = (
+    ActorKind.CAR,
+    ActorKind.VAN,
+    ActorKind.TRUCK,
+    ActorKind.EMERGENCY,
+    ActorKind.BICYCLE,
+)
+TURNS = (Command.LEFT, Command.RIGHT, Command.STRAIGHT)
+LAYOUT = (ActorKind.CONE, ActorKind.BARRIER)
+KINDS = {
+    EventKind.RED_LIGHT: InfractionKind.RED_LIGHT,
+    EventKind.STOP_SIGN: InfractionKind.STOP,
+    EventKind.GIVE_WAY: InfractionKind.GIVE_WAY,
+    EventKind.YIELD_EMERGENCY: InfractionKind.YIELD_TO_EMERGENCY_VEHICLE,
+}
+ENDINGS = {
+    Ending.DEVIATION: InfractionKind.ROUTE_DEVIATION,
+    Ending.BLOCKED: InfractionKind.VEHICLE_BLOCKED,
+    Ending.TIMEOUT: InfractionKind.ROUTE_TIMEOUT,
+}
+
+
+@dataclass
+class Recorder:
+    """Writes down one route: a frame every 50 ms, whatever the world's own step."""
+
+    world: World
+    frames: list[Frame] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
+
+    def see(self, scene: Scene) -> None:
+        """Write down an instant if its time has come."""
+        if scene.time_us >= len(self.frames) * FRAME_US:
+            self.frames.append(_frame(scene, self.world.progress_m))
+
+    def episode(self, ending: Ending, failure: str | None = None) -> Episode:
+        """Close the record of the world's route."""
+        world = self.world
+        route, goal_m = world.route, world.path.goal_m
+        completed = ending is Ending.COMPLETED
+        return Episode(
+            route=route.id,
+            scenario=route.scenario,
+            abilities=route.abilities,
+            route_length_m=goal_m,
+            completion_percent=100.0 if completed else completion_percent(world),
+            ending=ending,
+            failure=failure,
+            infractions=_infractions(world, ending),
+            frames=tuple(self.frames),
+            decisions=tuple(self.decisions),
+            junction_m=junction_m(world.path),
+        )
+
+
+def unrecorded(route: Route, completion_percent: float, failure: str) -> Episode:
+    """Return the episode of a route whose driver took the record down with it."""
+    world = World(route)
+    return Episode(
+        route=route.id,
+        scenario=route.scenario,
+        abilities=route.abilities,
+        route_length_m=world.path.goal_m,
+        completion_percent=completion_percent,
+        ending=Ending.POLICY_FAILED,
+        failure=failure,
+        infractions=(),
+        frames=(),
+        decisions=(),
+        junction_m=junction_m(world.path),
+    )
+
+
+def completion_percent(world: World) -> float:
+    """Return how much of the route was passed while its goal is not reached.
+
+    Two digits, as the leaderboard; only reaching the goal makes it 100.
+    """
+    share = 100.0 * world.progress_m / world.path.goal_m
+    return min(max(round(share, 2), 0.0), 99.99)
+
+
+def junction_m(path: RoutePath) -> float | None:
+    """Return where the first junction of a route begins, None if there is none.
+
+    Its command is announced 20 m ahead.
+    """
+    for station, command in enumerate(path.commands):
+        if station < path.goal_m and Command(int(command)) in TURNS:
+            return station + ANNOUNCED_M
+    return None
+
+
+def _frame(scene: Scene, route_m: float) -> Frame:
+    ego = scene.ego
+    near = [
+        actor.speed_mps
+        for actor in scene.actors
+        if actor.kind in VEHICLES
+        and math.hypot(actor.x - ego.x, actor.y - ego.y) <= NEAR_M
+    ]
+    return Frame(
+        time_us=scene.time_us,
+        x=ego.x,
+        y=ego.y,
+        heading=ego.heading,
+        speed_mps=ego.speed_mps,
+        acceleration_mps2=ego.acceleration_mps2,
+        lateral_acceleration_mps2=ego.lateral_acceleration_mps2,
+        yaw_rate_radps=ego.yaw_rate_radps,
+        steering_rad=ego.steering_rad,
+        route_m=route_m,
+        traffic_speed_mps=fmean(near) if near else None,
+    )
+
+
+def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
+    """Translate the world's events, and the end of the route, into CARLA's words."""
+    found = [
+        _infraction(kind, event)
+        for event in world.events
+        if (kind := _kind(event)) is not None
+    ]
+    outside = _outside(world)
+    if outside is not None:
+        found.append(outside)
+    if ending in ENDINGS:
+        ego = world.scene().ego
+        found.append(
+            Infraction(ENDINGS[ending], world.time_us, ego.x, ego.y, ending.value)
+        )
+    return tuple(sorted(found, key=lambda infraction: infraction.time_us))
+
+
+def _kind(event: Event) -> InfractionKind | None:
+    if event.kind is not EventKind.COLLISION:
+        return KINDS.get(event.kind)
+    if event.actor_kind is ActorKind.PEDESTRIAN:
+        return InfractionKind.COLLISION_PEDESTRIAN
+    if event.actor_kind in LAYOUT:
+        return InfractionKind.COLLISION_LAYOUT
+    return InfractionKind.COLLISION_VEHICLE
+
+
+def _infraction(kind: InfractionKind, event: Event) -> Infraction:
+    partner = "" if event.actor_kind is None else f"{event.actor_kind.value} "
+    number = "" if event.actor_id is None else f"{event.actor_id}"
+    detail = f"{partner}{number}".strip() or event.detail
+    return Infraction(kind, event.time_us, event.x, event.y, detail)
+
+
+def _outside(world: World) -> Infraction | None:
+    """Sum up all leaving of lanes in one infraction, placed where it began."""
+    first = next((e for e in world.events if e.kind is EventKind.OUTSIDE_LANES), None)
+    if first is None:
+        return None
+    outside_m = world.outside_distance_m
+    percent = min(100.0, 100.0 * outside_m / max(world.progress_m, outside_m, 1e-9))
+    return Infraction(
+        InfractionKind.OUTSIDE_ROUTE_LANES,
+        *(first.time_us, first.x, first.y),
+        detail=f"{outside_m:.2f} m",
+        percent=percent,
+    )

@@ -1,0 +1,183 @@
+"""A folder of results: one JSON a route, and what decided them."""
+
+import errno
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+from me2e_compress import __version__
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.worker import Driven, Job
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.runtime.atomic import write_json
+
+MANIFEST = "evaluation.json"
+ROUTES = "routes"
+
+
+def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
+    """Return everything that decides the bytes of the results.
+
+    Args:
+        job: Driver and conditions.
+        routes: What is driven.
+        set_size: How many routes the whole set has.
+    """
+    definitions = json.dumps([asdict(route) for route in routes], sort_keys=True)
+    return {
+        "version": __version__,
+        "policy": job.driver.fingerprint(),
+        "latency": job.conditions.latency.to_json(),
+        "dt_us": job.conditions.dt_us,
+        "image_size": list(job.conditions.image_size),
+        "weather": json.loads(json.dumps(asdict(job.conditions.weather))),
+        "frame_limit_s": job.frame_limit_s,
+        "set_size": set_size,
+        "routes_sha256": hashlib.sha256(definitions.encode()).hexdigest(),
+        "routes": [route.id for route in routes],
+    }
+
+
+@dataclass
+class ResultsFolder:
+    """Results on disk; every file is whole or not there.
+
+    Attributes:
+        path: The folder.
+        made_by: The fingerprint.
+        corrupt: Files that could not be read, with the reason; their routes count as
+            not driven.
+    """
+
+    path: Path
+    made_by: dict[str, Any]
+    corrupt: dict[Path, str] = field(default_factory=dict)
+
+    @classmethod
+    def create(cls, path: Path, made_by: dict[str, Any]) -> Self:
+        """Make the folder, or go on with one of the same evaluation.
+
+        Raises:
+            EvaluationError: It holds the results of another evaluation, or something
+                else, or cannot be written.
+        """
+        try:
+            (path / ROUTES).mkdir(parents=True, exist_ok=True)
+            if not (path / MANIFEST).exists():
+                if any((path / ROUTES).iterdir()):
+                    raise EvaluationError(f"{path}: holds routes but no {MANIFEST}")
+                write_json(path / MANIFEST, made_by, indent=1)
+        except OSError as error:
+            raise _unwritable(path, error) from error
+        folder = cls.open(path)
+        for key in sorted({*made_by, *folder.made_by}):
+            old, new = folder.made_by.get(key), made_by.get(key)
+            if old != new:
+                raise EvaluationError(
+                    f"{path}: holds the results of another evaluation: its {key} is "
+                    f"{_short(old)}, this one's {_short(new)}; take another folder"
+                )
+        return folder
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Read what a folder is.
+
+        Raises:
+            EvaluationError: It is no folder of results.
+        """
+        try:
+            made_by = json.loads((path / MANIFEST).read_bytes())
+        except (OSError, ValueError) as error:
+            words = error.strerror if isinstance(error, OSError) else "not JSON"
+            raise EvaluationError(
+                f"{path}: no folder of results: {MANIFEST}: {words}"
+            ) from error
+        if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
+            raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
+        return cls(path, made_by)
+
+    @property
+    def set_size(self) -> int:
+        """How many routes the whole set has."""
+        return int(self.made_by.get("set_size", len(self.made_by["routes"])))
+
+    @property
+    def log(self) -> Path:
+        """Where wall-clock times go: beside the folder, which must not hold any."""
+        resolved = self.path.resolve()
+        return resolved.with_name(f"{resolved.name}.log")
+
+    def episodes(self) -> dict[str, Episode]:
+        """Read every route that was driven, in the order of the evaluation."""
+        found = {route: self._read(str(route)) for route in self.made_by["routes"]}
+        return {route: one for route, one in found.items() if one is not None}
+
+    def save(self, driven: Driven) -> None:
+        """Write one route, and what it cost to the log.
+
+        Raises:
+            EvaluationError: The disk is full, or the folder cannot be written.
+        """
+        episode = driven.episode
+        record = {"fingerprint": self._seal, "episode": episode.to_json()}
+        cost = {
+            "route": episode.route,
+            "frames": len(episode.frames),
+            "decisions": len(episode.decisions),
+            "seconds": round(driven.seconds, 3),
+            "memory_mb": round(driven.memory_bytes / 1e6, 1),
+        }
+        try:
+            write_json(self._file(episode.route), record)
+            with self.log.open("a", encoding="utf-8") as log:
+                log.write(f"{json.dumps(cost)}\n")
+        except OSError as error:
+            raise _unwritable(self._file(episode.route), error) from error
+
+    @property
+    def _seal(self) -> str:
+        text = json.dumps(self.made_by, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _file(self, route: str) -> Path:
+        return self.path / ROUTES / f"{route}.json"
+
+    def _read(self, route: str) -> Episode | None:
+        path = self._file(route)
+        if not path.exists():
+            return None
+        try:
+            record = json.loads(path.read_bytes())
+            if not isinstance(record, dict) or record.get("fingerprint") != self._seal:
+                raise ValueError("of another evaluation")
+            return Episode.from_json(record["episode"])
+        except (ValueError, KeyError, TypeError) as error:
+            self.corrupt[path] = " ".join(str(error).split())[:200]
+            return None
+
+
+def read_results(paths: Iterable[Path]) -> list[ResultsFolder]:
+    """Open several folders.
+
+    Raises:
+        EvaluationError: One of them is none.
+    """
+    return [ResultsFolder.open(path) for path in paths]
+
+
+def _unwritable(path: Path, error: OSError) -> EvaluationError:
+    if error.errno == errno.ENOSPC:
+        return EvaluationError(
+            f"{path}: the disk is full; what is written is whole, run again to go on"
+        )
+    return EvaluationError(f"{path}: cannot be written: {error.strerror or error}")
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

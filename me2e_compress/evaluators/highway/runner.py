@@ -1,0 +1,221 @@
+"""One route: the policy decides, the world charges for it, the episode remains."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.base import PLAN_SHAPE, Observation, Policy
+from me2e_compress.evaluators.highway.cameras import (
+    CLEAR,
+    CameraRig,
+    Cameras,
+    Weather,
+    paint_texture,
+)
+from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.observe import Observer
+from me2e_compress.evaluators.highway.picture import Moment
+from me2e_compress.evaluators.highway.record import Recorder
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.rules import Rules
+from me2e_compress.evaluators.highway.scene import Control, Ego, Scene
+from me2e_compress.evaluators.highway.world import World
+from me2e_compress.evaluators.latency import FixedLatency, LatencySource
+from me2e_compress.evaluators.realtime import DT_US, HeldControl
+from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode
+
+Plan = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Under what a policy drives.
+
+    Args:
+        latency: What its decisions cost.
+        dt_us: Step of the world, a whole part of 50 ms; what a finer one changes says
+            `realtime.skipped_decisions`. Frames are recorded every 50 ms all the same.
+        image_size: Rows and columns of each camera.
+        weather: Weather and sensor faults.
+
+    Raises:
+        EvaluationError: 50 ms are not a multiple of the step.
+    """
+
+    latency: LatencySource = field(default_factory=FixedLatency)
+    dt_us: int = DT_US
+    image_size: tuple[int, int] = (96, 160)
+    weather: Weather = CLEAR
+
+    def __post_init__(self) -> None:
+        """Check the step."""
+        if self.dt_us <= 0 or FRAME_US % self.dt_us:
+            raise EvaluationError(
+                f"a step of {self.dt_us / 1e3:g} ms: it must be a whole part of "
+                f"{FRAME_US // 1000} ms"
+            )
+
+
+class PolicyFailedError(Exception):
+    """A policy broke its contract; the message says how."""
+
+
+@dataclass(frozen=True)
+class Listeners:
+    """Who is told what while a route is driven; none of them changes the drive.
+
+    Args:
+        asking: Called with the world before the policy is asked.
+        answered: Called when it has answered.
+        moment: Called at every frame with what a picture needs, the latest plan as
+            seen from the ego now; makes the cameras render for any policy.
+    """
+
+    asking: Callable[[World], None] = lambda world: None
+    answered: Callable[[], None] = lambda: None
+    moment: Callable[[Moment], None] | None = None
+
+
+SILENT = Listeners()
+
+
+def drive(
+    route: Route,
+    policy: Policy,
+    conditions: Conditions,
+    listeners: Listeners = SILENT,
+) -> Episode:
+    """Drive a route to its end and return the record.
+
+    At each decision (`HeldControl`) the policy plans, and the controller turns the
+    plan and the ego's state at that same frame into a control; equation 4 says when
+    it acts and how long it is held. Before the first one acts the ego coasts straight.
+    A policy that raises, or answers anything but six finite waypoints, ends the route
+    as failed.
+
+    Args:
+        route: What to drive.
+        policy: Who drives.
+        conditions: Latency, step, cameras.
+        listeners: For a watchdog or for pictures.
+    """
+    return _Drive(route, policy, conditions, listeners).run()
+
+
+class _Drive:
+    """The state of one route while it is driven."""
+
+    def __init__(
+        self, route: Route, policy: Policy, conditions: Conditions, to: Listeners
+    ) -> None:
+        self.route, self.policy, self.to = route, policy, to
+        self.world = world = World(route, dt_us=conditions.dt_us)
+        self.recorder, self.rules = Recorder(world), Rules()
+        self.held = HeldControl(Control(0.0, 0.0), conditions.dt_us)
+        self.charge = conditions.latency.on_route(route.id)
+        self.controller = Controller()
+        rig = CameraRig(*conditions.image_size)
+        self.cameras = None
+        if policy.needs_images or to.moment is not None:
+            texture = paint_texture(world.roadmap, world.path.points)
+            self.cameras = Cameras(texture, rig, conditions.weather)
+        needed = self.cameras if policy.needs_images else None
+        self.observer = Observer(world, policy, rig, needed)
+        self.plan: tuple[Ego, Plan] | None = None
+
+    def run(self) -> Episode:
+        world, ending = self.world, None
+        scene = world.scene()
+        try:
+            self.to.asking(world)
+            _reset(self.policy, self.route)
+            self.to.answered()
+            while ending is None:
+                self.recorder.see(scene)
+                if self.held.decision_is_due:
+                    self.decide(scene)
+                self.show(scene)
+                world.step(self.held.advance())
+                scene = world.scene()
+                ending = self.rules.ending(world, scene.ego.speed_mps)
+        except PolicyFailedError as failure:
+            return self.recorder.episode(Ending.POLICY_FAILED, str(failure))
+        self.recorder.see(scene)
+        self.show(scene)
+        return self.recorder.episode(ending)
+
+    def decide(self, scene: Scene) -> None:
+        """Ask the policy at this frame, and let equation 4 say when it acts."""
+        observation = self.observer.observe(scene)
+        self.to.asking(self.world)
+        begun = time.perf_counter_ns()
+        answer = _ask(self.policy, observation)
+        took_us = (time.perf_counter_ns() - begun) // 1_000
+        self.to.answered()
+        plan = _checked(answer)
+        self.plan = scene.ego, plan
+        latency_us = self.charge(took_us)
+        self.recorder.decisions.append(Decision(scene.time_us, latency_us))
+        anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
+        control = self.controller.control(anchored, scene.ego, scene.time_us)
+        self.held.decide(control, latency_us)
+
+    def show(self, scene: Scene) -> None:
+        """Render this frame for whoever draws pictures."""
+        if self.to.moment is not None and self.cameras is not None:
+            images = self.cameras.render(scene)
+            plan = None if self.plan is None else _seen_from(scene.ego, *self.plan)
+            self.to.moment(Moment(scene, images, plan, self.world.events))
+
+
+def _seen_from(ego: Ego, planned_at: Ego, plan: Plan) -> Plan:
+    """Turn the waypoints of an earlier ego frame into today's."""
+    cos, sin = math.cos(planned_at.heading), math.sin(planned_at.heading)
+    world = plan @ np.array([[cos, sin], [-sin, cos]]) + (planned_at.x, planned_at.y)
+    cos, sin = math.cos(ego.heading), math.sin(ego.heading)
+    return np.asarray((world - (ego.x, ego.y)) @ np.array([[cos, -sin], [sin, cos]]))
+
+
+def _reset(policy: Policy, route: Route) -> None:
+    try:
+        policy.reset(route)
+    except Exception as error:
+        raise _failure(error) from error
+
+
+def _ask(policy: Policy, observation: Observation) -> object:
+    """Call foreign code: whatever it raises is a crash of the policy, not of ours."""
+    try:
+        return policy.plan(observation)
+    except Exception as error:
+        raise _failure(error) from error
+
+
+def _failure(error: Exception) -> PolicyFailedError:
+    words = " ".join(str(error).split())
+    return PolicyFailedError(
+        f"{type(error).__name__}: {words}" if words else repr(error)
+    )
+
+
+def _checked(answer: object) -> Plan:
+    if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
+        raise PolicyFailedError(f"the plan is no float array but {_kind(answer)}")
+    if answer.shape != PLAN_SHAPE:
+        raise PolicyFailedError(
+            f"the plan has shape {list(answer.shape)}, it must be {list(PLAN_SHAPE)}"
+        )
+    if not np.isfinite(answer).all():
+        raise PolicyFailedError("the plan is not finite")
+    return answer.astype(np.float64)
+
+
+def _kind(answer: object) -> str:
+    if isinstance(answer, np.ndarray):
+        return f"an array of {answer.dtype}"
+    return type(answer).__name__

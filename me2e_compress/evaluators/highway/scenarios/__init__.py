@@ -1,0 +1,1 @@
+"""44 scenario types after Bench2Drive's: a layout and an actor script each."""

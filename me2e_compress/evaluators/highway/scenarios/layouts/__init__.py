@@ -1,0 +1,1 @@
+"""Roads: every layout lays the network and sets the ego's route."""

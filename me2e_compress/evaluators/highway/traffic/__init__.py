@@ -1,0 +1,1 @@
+"""Roads, vehicles and signals on highway-env's classes, before any scenario."""

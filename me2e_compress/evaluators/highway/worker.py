@@ -1,0 +1,188 @@
+"""A process that drives routes, and the watchdog that outlives it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import threading
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from multiprocessing.sharedctypes import SynchronizedArray
+from typing import TypeAlias
+
+import psutil
+
+from me2e_compress.errors import EvaluationError, Me2eError
+from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.record import completion_percent, unrecorded
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
+from me2e_compress.evaluators.highway.world import World
+from me2e_compress.metrics.episode import Episode
+
+POLL_S = 0.05
+FRAME_LIMIT_S = 60.0
+
+Pulse: TypeAlias = "SynchronizedArray[float]"
+"""[0] number of the question the policy is thinking about, 0 while it is not asked;
+[1] percent of the route passed."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What every route of an evaluation has in common.
+
+    Args:
+        driver: Who drives.
+        conditions: Under what.
+        frame_limit_s: Seconds that a decision may take before the policy counts as
+            hung.
+    """
+
+    driver: Driver
+    conditions: Conditions
+    frame_limit_s: float = FRAME_LIMIT_S
+
+
+@dataclass(frozen=True)
+class Driven:
+    """An episode and what it cost here.
+
+    Attributes:
+        episode: The record.
+        seconds: Wall-clock seconds.
+        memory_bytes: Resident memory of the process that drove.
+    """
+
+    episode: Episode
+    seconds: float
+    memory_bytes: int
+
+
+@dataclass
+class RouteWorker:
+    """Drives one route at a time in a process of its own, started when needed.
+
+    Args:
+        job: What to drive with.
+    """
+
+    job: Job
+    _process: SpawnProcess | None = field(default=None, init=False)
+    _pulse: Pulse | None = field(default=None, init=False)
+    _line: Connection[Route, Driven | Me2eError] | None = field(
+        default=None, init=False
+    )
+
+    def drive(self, route: Route, stop: threading.Event | None = None) -> Driven | None:
+        """Drive a route; a policy that hangs or takes its process down has failed.
+
+        Args:
+            route: Which.
+            stop: Gives up when set.
+
+        Returns:
+            What was driven, None if it was told to stop.
+
+        Raises:
+            EvaluationError: The process ended for another reason than the policy.
+        """
+        begun = time.perf_counter()
+        process, pulse, line = self._started()
+        line.send(route)
+        asked, since = 0.0, begun
+        while not _ready(line):
+            if stop is not None and stop.is_set():
+                self.close()
+                return None
+            if pulse[0] != asked:
+                asked, since = pulse[0], time.perf_counter()
+            elif asked and time.perf_counter() - since > self.job.frame_limit_s:
+                limit = f"{self.job.frame_limit_s:g} s"
+                return self._lost(route, begun, f"no plan within {limit}")
+        try:
+            answer = line.recv()
+        except (EOFError, ConnectionResetError):
+            process.join()
+            return self._lost(route, begun, self._cause(route, process))
+        if isinstance(answer, Me2eError):
+            raise answer
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+        if self._line is not None:
+            self._line.close()
+        self._process = self._pulse = self._line = None
+
+    def _started(
+        self,
+    ) -> tuple[SpawnProcess, Pulse, Connection[Route, Driven | Me2eError]]:
+        if self._process is None or self._pulse is None or self._line is None:
+            context = multiprocessing.get_context("spawn")
+            pulse = context.Array("d", 2)
+            ours, theirs = context.Pipe()
+            process = context.Process(
+                target=_serve, args=(theirs, pulse, self.job), daemon=True
+            )
+            process.start()
+            theirs.close()
+            self._process, self._pulse, self._line = process, pulse, ours
+        return self._process, self._pulse, self._line
+
+    def _cause(self, route: Route, process: SpawnProcess) -> str:
+        code = process.exitcode
+        if code == -signal.SIGKILL or not self._pulse or not self._pulse[0]:
+            self.close()
+            killed = code == -signal.SIGKILL
+            how = "was killed (out of memory?)" if killed else f"ended with code {code}"
+            raise EvaluationError(f"route {route.id}: its process {how}")
+        return f"the policy ended its process with code {code}"
+
+    def _lost(self, route: Route, begun: float, failure: str) -> Driven:
+        percent = self._pulse[1] if self._pulse else 0.0
+        self.close()
+        episode = unrecorded(route, percent, failure)
+        return Driven(episode, time.perf_counter() - begun, 0)
+
+
+def _ready(line: Connection[Route, Driven | Me2eError]) -> bool:
+    try:
+        return line.poll(POLL_S)
+    except (BrokenPipeError, ConnectionResetError):
+        return True
+
+
+def _serve(line: Connection[Driven | Me2eError, Route], pulse: Pulse, job: Job) -> None:
+    """Drive what comes down the line until the other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    asked = 0
+
+    def asking(world: World) -> None:
+        nonlocal asked
+        asked += 1
+        pulse[1] = completion_percent(world)
+        pulse[0] = float(asked)
+
+    def answered() -> None:
+        pulse[0] = 0.0
+
+    try:
+        policy = job.driver.open()
+        while True:
+            route = line.recv()
+            begun = time.perf_counter()
+            listeners = Listeners(asking, answered)
+            episode = drive(route, policy, job.conditions, listeners)
+            answered()
+            memory = psutil.Process().memory_info().rss
+            line.send(Driven(episode, time.perf_counter() - begun, memory))
+    except Me2eError as error:
+        line.send(error)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return

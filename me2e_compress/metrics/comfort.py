@@ -1,0 +1,101 @@
+"""Driving comfort: the share of seconds a passenger would not mind."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import savgol_filter
+
+from me2e_compress.metrics.episode import FRAME_US, Episode
+from me2e_compress.metrics.measure import Measure
+
+SEGMENT_FRAMES = 20
+WINDOW = 7
+ORDER = 2
+BLOCKED_SPEED_MPS = 0.1
+BLOCKED_US = 60_000_000
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Expert ranges of the six variables, in SI units (the paper's table 1).
+
+    They are the 99th percentiles of human drivers that nuPlan's comfort metric uses.
+    """
+
+    lowest_acceleration_mps2: float = -4.05
+    highest_acceleration_mps2: float = 2.40
+    lateral_acceleration_mps2: float = 4.89
+    yaw_rate_radps: float = 0.95
+    yaw_acceleration_radps2: float = 1.93
+    longitudinal_jerk_mps3: float = 4.13
+    jerk_mps3: float = 8.37
+
+
+BOUNDS = Bounds()
+
+
+def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
+    """Return the share of segments of 20 frames in which every frame is smooth.
+
+    Equation 7 with all six variables in SI units and the frames' own 0.05 s:
+
+    * accelerations and yaw rate are smoothed (Savitzky-Golay, 7 frames, order 2) over
+      the whole route before it is cut;
+    * the yaw acceleration is the filter's derivative of the yaw rate, the longitudinal
+      jerk that of the longitudinal acceleration, and the jerk is the length of the
+      derivative of the acceleration vector in the plane of the road;
+    * the bounds belong to the range;
+    * an incomplete last segment is dropped;
+    * frames of a stop (at most 0.1 m/s for more than 60 s) are smooth whatever the
+      filter makes of them.
+    """
+    if len(episode.frames) < SEGMENT_FRAMES:
+        frames = len(episode.frames)
+        return Measure(None, "ratio", f"{frames} frames, {SEGMENT_FRAMES} are needed")
+    smooth = smooth_frames(episode, bounds)
+    segments = len(smooth) // SEGMENT_FRAMES
+    cut = smooth[: segments * SEGMENT_FRAMES].reshape(segments, SEGMENT_FRAMES)
+    return Measure(float(cut.all(axis=1).mean()), "ratio")
+
+
+def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.bool_]:
+    """Return for each of at least 7 frames whether all six variables are in range."""
+    frames = episode.frames
+    along = np.array([frame.acceleration_mps2 for frame in frames])
+    left = np.array([frame.lateral_acceleration_mps2 for frame in frames])
+    heading = np.array([frame.heading for frame in frames])
+    yaw_rate = np.array([frame.yaw_rate_radps for frame in frames])
+    east = along * np.cos(heading) - left * np.sin(heading)
+    north = along * np.sin(heading) + left * np.cos(heading)
+    acceleration = _filtered(along)
+    return (
+        (acceleration >= bounds.lowest_acceleration_mps2)
+        & (acceleration <= bounds.highest_acceleration_mps2)
+        & (np.abs(_filtered(left)) <= bounds.lateral_acceleration_mps2)
+        & (np.abs(_filtered(yaw_rate)) <= bounds.yaw_rate_radps)
+        & (np.abs(_filtered(yaw_rate, 1)) <= bounds.yaw_acceleration_radps2)
+        & (np.abs(_filtered(along, 1)) <= bounds.longitudinal_jerk_mps3)
+        & (np.hypot(_filtered(east, 1), _filtered(north, 1)) <= bounds.jerk_mps3)
+    ) | _blocked_frames(episode)
+
+
+def _filtered(values: Floats, derivative: int = 0) -> Floats:
+    smoothed: Any = savgol_filter(
+        values, WINDOW, ORDER, deriv=derivative, delta=FRAME_US / 1e6
+    )
+    return np.asarray(smoothed, np.float64)
+
+
+def _blocked_frames(episode: Episode) -> npt.NDArray[np.bool_]:
+    """Mark the frames of every stop of more than 60 s."""
+    still = [frame.speed_mps <= BLOCKED_SPEED_MPS for frame in episode.frames]
+    blocked = np.zeros(len(still), np.bool_)
+    edges = np.flatnonzero(np.diff([False, *still, False]))
+    for start, end in edges.reshape(-1, 2):
+        lasted = episode.frames[end - 1].time_us - episode.frames[start].time_us
+        blocked[start:end] = lasted > BLOCKED_US
+    return blocked

@@ -1,0 +1,33 @@
+"""Driving score: how far the ego came, times what its infractions cost."""
+
+import math
+from dataclasses import dataclass
+
+from me2e_compress.metrics.episode import Episode
+
+DIGITS = 6
+"""The leaderboard rounds each of the three scores to so many digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class RouteScore:
+    """Scores of one route: route and composed in percent, penalty a factor."""
+
+    route: float
+    penalty: float
+    composed: float
+
+
+def route_score(episode: Episode) -> RouteScore:
+    """Return completion, penalty and their product (equation 5, one summand).
+
+    The formula is the leaderboard's (statistics_manager.py of Bench2Drive 0.0.3):
+    every infraction multiplies the completed percentage by its factor.
+    """
+    route = episode.completion_percent
+    penalty = math.prod(infraction.factor for infraction in episode.infractions)
+    return RouteScore(
+        round(route, DIGITS),
+        round(penalty, DIGITS),
+        round(max(route * penalty, 0.0), DIGITS),
+    )

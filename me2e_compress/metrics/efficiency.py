@@ -1,0 +1,66 @@
+"""Driving efficiency: how fast the ego is, measured against the traffic around it."""
+
+from collections.abc import Iterator
+from statistics import fmean
+
+from me2e_compress.metrics.episode import Ending, Episode, Frame
+from me2e_compress.metrics.measure import Measure
+
+CHECKPOINTS = 20
+OUTLIER_PERCENT = 1000.0
+PERCENT = "%"
+
+
+def efficiency(episode: Episode) -> Measure:
+    """Return the mean of ego speed over traffic speed at 20 check points, in percent.
+
+    Equation 6: at each check point, every twentieth of the route, the mean speed of
+    the ego since the last one is divided by that of the vehicles near by. Ratios above
+    1000 % are dropped, and so are check points that saw no moving traffic: nothing was
+    measured there. A route that ends within its first 5 % has no efficiency.
+    """
+    ratios = speed_ratios(episode)
+    if episode.completion_percent < 100.0 / CHECKPOINTS:
+        return Measure(None, PERCENT, "the ego did not pass the first 5 % of the route")
+    kept = [ratio for ratio in ratios if ratio <= OUTLIER_PERCENT]
+    if not kept:
+        return Measure(None, PERCENT, "no check point saw moving traffic")
+    return Measure(fmean(kept), PERCENT)
+
+
+def speed_ratios(episode: Episode) -> tuple[float, ...]:
+    """Return the ratio at each check point that saw moving traffic, in percent.
+
+    Ratios that the simulator reported itself come first: of its last two, which
+    Bench2Drive writes twice, one is kept.
+    """
+    if episode.speed_ratios_percent is not None:
+        given = episode.speed_ratios_percent
+        twice = len(given) > 1 and given[-1] == given[-2]
+        return given[:-1] if twice and episode.completion_percent >= 100.0 else given
+    ratios = (_ratio_percent(stretch) for stretch in _stretches(episode))
+    return tuple(ratio for ratio in ratios if ratio is not None)
+
+
+def _stretches(episode: Episode) -> Iterator[list[Frame]]:
+    """Yield the frames between one check point and the next."""
+    spacing_m = episode.route_length_m / CHECKPOINTS
+    passed, stretch = 0, list[Frame]()
+    for frame in episode.frames:
+        stretch.append(frame)
+        reached = int(frame.route_m / spacing_m)
+        if reached > passed:
+            yield stretch
+            passed, stretch = reached, []
+    if episode.ending is Ending.COMPLETED and passed < CHECKPOINTS and stretch:
+        yield stretch
+
+
+def _ratio_percent(stretch: list[Frame]) -> float | None:
+    seen = [
+        (frame.speed_mps, frame.traffic_speed_mps)
+        for frame in stretch
+        if frame.traffic_speed_mps is not None
+    ]
+    traffic = sum(traffic for _, traffic in seen)
+    return 100.0 * sum(ego for ego, _ in seen) / traffic if traffic > 0.0 else None

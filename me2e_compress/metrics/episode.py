@@ -1,0 +1,158 @@
+"""What a drive leaves behind."""
+
+import dataclasses
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from pydantic import ConfigDict, TypeAdapter, with_config
+
+from me2e_compress.metrics.infraction import COLLISIONS, Infraction, InfractionKind
+
+FRAME_US = 50_000
+"""Microseconds between two frames: the simulators of the benchmarks run at 20 Hz."""
+
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+
+class Ending(StrEnum):
+    """Why a route was over."""
+
+    COMPLETED = "completed"
+    COLLISION = "collision"
+    DEVIATION = "deviated from the route"
+    BLOCKED = "blocked"
+    TIMEOUT = "timed out"
+    POLICY_FAILED = "policy failed"
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The ego at one instant, every 50 ms.
+
+    Attributes:
+        time_us: Simulated microseconds since the route began.
+        x: Metres east.
+        y: Metres north.
+        heading: Radians, counter-clockwise from east.
+        speed_mps: Metres per second.
+        acceleration_mps2: Along the ego's heading.
+        lateral_acceleration_mps2: To the ego's left.
+        yaw_rate_radps: Radians per second, counter-clockwise.
+        steering_rad: Angle of the front wheels, left positive.
+        route_m: Metres of the route passed; never decreases.
+        traffic_speed_mps: Mean speed of the vehicles near by, None if there are none.
+        acceleration_norm_mps2: Length of the acceleration vector in the plane where a
+            simulator recorded it apart; None if it follows from the two components.
+    """
+
+    time_us: int
+    x: float
+    y: float
+    heading: float
+    speed_mps: float
+    acceleration_mps2: float
+    lateral_acceleration_mps2: float
+    yaw_rate_radps: float
+    steering_rad: float
+    route_m: float
+    traffic_speed_mps: float | None
+    acceleration_norm_mps2: float | None = None
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One inference: when its observation was taken and how long it took."""
+
+    time_us: int
+    latency_us: int
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One route driven to its end.
+
+    Attributes:
+        route: Identity of the route.
+        scenario: Type of the scenario on it.
+        abilities: The abilities it tests, one or two of Bench2Drive's five.
+        route_length_m: Metres.
+        completion_percent: How much of the route was passed, 0 to 100.
+        ending: Why it was over.
+        failure: What the policy did wrong, if that ended the route.
+        infractions: In order of time.
+        frames: Every 50 ms.
+        decisions: Every inference.
+        junction_m: Metres to the first junction, None if the route has none.
+        speed_ratios_percent: Ego speed over traffic speed at the check points where a
+            simulator reported them itself; None if they follow from the frames.
+    """
+
+    route: str
+    scenario: str
+    abilities: tuple[str, ...]
+    route_length_m: float
+    completion_percent: float
+    ending: Ending
+    failure: str | None
+    infractions: tuple[Infraction, ...]
+    frames: tuple[Frame, ...]
+    decisions: tuple[Decision, ...]
+    junction_m: float | None = None
+    speed_ratios_percent: tuple[float, ...] | None = None
+
+    @property
+    def collided(self) -> bool:
+        """Whether the ego hit anything."""
+        return any(infraction.kind in COLLISIONS for infraction in self.infractions)
+
+    @property
+    def succeeded(self) -> bool:
+        """The whole route without an infraction (a low speed is none)."""
+        return self.completion_percent >= 100.0 and all(
+            infraction.kind is InfractionKind.MIN_SPEED
+            for infraction in self.infractions
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain objects; frames and decisions are stored column by column."""
+        record: dict[str, Any] = _EPISODE.dump_python(
+            dataclasses.replace(self, frames=(), decisions=()), mode="json"
+        )
+        record["frames"] = _columns(Frame, self.frames)
+        record["decisions"] = _columns(Decision, self.decisions)
+        return record
+
+    @classmethod
+    def from_json(cls, record: dict[str, Any]) -> "Episode":
+        """Return the episode that `to_json` was called on.
+
+        Raises:
+            ValueError: If anything is missing, unknown, of another type or not finite.
+        """
+        rows = {
+            name: _rows(name, record.get(name, {})) for name in ("frames", "decisions")
+        }
+        return _EPISODE.validate_python({**record, **rows})
+
+
+_EPISODE = TypeAdapter(Episode)
+
+
+def _columns(kind: type, rows: tuple[Any, ...]) -> dict[str, list[Any]]:
+    names = [field.name for field in dataclasses.fields(kind)]
+    return {name: [getattr(row, name) for row in rows] for name in names}
+
+
+def _rows(name: str, columns: object) -> tuple[dict[str, Any], ...]:
+    if not isinstance(columns, dict) or not all(
+        isinstance(column, list) for column in columns.values()
+    ):
+        raise ValueError(f"{name} are not stored as columns")
+    if len({len(column) for column in columns.values()}) > 1:
+        raise ValueError(f"the columns of {name} differ in length")
+    rows = zip(*columns.values(), strict=True)
+    return tuple(dict(zip(columns, row, strict=True)) for row in rows)

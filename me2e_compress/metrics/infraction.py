@@ -1,0 +1,86 @@
+"""What a driver can do wrong, in the words of the CARLA leaderboard."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+
+from pydantic import ConfigDict, with_config
+
+
+class InfractionKind(StrEnum):
+    """The keys of `infractions` in a leaderboard record, and one of our own."""
+
+    COLLISION_PEDESTRIAN = "collisions_pedestrian"
+    COLLISION_VEHICLE = "collisions_vehicle"
+    COLLISION_LAYOUT = "collisions_layout"
+    RED_LIGHT = "red_light"
+    STOP = "stop_infraction"
+    GIVE_WAY = "give_way_infraction"
+    """Crossing a give-way line close before priority traffic: CARLA has no such rule;
+    it costs as much as a stop sign that was run."""
+    OUTSIDE_ROUTE_LANES = "outside_route_lanes"
+    MIN_SPEED = "min_speed_infractions"
+    YIELD_TO_EMERGENCY_VEHICLE = "yield_emergency_vehicle_infractions"
+    SCENARIO_TIMEOUT = "scenario_timeouts"
+    ROUTE_DEVIATION = "route_dev"
+    VEHICLE_BLOCKED = "vehicle_blocked"
+    ROUTE_TIMEOUT = "route_timeout"
+
+
+COLLISIONS = (
+    InfractionKind.COLLISION_PEDESTRIAN,
+    InfractionKind.COLLISION_VEHICLE,
+    InfractionKind.COLLISION_LAYOUT,
+)
+
+PENALTY = MappingProxyType(
+    {
+        InfractionKind.COLLISION_PEDESTRIAN: 0.5,
+        InfractionKind.COLLISION_VEHICLE: 0.6,
+        InfractionKind.COLLISION_LAYOUT: 0.65,
+        InfractionKind.RED_LIGHT: 0.7,
+        InfractionKind.STOP: 0.8,
+        InfractionKind.GIVE_WAY: 0.8,
+        InfractionKind.SCENARIO_TIMEOUT: 0.7,
+        InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: 0.7,
+        InfractionKind.MIN_SPEED: 1.0,
+        InfractionKind.ROUTE_DEVIATION: 1.0,
+        InfractionKind.VEHICLE_BLOCKED: 1.0,
+        InfractionKind.ROUTE_TIMEOUT: 1.0,
+    }
+)
+"""Factor per event: Bench2Drive 0.0.3, leaderboard/utils/statistics_manager.py.
+
+Leaving the lanes has no fixed factor: it costs the share of the way driven outside.
+GIVE_WAY is ours.
+"""
+
+
+@with_config(ConfigDict(allow_inf_nan=False, extra="forbid"))
+@dataclass(frozen=True, slots=True)
+class Infraction:
+    """One thing that went wrong.
+
+    Attributes:
+        kind: Which rule was broken.
+        time_us: When, in simulated microseconds since the route began.
+        x: Where the ego was, metres east.
+        y: Metres north.
+        detail: With whom or against what, in a few words.
+        percent: Share of the driven way spent outside the lanes, 0 to 100; only
+            OUTSIDE_ROUTE_LANES has one.
+    """
+
+    kind: InfractionKind
+    time_us: int
+    x: float
+    y: float
+    detail: str
+    percent: float | None = None
+
+    @property
+    def factor(self) -> float:
+        """What the driving score is multiplied by."""
+        if self.kind is InfractionKind.OUTSIDE_ROUTE_LANES:
+            return 1.0 - (self.percent or 0.0) / 100.0
+        return PENALTY[self.kind]

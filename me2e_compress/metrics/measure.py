@@ -1,0 +1,56 @@
+"""A number that travels with its unit, or the reason why there is none."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A value and its unit; None means it could not be measured, never zero.
+
+    Raises:
+        ValueError: If there is neither a finite value nor a reason, or both.
+    """
+
+    value: float | None
+    unit: str
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if self.value is not None and not math.isfinite(self.value):
+            raise ValueError(f"a measure must be finite, found {self.value}")
+        if (self.value is None) != bool(self.reason):
+            raise ValueError("a measure has either a value or a reason for having none")
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A mean over routes with its confidence interval.
+
+    Attributes:
+        measure: The mean, or None with the reason.
+        low: Lower end of the 95 % interval; None where n is too small for one.
+        high: Upper end of it.
+        n: How many routes the mean was taken over.
+    """
+
+    measure: Measure
+    low: float | None
+    high: float | None
+    n: int
+
+    @property
+    def value(self) -> float | None:
+        """The mean itself."""
+        return self.measure.value
+
+    def to_json(self) -> dict[str, float | int | str | None]:
+        """Return a flat object: value, low, high, n, unit, reason (null if none)."""
+        return {
+            "value": self.measure.value,
+            "low": self.low,
+            "high": self.high,
+            "n": self.n,
+            "unit": self.measure.unit,
+            "reason": self.measure.reason or None,
+        }

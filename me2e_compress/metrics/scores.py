@@ -1,0 +1,154 @@
+"""All scores of a set of driven routes."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.metrics import bench2drive, comfort, efficiency
+from me2e_compress.metrics.abilities import ABILITIES, successes
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.intervals import (
+    binomial_interval,
+    bootstrap_interval,
+    resampled_interval,
+)
+from me2e_compress.metrics.measure import Estimate, Measure
+
+FULL_SET = 220
+"""Routes of a whole benchmark: 44 scenario types with 5 variants each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Means over the routes that were driven, each with its interval.
+
+    Attributes:
+        driving_score: Percent (equation 5).
+        success_rate: Percent of routes completed without an infraction.
+        efficiency: Percent (equation 6).
+        comfort: Share of smooth segments (equation 7), SI units.
+        abilities: Mean of the five success rates, percent.
+        each_ability: Success rate of each of the five, percent.
+        bench2drive_efficiency: The same name, Bench2Drive's own arithmetic.
+        bench2drive_smoothness: Its smoothness, which it also calls comfort.
+        routes: How many routes were driven.
+        expected: How many the whole set has; fewer driven means a partial result.
+    """
+
+    driving_score: Estimate
+    success_rate: Estimate
+    efficiency: Estimate
+    comfort: Estimate
+    abilities: Estimate
+    each_ability: dict[str, Estimate]
+    bench2drive_efficiency: Estimate
+    bench2drive_smoothness: Estimate
+    routes: int
+    expected: int
+
+    @property
+    def partial(self) -> bool:
+        """Whether routes are missing; the means leave them out, they are no zeros."""
+        return self.routes < self.expected
+
+    def to_json(self) -> dict[str, Any]:
+        """Return one object a score, and how many routes they were taken over."""
+        abilities = {name: each.to_json() for name, each in self.each_ability.items()}
+        return {
+            "driving_score": self.driving_score.to_json(),
+            "success_rate": self.success_rate.to_json(),
+            "efficiency": self.efficiency.to_json(),
+            "comfort": self.comfort.to_json(),
+            "abilities": {**self.abilities.to_json(), "each": abilities},
+            "bench2drive": {
+                "efficiency": self.bench2drive_efficiency.to_json(),
+                "smoothness": self.bench2drive_smoothness.to_json(),
+            },
+            "routes": {
+                "driven": self.routes,
+                "expected": self.expected,
+                "partial": self.partial,
+            },
+        }
+
+
+def score(
+    episodes: Sequence[Episode], expected: int = FULL_SET, seed: int = 0
+) -> Scores:
+    """Score a set of routes.
+
+    Args:
+        episodes: One a route, in any order: it decides nothing but the bootstrap.
+        expected: How many routes the whole set has.
+        seed: Of the bootstrap.
+    """
+    driving = [route_score(episode).composed for episode in episodes]
+    return Scores(
+        driving_score=_mean([Measure(value, "%") for value in driving], "%", seed),
+        success_rate=_rate([episode.succeeded for episode in episodes]),
+        efficiency=_over(episodes, efficiency.efficiency, "%", seed),
+        comfort=_over(episodes, comfort.comfort, "ratio", seed),
+        abilities=_abilities(episodes, seed),
+        each_ability={
+            name: _rate(mastered) for name, mastered in successes(episodes).items()
+        },
+        bench2drive_efficiency=_over(episodes, bench2drive.efficiency, "%", seed),
+        bench2drive_smoothness=_over(episodes, bench2drive.smoothness, "ratio", seed),
+        routes=len(episodes),
+        expected=expected,
+    )
+
+
+def _over(
+    episodes: Sequence[Episode],
+    metric: Callable[[Episode], Measure],
+    unit: str,
+    seed: int,
+) -> Estimate:
+    return _mean([metric(episode) for episode in episodes], unit, seed)
+
+
+def _mean(measures: Sequence[Measure], unit: str, seed: int) -> Estimate:
+    values = [measure.value for measure in measures if measure.value is not None]
+    if not values:
+        reason = measures[0].reason if measures else "no route was driven"
+        return Estimate(Measure(None, unit, reason), None, None, 0)
+    low, high = bootstrap_interval(values, seed)
+    return Estimate(Measure(fmean(values), unit), low, high, len(values))
+
+
+def _rate(outcomes: Sequence[bool]) -> Estimate:
+    n, good = len(outcomes), sum(outcomes)
+    if n == 0:
+        return Estimate(Measure(None, "%", "no such route was driven"), None, None, 0)
+    low, high = binomial_interval(good, n)
+    bounds = [None if bound is None else 100.0 * bound for bound in (low, high)]
+    return Estimate(Measure(100.0 * good / n, "%"), bounds[0], bounds[1], n)
+
+
+def _abilities(episodes: Sequence[Episode], seed: int) -> Estimate:
+    """Mean of the abilities' success rates; all five must have been driven."""
+    outcomes = successes(episodes)
+    missing = [name for name in ABILITIES if not outcomes[name]]
+    if missing:
+        reason = f"no route for {', '.join(missing)} was driven"
+        return Estimate(Measure(None, "%", reason), None, None, 0)
+    tests = np.array([[a in e.abilities for a in ABILITIES] for e in episodes])
+    good = np.zeros(tests.shape)
+    for column, name in enumerate(ABILITIES):
+        good[tests[:, column], column] = outcomes[name]
+
+    def mean_rate(picked: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+        n = tests[picked].sum(axis=1)
+        rates = np.full(n.shape, np.nan)
+        np.divide(good[picked].sum(axis=1), n, out=rates, where=n > 0)
+        return np.asarray(100.0 * np.nanmean(rates, axis=1))
+
+    low, high = resampled_interval(mean_rate, len(episodes), seed)
+    value = fmean(100.0 * sum(each) / len(each) for each in outcomes.values())
+    return Estimate(Measure(value, "%"), low, high, len(episodes))

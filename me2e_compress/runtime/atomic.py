@@ -1,0 +1,32 @@
+"""Files that are either whole or not there."""
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file all or nothing: a draft in the same folder takes its place.
+
+    Raises:
+        OSError: The folder is missing, not writable or full; nothing is left behind.
+    """
+    handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(draft).chmod(0o644)
+        os.replace(draft, path)
+    except BaseException:
+        Path(draft).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: Path, record: dict[str, Any], indent: int | None = None) -> None:
+    """Write a JSON file all or nothing; the same record gives the same bytes."""
+    text = json.dumps(record, indent=indent, allow_nan=False, ensure_ascii=False)
+    write_bytes(path, f"{text}\n".encode())

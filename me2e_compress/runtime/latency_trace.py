@@ -1,0 +1,87 @@
+"""Latencies of a model as they were measured on one machine."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.atomic import write_json
+
+PERCENTILES = (50, 90, 99)
+
+
+@dataclass(frozen=True)
+class LatencyTrace:
+    """Latencies in the order in which they were measured.
+
+    Attributes:
+        model_sha256: Of the model that ran.
+        machine: Processor and number of threads, in words.
+        samples_us: Microseconds, one an inference, without the warm-up.
+    """
+
+    model_sha256: str
+    machine: str
+    samples_us: tuple[int, ...]
+
+    def percentile_us(self, percent: float) -> int:
+        """Return the smallest sample that so many percent do not exceed."""
+        return int(np.percentile(self.samples_us, percent, method="inverted_cdf"))
+
+    @property
+    def max_us(self) -> int:
+        """The slowest sample."""
+        return max(self.samples_us)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return p50, p90, p99 and max beside the samples."""
+        return {
+            "model_sha256": self.model_sha256,
+            "machine": self.machine,
+            **{f"p{p}_us": self.percentile_us(p) for p in PERCENTILES},
+            "max_us": self.max_us,
+            "samples_us": list(self.samples_us),
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the trace atomically.
+
+        Raises:
+            EvaluationError: The file cannot be written.
+        """
+        try:
+            write_json(path, self.to_json())
+        except OSError as error:
+            raise EvaluationError(
+                f"{path}: cannot be written: {error.strerror}"
+            ) from error
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a trace; its percentiles are not trusted but computed again.
+
+        Raises:
+            EvaluationError: No such file, or not a trace with at least one sample.
+        """
+        try:
+            record = _Record.model_validate_json(path.read_bytes())
+        except OSError as error:
+            raise EvaluationError(f"{path}: {error.strerror}") from error
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"])) or "the file"
+            raise EvaluationError(
+                f"{path}: not a latency trace: {where}: {first['msg']}"
+            ) from error
+        return cls(record.model_sha256, record.machine, tuple(record.samples_us))
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    model_sha256: str
+    machine: str
+    samples_us: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]

@@ -1,0 +1,89 @@
+"""How long a model takes on this machine, alone and warm."""
+
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain, islice, repeat
+from pathlib import Path
+
+from me2e_compress import graph
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.frames import Array, Frames
+from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.session import Session, replay
+
+WARM_UP = 10
+
+
+def profile(
+    model: Path,
+    frames: Frames,
+    *,
+    samples: int | None = None,
+    warm_up: int = WARM_UP,
+    threads: int = 1,
+    on_sample: Callable[[int, int], None] = lambda done, total: None,
+) -> LatencyTrace:
+    """Run a model over frames one at a time and write down every latency.
+
+    Recurrent state is fed forward and reset where scenes begin; reading a frame is
+    not counted. The recording is repeated as often as it takes.
+
+    Args:
+        model: ONNX file.
+        frames: What it sees.
+        samples: How many latencies; None for one a frame.
+        warm_up: Inferences before the first that counts.
+        threads: Of onnxruntime; the closed loop uses one.
+        on_sample: Called with samples done and to do.
+
+    Raises:
+        EvaluationError: There is nothing to measure.
+        GraphError: The model cannot be run.
+        FramesError: A frame does not fit.
+    """
+    wanted = len(frames) if samples is None else samples
+    if wanted < 1 or warm_up < 0 or not len(frames):
+        raise EvaluationError(
+            f"{wanted} samples after {warm_up} of warm-up on {len(frames)} frames: "
+            "at least one sample and one frame are needed"
+        )
+    session = TimedSession(model, threads=threads)
+    endless = chain.from_iterable(repeat(frames))
+    for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
+        on_sample(max(0, done - warm_up), wanted)
+    machine = f"{processor()}, onnxruntime on {threads or 'all'} threads"
+    taken = tuple(session.taken_us[warm_up:])
+    return LatencyTrace(graph.sha256_of(model), machine, taken)
+
+
+class TimedSession(Session):
+    """A session that writes down how long each run took.
+
+    Attributes:
+        taken_us: Microseconds, one a run.
+    """
+
+    def __init__(self, model: Path, *, threads: int) -> None:
+        super().__init__(model, threads=threads)
+        self.taken_us = list[int]()
+
+    def run(
+        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
+    ) -> dict[str, Array]:
+        """Run once, by the clock."""
+        begun = time.perf_counter_ns()
+        values = super().run(feeds, outputs)
+        self.taken_us.append((time.perf_counter_ns() - begun) // 1_000)
+        return values
+
+
+def processor() -> str:
+    """Name the processor of this machine as the system knows it."""
+    table = Path("/proc/cpuinfo")
+    if table.is_file():
+        for line in table.read_text("utf-8").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()

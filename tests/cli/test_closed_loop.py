@@ -1,0 +1,125 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from me2e_compress.cli.evaluate import evaluate
+from me2e_compress.cli.profile import profile
+from me2e_compress.cli.score import score
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.routes import save_routes
+from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
+
+Run = Callable[..., str]
+
+
+@pytest.fixture
+def run() -> Run:
+    app = typer.Typer()
+    for command in (evaluate, score, profile):
+        app.command()(command)
+
+    def invoke(*words: str | Path) -> str:
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        if result.exception is not None:
+            raise result.exception
+        return result.stdout
+
+    return invoke
+
+
+@pytest.fixture
+def manifest(tmp_path: Path) -> Path:
+    save_routes((CROSSING, PARKED), tmp_path / "routes.json")
+    return tmp_path / "routes.json"
+
+
+def test_evaluate_and_score_say_the_same(
+    run: Run, manifest: Path, tmp_path: Path
+) -> None:
+    results = tmp_path / "results"
+    driven = json.loads(
+        run("evaluate", "blind", "--routes", manifest, "-o", results, "--json")
+    )
+    scored = json.loads(run("score", results, "--json"))
+
+    assert scored == {"results": str(results), **driven}
+    assert scored["success_rate"]["value"] == 0.0
+    assert scored["routes"] == {"driven": 2, "expected": 2, "partial": False}
+    assert set(scored["driving_score"]) >= {"value", "low", "high", "n"}
+
+
+def test_score_says_partial(run: Run, manifest: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    run("evaluate", "blind", "--routes", manifest, "-o", results)
+    (results / "routes" / "parked.json").unlink()
+
+    shown = " ".join(run("score", results).split())
+    assert "1 of 2 routes, PARTIAL" in shown
+
+
+def test_a_route_is_drawn(run: Run, manifest: Path, tmp_path: Path) -> None:
+    results, model = tmp_path / "results", straight_on(tmp_path / "m.onnx")
+    run(
+        *("evaluate", model, "--routes", manifest, "-o", results),
+        *("--render", "crossing", "--weather", "fog_m=60,dropped=BACK+FRONT_LEFT"),
+    )
+
+    assert (results / "crossing.gif").read_bytes().startswith(b"GIF89a")
+    assert (results / "crossing.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--render", "nowhere"), "no route 'nowhere'"),
+        (("--engine", "cloud"), "engine 'cloud'"),
+        (("--engine", "local", "--address", "a:1"), "engine 'local' with address a:1"),
+        (("--weather", "snow=1"), "weather option 'snow'"),
+        (("--weather", "night=dark"), "weather option night"),
+        (("--latency", "fast"), "latency 'fast'"),
+        (("--dt-ms", "30"), "a step of 30 ms"),
+    ],
+)
+def test_wrong_words_are_one_line_and_leave_nothing(
+    run: Run, manifest: Path, tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    results = tmp_path / "results"
+
+    with pytest.raises(EvaluationError, match=message) as caught:
+        run("evaluate", "blind", "--routes", manifest, "-o", results, *words)
+    assert "\n" not in str(caught.value)
+    assert not results.exists()
+
+
+def test_score_of_another_folder(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="no folder of results"):
+        run("score", tmp_path)
+
+
+def test_a_profile_is_a_latency_trace(run: Run, manifest: Path, tmp_path: Path) -> None:
+    model = tmp_path / "m.onnx"
+    text = """<ir_version: 8, opset_import: ["" : 17]>
+    double (float[3] x) => (float[3] y) { y = Add (x, x) }"""
+    onnx.save(onnx.parser.parse_model(text), model)
+    frames, trace = tmp_path / "frames", tmp_path / "trace.json"
+    frames.mkdir()
+    for index in range(4):
+        np.savez(frames / f"{index}.npz", x=np.zeros(3, np.float32))
+    (frames / "scenes.json").write_text('{"scenes": [0]}')
+
+    shown = json.loads(run("profile", model, frames, "-o", trace, "--json"))
+
+    assert shown == json.loads(trace.read_text())
+    assert len(shown["samples_us"]) == 4
+    assert shown["p50_us"] <= shown["p90_us"] <= shown["p99_us"] <= shown["max_us"]
+    latency = f"trace:{trace}"
+    run(
+        *("evaluate", "blind", "--routes", manifest, "-o", tmp_path / "r"),
+        *("--latency", latency, "--in-order", "--latency-scale", "1000"),
+    )

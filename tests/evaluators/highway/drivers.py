@@ -1,0 +1,89 @@
+"""Drivers that misbehave, and routes that are short."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+
+from me2e_compress.evaluators.base import Observation, Policy
+from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.routes import Route
+
+CROSSING = Route("crossing", "DynamicObjectCrossing", "Emergency_Brake", 1)
+PARKED = Route("parked", "ParkedObstacle", "Overtaking", 1)
+GREEN = Route("green", "VanillaSignalizedTurnEncounterGreenLight", "Traffic_Signs", 1)
+EXIT = Route("exit", "HighwayExit", "Merging", 1)
+ROUTES = (CROSSING, PARKED, GREEN, EXIT)
+
+
+@dataclass
+class Misbehaving:
+    """Drives blindly, and at its 20th decision does what it is called."""
+
+    way: str
+    needs_images: bool = False
+    privileged: bool = True
+
+    def reset(self, route: Route) -> None:
+        self.asked, self.blind = 0, Blind()
+        self.blind.reset(route)
+        if self.way == "no-reset":
+            raise RuntimeError("will not start")
+
+    def plan(self, observation: Observation) -> npt.NDArray[np.floating]:
+        self.asked += 1
+        plan = self.blind.plan(observation)
+        return plan if self.asked < 20 else self.misbehave(plan)
+
+    def misbehave(self, plan: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        if self.way == "raise":
+            raise KeyError("lost\nmy way")
+        if self.way == "hang":
+            time.sleep(3600)
+        if self.way == "die":
+            os._exit(7)
+        if self.way == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.way == "not-finite":
+            return np.where(np.arange(12).reshape(6, 2) == 5, np.nan, plan)
+        return {"shape": plan[:5], "integers": plan.astype(int), "list": [1, 2]}[
+            self.way
+        ]  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class MisbehavingDriver(Driver):
+    """Opens the above in any process."""
+
+    def open(self) -> Policy:
+        return Misbehaving(self.name)
+
+    def fingerprint(self) -> str:
+        return self.name
+
+
+def straight_on(
+    path: Path,
+    *,
+    inputs: str = "int64[1] command",
+    body: str = "plan = Identity (ahead)",
+    outputs: str = "float[1, 6, 2] plan",
+    initializers: str = "",
+    metadata: dict[str, str] | None = None,
+) -> Path:
+    """Write a model; its default plan goes 4 m/s straight ahead."""
+    ahead = ", ".join(f"{2.0 * k}, 0.0" for k in range(1, 7))
+    text = f"""<ir_version: 8, opset_import: ["" : 17]>
+    driver ({inputs}) => ({outputs})
+    <float[1, 6, 2] ahead = {{{ahead}}} {initializers}> {{ {body} }}"""
+    model = onnx.parser.parse_model(text)
+    for key, value in (metadata or {}).items():
+        model.metadata_props.add(key=key, value=value)
+    onnx.save(model, path)
+    return path

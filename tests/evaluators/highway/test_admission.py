@@ -1,0 +1,97 @@
+from dataclasses import replace
+
+import pytest
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.admission import Verdict, examine
+from me2e_compress.evaluators.highway.generate import (
+    Harvest,
+    generate,
+    harvest,
+    propose,
+    seed_of,
+)
+from me2e_compress.evaluators.highway.rehearsal import Rehearsal
+from me2e_compress.evaluators.highway.routes import load_routes, pick_routes
+from me2e_compress.evaluators.highway.world import World
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import InfractionKind
+from tests.evaluators.highway.world.driving import route_of
+
+SAMPLE = pick_routes(load_routes(), "11")
+HIT = (InfractionKind.COLLISION_VEHICLE,)
+SOLVED = Rehearsal((), Ending.COMPLETED, True, False, 20.0)
+FAILED = Rehearsal(HIT, Ending.COLLISION, True, False, 9.0)
+LATE = Rehearsal((), Ending.BLOCKED, True, False, 75.0)
+BROKEN = Rehearsal((), Ending.POLICY_FAILED, True, False, 1.0, "ValueError: no")
+
+
+@pytest.mark.parametrize("route", SAMPLE, ids=lambda route: route.id)
+def test_what_ships_is_admitted(route: object) -> None:
+    verdict = examine(next(one for one in SAMPLE if one is route))
+
+    assert verdict.refusal is None
+    assert len(verdict.blind) == 3
+
+
+@pytest.mark.parametrize(
+    ("expert", "blind", "words"),
+    [
+        (None, (SOLVED,), "no infraction at 4 m/s"),
+        (None, (FAILED, FAILED, LATE), "no infraction at 12 m/s"),
+        (FAILED, (FAILED,) * 3, "the expert commits: collisions_vehicle"),
+        (LATE, (FAILED,) * 3, "ends after 75 s: blocked"),
+        (BROKEN, (FAILED,) * 3, "ends after 1 s: ValueError: no"),
+        (replace(SOLVED, triggered=False), (FAILED,) * 3, "never happened"),
+        (replace(SOLVED, actors_crashed=True), (FAILED,) * 3, "two actors collide"),
+    ],
+)
+def test_why_a_route_is_refused(
+    expert: Rehearsal | None, blind: tuple[Rehearsal, ...], words: str
+) -> None:
+    verdict = Verdict(route_of(), expert, blind)
+
+    assert not verdict.admitted
+    assert words in str(verdict.refusal)
+
+
+def test_an_empty_street_is_refused_at_once() -> None:
+    route = route_of("VehicleOpensDoorTwoWays", 1, door_m=1000.0)
+
+    verdict = examine(route)
+
+    assert verdict.expert is None
+    assert len(verdict.blind) == 1
+    assert "no infraction at 4 m/s" in str(verdict.refusal)
+
+
+def test_a_proposal_writes_out_every_parameter() -> None:
+    route = propose("EnterActorFlow", 5, "mine")
+
+    assert route.parameters == World(route).parameters
+    assert route.parameters == World(replace(route, seed=99)).parameters
+
+
+def test_a_proposal_of_an_unknown_type() -> None:
+    with pytest.raises(EvaluationError, match="no scenario 'Flying'; there are"):
+        propose("Flying", 0, "mine")
+
+
+def test_a_harvest_is_the_same_each_time_and_for_any_workers() -> None:
+    names = ("ConstructionObstacle", "VanillaNonSignalizedTurnEncounterStopsign")
+    once = [harvest(name, 3, 1) for name in names]
+
+    assert list(generate(3, names, 1, workers=2)) == once
+    assert once[0].routes[0].id == "ConstructionObstacle_0"
+    assert once[0].tried == 1 + len(once[0].refusals)
+
+
+def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
+    seeds = {seed_of(0, name, k) for name in ("Accident", "T_Junction") for k in (0, 1)}
+
+    assert len(seeds) == 4
+    assert seed_of(1, "Accident", 0) not in seeds
+
+
+def test_a_harvest_counts_what_it_refused() -> None:
+    assert Harvest("Accident", (route_of(),), ("no", "no")).tried == 3

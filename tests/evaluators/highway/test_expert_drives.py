@@ -1,0 +1,94 @@
+"""The expert, through the controller, on the real world."""
+
+import numpy as np
+import pytest
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.base import CAN_BUS_SIZE, Observation
+from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
+from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.expert import Expert, Memory, ceiling, decide
+from me2e_compress.evaluators.highway.rehearsal import rehearse
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.scene import Control
+from me2e_compress.evaluators.highway.world import INFRACTIONS
+from me2e_compress.evaluators.highway.world.world import World
+from me2e_compress.evaluators.realtime import HeldControl
+
+SEED = 77_001
+
+
+def route(scenario: str, seed: int = SEED) -> Route:
+    return Route(f"{scenario}-{seed}", scenario, SCENARIO_ABILITIES[scenario][0], seed)
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        "AccidentTwoWays",
+        "EnterActorFlow",
+        "PedestrianCrossing",
+        "SequentialLaneChange",
+        "VanillaNonSignalizedTurnEncounterStopsign",
+        "VanillaSignalizedTurnEncounterRedLight",
+        "YieldToEmergencyVehicle",
+    ],
+)
+def test_it_solves_a_fresh_route_of(scenario: str) -> None:
+    drive = rehearse(route(scenario), Expert())
+    assert drive.solved, drive
+
+
+def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
+    """The plan of a moment is driven: within 0.5 m after a second on a ring."""
+    world, controller, memory = World(route("EnterActorFlow")), Controller(), Memory()
+    top, misses = ceiling(world.path), list[float]()
+    planned: list[tuple[float, float]] = []
+    while not world.done and world.time_us < 40_000_000:
+        scene = world.scene()
+        decision = decide(scene, world.privileged(), world.path, top, memory)
+        memory = decision.memory
+        plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
+        cos, sin = np.cos(scene.ego.heading), np.sin(scene.ego.heading)
+        forward, left = decision.waypoints[1]
+        planned.append(
+            (
+                scene.ego.x + cos * forward - sin * left,
+                scene.ego.y + sin * forward + cos * left,
+            )
+        )
+        world.step(controller.control(plan, scene.ego, scene.time_us))
+        if len(planned) > 20:
+            x, y = planned[-21]
+            misses.append(float(np.hypot(scene.ego.x - x, scene.ego.y - y)))
+    assert np.median(misses) < 0.3
+    assert np.quantile(misses, 0.9) < 1.0
+
+
+def test_a_decision_that_takes_long_drives_worse() -> None:
+    """Nobody drives a ring whose every control is 0.85 s old."""
+    held, controller = HeldControl(Control(0.0, 0.0)), Controller()
+    world, memory = World(route("EnterActorFlow")), Memory()
+    top = ceiling(world.path)
+    while not world.done and world.time_us < 40_000_000:
+        if held.decision_is_due:
+            scene = world.scene()
+            decision = decide(scene, world.privileged(), world.path, top, memory)
+            memory = decision.memory
+            plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
+            control = controller.control(plan, scene.ego, scene.time_us)
+            held.decide(control, 850_000)
+        world.step(held.advance())
+    wrong = [event.kind for event in world.events if event.kind in INFRACTIONS]
+    assert wrong or not world.done
+
+
+def test_without_a_world_it_says_what_is_missing() -> None:
+    nothing = Observation(
+        *(0, None, np.zeros((6, 4, 4), np.float32)),
+        can_bus=np.zeros(CAN_BUS_SIZE, np.float32),
+        command=3,
+        speed_mps=0.0,
+    )
+    with pytest.raises(EvaluationError, match="expert: the observation has no world"):
+        Expert().plan(nothing)

@@ -1,0 +1,270 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.base import Observation
+from me2e_compress.evaluators.highway.adapter import (
+    Adapter,
+    Axes,
+    ImageNormalization,
+)
+from me2e_compress.evaluators.highway.cameras import CameraRig
+from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
+from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+from me2e_compress.evaluators.highway.runner import Conditions, drive
+from me2e_compress.metrics.episode import Ending
+from tests.evaluators.highway.drivers import EXIT, PARKED, straight_on
+
+NORM = {"input": "img", "mean": [10, 20, 30], "std": [2, 4, 5], "order": "bgr"}
+IMAGE = {"me2e.image": json.dumps(NORM)}
+RIG = CameraRig(16, 24)
+
+
+def observation(seed: int = 0, command: int = 2) -> Observation:
+    rng = np.random.default_rng(seed)
+    return Observation(
+        0,
+        rng.integers(0, 256, (6, 16, 24, 3)).astype(np.uint8),
+        RIG.lidar2img,
+        rng.normal(size=18).astype(np.float32),
+        command,
+        3.0,
+    )
+
+
+def test_a_model_drives(tmp_path: Path) -> None:
+    policy = OnnxPolicy.open(straight_on(tmp_path / "m.onnx"))
+
+    episode = drive(PARKED, policy, Conditions())
+
+    assert not policy.needs_images
+    assert episode.failure is None
+    assert len(episode.decisions) == len(episode.frames) - 1
+    assert episode.frames[60].speed_mps == pytest.approx(4.0, abs=0.3)
+
+
+def test_images_arrive_normalised_in_the_models_order(tmp_path: Path) -> None:
+    model = straight_on(
+        tmp_path / "m.onnx",
+        inputs="float[1, 6, 3, 16, 24] img",
+        body="""
+            flat = Reshape (img, everything)
+            first = Gather <axis = 1> (flat, picked)
+            plan = Reshape (first, plan_shape)""",
+        initializers=""", int64[2] everything = {1, -1}, int64[12] picked = {
+            0, 1, 384, 385, 768, 769, 1152, 1536, 1920, 6900, 6910, 6911},
+            int64[3] plan_shape = {1, 6, 2}""",
+        metadata=IMAGE,
+    )
+    policy, seen = OnnxPolicy.open(model), observation()
+    policy.reset(EXIT)
+
+    plan = policy.plan(seen)
+
+    assert image_size_of(policy) == (16, 24)
+    assert seen.images is not None
+    blue_first = seen.images[..., ::-1].astype(float)
+    expected = (blue_first - [10, 20, 30]) / [2, 4, 5]
+    expected = np.moveaxis(expected, -1, 1).reshape(-1)
+    picked = [0, 1, 384, 385, 768, 769, 1152, 1536, 1920, 6900, 6910, 6911]
+    assert plan.reshape(-1) == pytest.approx(expected[picked], rel=1e-5)
+
+
+COUNTER = {
+    "inputs": "float[18] can_bus, float[1, 6, 2] steps",
+    "body": "steps_out = Add (steps, one) plan = Identity (steps_out)",
+    "outputs": "float[1, 6, 2] plan, float[1, 6, 2] steps_out",
+    "initializers": ", float one = {1.0}",
+}
+
+
+def test_recurrent_state_is_fed_forward_and_reset(tmp_path: Path) -> None:
+    policy = OnnxPolicy.open(straight_on(tmp_path / "m.onnx", **COUNTER))  # type: ignore[arg-type]
+    counted = []
+    for _ in range(2):
+        policy.reset(EXIT)
+        counted += [policy.plan(observation())[0, 0] for _ in range(3)]
+
+    assert counted == [1.0, 2.0, 3.0, 1.0, 2.0, 3.0]
+
+
+def test_an_adapter_names_the_recurrent_pair(tmp_path: Path) -> None:
+    named = {key: text.replace("steps_out", "state") for key, text in COUNTER.items()}
+    path = straight_on(tmp_path / "m.onnx", **named)  # type: ignore[arg-type]
+
+    with pytest.raises(EvaluationError, match="input steps is none of img, lidar2img"):
+        OnnxPolicy.open(path)
+    policy = OnnxPolicy.open(path, Adapter(recurrent={"steps": "state"}))
+    policy.reset(EXIT)
+
+    assert [policy.plan(observation())[5, 1] for _ in range(2)] == [1.0, 2.0]
+
+
+VAD = """
+axes = "right-forward"
+[inputs]
+lidar2img = "projection"
+[plan]
+output = "ego_fut_preds"
+deltas = true
+command_input = "command"
+"""
+
+
+def test_an_adapter_sums_steps_picks_the_mode_and_turns_the_axes(
+    tmp_path: Path,
+) -> None:
+    """VAD's head: steps for three modes in the lidar frame, x right, y forward."""
+    model = straight_on(
+        tmp_path / "m.onnx",
+        inputs="float[6, 4, 4] projection",
+        body="ego_fut_preds = Identity (steps)",
+        outputs="float[1, 3, 6, 2] ego_fut_preds",
+        initializers=", float[1, 3, 6, 2] steps = {"
+        + ", ".join(["0.5, 0.0"] * 6 + ["0.0, 1.0"] * 6 + ["-0.25, 2.0"] * 6)
+        + "}",
+    )
+    toml = tmp_path / "vad.toml"
+    toml.write_text(VAD)
+    policy = Driver(str(model), toml).open()
+    policy.reset(EXIT)
+
+    plan = policy.plan(observation(command=2))
+
+    assert plan == pytest.approx(np.outer(range(1, 7), [2.0, 0.25]))
+    assert policy.plan(observation(command=0))[5] == pytest.approx([0.0, -3.0])
+
+
+def test_the_projection_is_turned_with_the_axes() -> None:
+    ego = np.array([12.0, -3.0, 1.0, 1.0])
+    lidar = np.array([3.0, 12.0, 1.0, 1.0])
+
+    turned = Adapter(axes=Axes.RIGHT_FORWARD).projection(RIG.lidar2img)
+
+    assert turned.dtype == np.float32
+    assert turned @ lidar == pytest.approx(RIG.lidar2img @ ego, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ({"inputs": "float[1, 5, 4, 4] lidar2img"}, "lidar2img has shape [1, 5, 4, 4]"),
+        ({"inputs": "float[2, 6, 4, 4] lidar2img"}, "it must be [1, 6, 4, 4]"),
+        ({"inputs": "float[17] can_bus"}, "it must be [1, 18]"),
+        ({"inputs": "float[18] speed"}, "input speed is none of img, lidar2img"),
+        ({"inputs": "string[1] command"}, "it cannot be fed"),
+        (
+            {"inputs": "float[1, 6, 3, 16, 24] img"},
+            "does not say how its images are normalised",
+        ),
+        (
+            {"outputs": "float[1, 6, 2] way", "body": "way = Identity (ahead)"},
+            "no output plan",
+        ),
+        (
+            {
+                "outputs": "float[1, 3, 4] plan",
+                "body": "plan = Reshape (ahead, shape)",
+                "initializers": ", int64[3] shape = {1, 3, 4}",
+            },
+            "plan has shape [1, 3, 4], a plan is [1, n, 2]",
+        ),
+        (
+            {
+                "outputs": "float[1, 4, 2] plan",
+                "body": "plan = Slice (ahead, from, to, axes)",
+                "initializers": ", int64[1] from = {0}, int64[1] to = {4},"
+                " int64[1] axes = {1}",
+            },
+            "a plan of shape [4, 2], it must be [6, 2]",
+        ),
+    ],
+)
+def test_a_model_that_breaks_the_contract_never_drives(
+    tmp_path: Path, model: dict[str, str], words: str
+) -> None:
+    path = straight_on(tmp_path / "m.onnx", **model)  # type: ignore[arg-type]
+
+    with pytest.raises(EvaluationError) as caught:
+        Driver(str(path)).open()
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert words in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[inputs]\npicture = 'img'", "adapter inputs.picture"),
+        ("[plan]\noutput = 'way'", "the adapter's plan is output way; there are plan"),
+        ("[inputs]\nimg = 'image'", "the adapter names input image; there are command"),
+        ("[recurrent]\ncommand = 'x'", "the adapter names output x; there are plan"),
+        ("axes = 'up'", "adapter axes"),
+        ("axes =", "not TOML"),
+    ],
+)
+def test_a_wrong_adapter_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+    path, toml = straight_on(tmp_path / "m.onnx"), tmp_path / "a.toml"
+    toml.write_text(text)
+
+    with pytest.raises(EvaluationError) as caught:
+        Driver(str(path), toml).open()
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_model_at_all(tmp_path: Path) -> None:
+    (tmp_path / "m.onnx").write_bytes(b"not a model")
+
+    with pytest.raises(EvaluationError, match=r"m.onnx: onnxruntime cannot run"):
+        Driver(str(tmp_path / "m.onnx")).open()
+
+
+def test_not_a_number_at_work_fails_the_route(tmp_path: Path) -> None:
+    """The root of 9.5 minus the number of decisions, taken off itself."""
+    model = straight_on(
+        tmp_path / "m.onnx",
+        inputs="float[1] count",
+        outputs="float[1, 6, 2] plan, float[1] count_out",
+        body="""
+            count_out = Add (count, one)
+            left = Sub (limit, count_out)
+            root = Sqrt (left)
+            zero = Sub (root, root)
+            plan = Add (ahead, zero)""",
+        initializers=", float[1] one = {1.0}, float[1] limit = {9.5}",
+    )
+
+    episode = drive(EXIT, OnnxPolicy.open(model), Conditions())
+
+    assert episode.ending is Ending.POLICY_FAILED
+    assert episode.failure == "the plan is not finite"
+    assert len(episode.decisions) == 9
+
+
+def test_drivers_by_name() -> None:
+    assert Driver("blind:6.5").fingerprint() == "blind:6.5"
+    with pytest.raises(EvaluationError, match="fast is not a speed"):
+        Driver("blind:fast").open()
+
+
+def test_the_fingerprint_follows_the_files(tmp_path: Path) -> None:
+    path, toml = straight_on(tmp_path / "m.onnx"), tmp_path / "a.toml"
+    toml.write_text("axes = 'forward-left'")
+    plain, adapted = Driver(str(path)).fingerprint(), Driver(str(path), toml)
+
+    assert adapted.fingerprint() != plain
+    before = adapted.fingerprint()
+    toml.write_text("axes = 'right-forward'")
+    assert adapted.fingerprint() != before
+
+
+def test_normalisation_keeps_red_first() -> None:
+    norm = ImageNormalization(mean=(0, 0, 0), std=(1, 1, 1), order="rgb")
+    images = np.arange(6 * 2 * 2 * 3, dtype=np.uint8).reshape(6, 2, 2, 3)
+
+    assert norm.apply(images)[0, 0, :, 0, 0].tolist() == [0.0, 1.0, 2.0]

@@ -1,0 +1,248 @@
+import dataclasses
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.base import Observation
+from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.expert import Expert
+from me2e_compress.evaluators.highway.observe import can_bus_of
+from me2e_compress.evaluators.highway.picture import Moment
+from me2e_compress.evaluators.highway.record import junction_m
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
+from me2e_compress.evaluators.highway.scene import Ego
+from me2e_compress.evaluators.highway.world import World
+from me2e_compress.evaluators.latency import FixedLatency
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import InfractionKind
+from tests.evaluators.highway.drivers import (
+    CROSSING,
+    EXIT,
+    GREEN,
+    PARKED,
+    Misbehaving,
+)
+
+IDEAL = Conditions()
+
+
+@dataclass
+class Standing:
+    """Plans to stay where it is, and keeps what it was shown."""
+
+    needs_images: bool = False
+    privileged: bool = False
+    plans: float = 0.0
+    seen: list[Observation] = field(default_factory=list)
+    resets: int = 0
+
+    def reset(self, route: Route) -> None:
+        self.resets += 1
+
+    def plan(self, observation: Observation) -> npt.NDArray[np.floating]:
+        self.seen.append(observation)
+        ahead = self.plans * 0.5 * np.arange(1, 7)
+        return np.stack([ahead, np.zeros(6)], axis=1)
+
+
+def test_the_expert_reaches_the_goal() -> None:
+    episode = drive(PARKED, Expert(), IDEAL)
+
+    assert episode.ending is Ending.COMPLETED
+    assert episode.completion_percent == 100.0
+    assert episode.succeeded
+    assert episode.abilities == ("Overtaking",)
+    assert episode.route_length_m > 50.0
+    times = [frame.time_us for frame in episode.frames]
+    assert times == list(range(0, times[-1] + 1, 50_000))
+    assert len(episode.decisions) == len(episode.frames) - 1
+
+
+def test_a_blind_driver_ends_at_its_first_collision() -> None:
+    episode = drive(PARKED, Blind(), IDEAL)
+
+    assert episode.ending is Ending.COLLISION
+    assert [i.kind for i in episode.infractions] == [InfractionKind.COLLISION_VEHICLE]
+    assert 0.0 < episode.completion_percent < 100.0
+    assert episode.infractions[0].time_us == episode.frames[-1].time_us
+
+
+def test_a_pedestrian_is_a_pedestrian() -> None:
+    episode = drive(CROSSING, Blind(), IDEAL)
+
+    assert InfractionKind.COLLISION_PEDESTRIAN in [i.kind for i in episode.infractions]
+
+
+def test_standing_still_is_blocked_after_a_minute() -> None:
+    episode = drive(GREEN, Standing(), IDEAL)
+
+    assert episode.ending is Ending.BLOCKED
+    assert episode.infractions[-1].kind is InfractionKind.VEHICLE_BLOCKED
+    still = [f.time_us for f in episode.frames if f.speed_mps <= 0.1]
+    assert still[-1] - still[0] == 60_000_000
+
+
+def test_the_same_route_drives_the_same() -> None:
+    slow = Conditions(FixedLatency(250_000))
+
+    assert drive(EXIT, Expert(), slow) == drive(EXIT, Expert(), slow)
+
+
+@pytest.mark.parametrize(
+    ("latency_us", "dt_us", "period_us"),
+    [
+        (0, 50_000, 50_000),
+        (99_999, 50_000, 50_000),
+        (150_000, 50_000, 150_000),
+        (250_000, 50_000, 250_000),
+        (20_000, 10_000, 20_000),
+    ],
+)
+def test_decisions_come_as_often_as_equation_4_lets_them(
+    latency_us: int, dt_us: int, period_us: int
+) -> None:
+    episode = drive(PARKED, Blind(), Conditions(FixedLatency(latency_us), dt_us))
+
+    times = [decision.time_us for decision in episode.decisions]
+    assert times == list(range(0, times[-1] + 1, period_us))
+    assert {decision.latency_us for decision in episode.decisions} == {latency_us}
+    assert [f.time_us for f in episode.frames[:3]] == [0, 50_000, 100_000]
+
+
+def test_a_late_control_acts_late() -> None:
+    """Equation 4 at 0.15 s: n = 2, so the first control acts in frame 3."""
+    prompt, late = (
+        drive(PARKED, Standing(), Conditions(FixedLatency(latency)))
+        for latency in (0, 150_000)
+    )
+
+    braking = [
+        next(k for k, f in enumerate(e.frames) if f.acceleration_mps2 < -0.1)
+        for e in (prompt, late)
+    ]
+
+    assert braking[1] - braking[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("way", "reason"),
+    [
+        ("raise", r"KeyError: 'lost\\nmy way'"),
+        ("not-finite", "the plan is not finite"),
+        ("shape", r"the plan has shape \[5, 2\], it must be \[6, 2\]"),
+        ("integers", "the plan is no float array but an array of int64"),
+        ("list", "the plan is no float array but list"),
+    ],
+)
+def test_a_policy_that_breaks_its_contract_has_failed(way: str, reason: str) -> None:
+    episode = drive(EXIT, Misbehaving(way), IDEAL)
+
+    assert episode.ending is Ending.POLICY_FAILED
+    assert episode.failure is not None
+    assert len(episode.decisions) == 19
+    assert not episode.succeeded
+    assert re.fullmatch(reason, episode.failure)
+
+
+def test_a_policy_that_cannot_reset_has_failed() -> None:
+    episode = drive(EXIT, Misbehaving("no-reset"), IDEAL)
+
+    assert episode.failure == "RuntimeError: will not start"
+    assert episode.completion_percent == 0.0
+
+
+def test_a_policy_sees_what_it_may() -> None:
+    plain, seeing = Standing(plans=8.0), Standing(needs_images=True, plans=8.0)
+    short = Conditions(image_size=(32, 48))
+    drive(PARKED, plain, short)
+    drive(PARKED, seeing, short)
+
+    first = plain.seen[0]
+    assert (first.images, first.scene, first.world) == (None, None, None)
+    assert first.lidar2img.shape == (6, 4, 4)
+    assert plain.resets == 1
+    images = seeing.seen[0].images
+    assert images is not None
+    assert images.shape == (6, 32, 48, 3)
+    assert images.dtype == np.uint8
+
+
+def test_the_can_bus_counts_from_decision_to_decision() -> None:
+    policy = Standing(plans=8.0)
+    drive(PARKED, policy, Conditions(FixedLatency(200_000)))
+    first, second = policy.seen[:2]
+
+    assert not first.can_bus[[0, 1, 2, 17]].any()
+    speeds = (first.can_bus[7], second.can_bus[7])
+    moved = float(np.hypot(*second.can_bus[:2]))
+    assert 0.2 * min(speeds) - 0.05 <= moved <= 0.2 * max(speeds) + 0.05
+
+
+def test_the_layout_of_the_can_bus() -> None:
+    ego = Ego(3.0, 4.0, -0.5, 6.0, 1.5, -0.5, 0.25, 0.1, 4.9, 2.0)
+    bus = can_bus_of(ego, dataclasses.replace(ego, x=1.0, y=5.0, heading=6.1831853))
+
+    expected = np.zeros(18, np.float32)
+    expected[:2] = 2.0, -1.0
+    expected[3], expected[6] = np.cos(-0.25), np.sin(-0.25)
+    expected[7] = 6.0
+    expected[10:12] = 1.5, -0.5
+    expected[15] = 0.25
+    expected[16] = 2 * np.pi - 0.5
+    expected[17] = np.degrees(-0.5 + 0.1)
+    assert bus.dtype == np.float32
+    assert bus == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_junction_begins_after_its_announcement() -> None:
+    found = junction_m(World(GREEN).path)
+
+    assert found is not None
+    assert 20.0 <= found < World(GREEN).path.goal_m
+    assert junction_m(World(PARKED).path) is None
+
+
+def test_a_step_must_divide_50_ms() -> None:
+    with pytest.raises(EvaluationError, match="a step of 30 ms"):
+        Conditions(dt_us=30_000)
+
+
+def test_watching_changes_nothing() -> None:
+    moments = list[Moment]()
+    small = Conditions(image_size=(16, 16))
+    watched = drive(PARKED, Blind(), small, Listeners(moment=moments.append))
+
+    assert watched == drive(PARKED, Blind(), small)
+    assert len(moments) == len(watched.frames)
+    assert moments[-1].events
+    images = moments[0].images
+    assert images is not None
+    assert images.shape == (6, 16, 16, 3)
+
+
+def test_a_held_plan_stays_where_it_was_made() -> None:
+    """Seen from an ego that has moved on, its waypoints come nearer."""
+    moments = list[Moment]()
+    slow = Conditions(FixedLatency(500_000), image_size=(16, 16))
+    drive(PARKED, Standing(plans=8.0), slow, Listeners(moment=moments.append))
+    first, later = moments[0], moments[9]
+    assert first.plan is not None
+    assert later.plan is not None
+
+    def in_world(moment: Moment, point: npt.NDArray[np.floating]) -> list[float]:
+        ego = moment.scene.ego
+        cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+        return [
+            ego.x + cos * point[0] - sin * point[1],
+            ego.y + sin * point[0] + cos * point[1],
+        ]
+
+    assert in_world(later, later.plan[3]) == pytest.approx(
+        in_world(first, first.plan[3])
+    )
+    assert later.plan[3, 0] < first.plan[3, 0] - 1.0

@@ -1,0 +1,175 @@
+"""A road, an ego with lag, and actors that keep their course: enough to drive on."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from me2e_compress.evaluators.highway.bicycle import advance
+from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.expert import Memory, ceiling, decide
+from me2e_compress.evaluators.highway.geometry import (
+    Command,
+    Floats,
+    RoutePath,
+    polyline_headings,
+    resample,
+)
+from me2e_compress.evaluators.highway.scene import (
+    DIMENSIONS,
+    Actor,
+    ActorKind,
+    Control,
+    Ego,
+    Scene,
+    Signal,
+    SignalKind,
+    SignalState,
+)
+from me2e_compress.evaluators.highway.world.privileged import (
+    Intent,
+    Phase,
+    Privileged,
+)
+
+DT_US = 50_000
+LAG_S = (0.2, 0.1)
+"""Of acceleration and steering, as in the real world's ego."""
+
+
+def path_through(
+    points: Floats,
+    limit_mps: float = 12.0,
+    left_m: float = 1.75,
+    right_m: float = 1.75,
+    oncoming_m: float | None = None,
+) -> RoutePath:
+    line = resample(points, 1.0)
+    n = len(line)
+    return RoutePath(
+        line,
+        polyline_headings(line),
+        np.full(n, 3.5),
+        np.full(n, limit_mps),
+        np.full(n, int(Command.FOLLOW), np.int64),
+        n - 61.0,
+        np.full(n, left_m),
+        np.full(n, right_m),
+        np.full(n, left_m if oncoming_m is None else oncoming_m),
+    )
+
+
+def straight(**edges: float) -> RoutePath:
+    return path_through(np.array([[0.0, 0.0], [230.0, 0.0]]), **edges)
+
+
+def circle(radius_m: float, turn_rad: float, run_in_m: float = 30.0) -> RoutePath:
+    phi = np.linspace(0.0, turn_rad, 400)[1:]
+    bend = np.stack(
+        [run_in_m + radius_m * np.sin(phi), radius_m * (1 - np.cos(phi))], axis=1
+    )
+    out = bend[-1] + np.outer([80.0], [np.cos(turn_rad), np.sin(turn_rad)])
+    return path_through(np.vstack([[[0.0, 0.0]], bend, out]))
+
+
+def ego_at(
+    x: float = 5.0,
+    y: float = 0.0,
+    heading: float = 0.0,
+    speed: float = 8.0,
+    steering: float = 0.0,
+) -> Ego:
+    return Ego(x, y, heading, speed, 0.0, 0.0, 0.0, steering, 5.0, 2.0)
+
+
+def actor(
+    x: float,
+    y: float = 0.0,
+    speed: float = 0.0,
+    heading: float = 0.0,
+    kind: ActorKind = ActorKind.CAR,
+    number: int = 1,
+) -> Actor:
+    size = DIMENSIONS[kind]
+    return Actor(number, kind, x, y, heading, speed, *size, False, 0)
+
+
+def signal_at(x: float, kind: SignalKind, state: SignalState | None = None) -> Signal:
+    return Signal(1, kind, x, -3.0, 0.0, state, ((x, 1.75), (x, -1.75)))
+
+
+@dataclass
+class TinyWorld:
+    path: RoutePath
+    ego: Ego
+    actors: tuple[Actor, ...] = ()
+    signals: tuple[Signal, ...] = ()
+    intents: tuple[Intent, ...] = ()
+    time_us: int = 0
+
+    def scene(self) -> Scene:
+        return Scene(self.time_us, self.ego, self.actors, self.signals)
+
+    def privileged(self) -> Privileged:
+        phases = (Phase(s.id, s.stop_line[0][0], s.state, None) for s in self.signals)
+        return Privileged(self.intents, tuple(phases))
+
+    def step(self, control: Control) -> None:
+        dt, ego = DT_US / 1e6, self.ego
+        follow = [1 - math.exp(-dt / lag) for lag in LAG_S]
+        pushed = ego.acceleration_mps2
+        pushed += follow[0] * (control.acceleration_mps2 - pushed)
+        wheel = ego.steering_rad + follow[1] * (control.steering_rad - ego.steering_rad)
+        speed = max(0.0, ego.speed_mps + pushed * dt)
+        travel = (ego.speed_mps + speed) / 2 * dt
+        x, y, heading = advance(ego.x, ego.y, ego.heading, wheel, travel, ego.length)
+        self.ego = Ego(
+            *(x, y, heading, speed, pushed, 0.0, 0.0, wheel),
+            length=ego.length,
+            width=ego.width,
+        )
+        self.actors = tuple(
+            replace(
+                a,
+                x=a.x + a.speed_mps * dt * math.cos(a.heading),
+                y=a.y + a.speed_mps * dt * math.sin(a.heading),
+            )
+            for a in self.actors
+        )
+        self.time_us += DT_US
+
+    @property
+    def offset_m(self) -> float:
+        return self.path.project(self.ego.x, self.ego.y)[1]
+
+    @property
+    def touches(self) -> bool:
+        """Whether a disc of the ego overlaps an actor's rectangle."""
+        for a in self.actors:
+            for disc in (-2.0, -1.0, 0.0, 1.0, 2.0):
+                x = self.ego.x + disc * math.cos(self.ego.heading) - a.x
+                y = self.ego.y + disc * math.sin(self.ego.heading) - a.y
+                along = abs(math.cos(a.heading) * x + math.sin(a.heading) * y)
+                across = abs(math.cos(a.heading) * y - math.sin(a.heading) * x)
+                end = max(along - a.length / 2, 0.0)
+                if math.hypot(end, max(across - a.width / 2, 0.0)) < 0.9:
+                    return True
+        return False
+
+
+def drive(world: TinyWorld, seconds: float, every: int = 1) -> list[Scene]:
+    """Let the expert drive through the controller; all scenes, the last included."""
+    top, memory, controller = ceiling(world.path), Memory(), Controller()
+    scenes, control = [world.scene()], Control(0.0, 0.0)
+    for frame in range(round(seconds * 1e6 / DT_US)):
+        if frame % every == 0:
+            scene = world.scene()
+            decision = decide(scene, world.privileged(), world.path, top, memory)
+            memory = decision.memory
+            plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
+            control = controller.control(plan, scene.ego, scene.time_us)
+        world.step(control)
+        scenes.append(world.scene())
+        if world.touches:
+            break
+    return scenes

@@ -1,0 +1,193 @@
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from me2e_compress.metrics import bench2drive
+from me2e_compress.metrics.comfort import comfort, smooth_frames
+from me2e_compress.metrics.episode import Episode, Frame
+from tests.metrics.drives import drive, frames
+
+Floats = npt.NDArray[np.float64]
+
+
+def held(count: int, **values: float) -> Episode:
+    return drive(driven=frames(count, lambda _: dict(values)))
+
+
+def random_frames(seed: int, count: int) -> tuple[Frame, ...]:
+    rng = np.random.default_rng(seed)
+    along, left = rng.normal(0, 1.5, (2, count)).cumsum(axis=1) * 0.3
+    yaw = rng.normal(0, 0.1, count).cumsum() * 0.3
+    heading = (yaw * 0.05).cumsum()
+    return frames(
+        count,
+        lambda k: {
+            "speed_mps": 8.0,
+            "acceleration_mps2": float(along[k]),
+            "lateral_acceleration_mps2": float(left[k]),
+            "yaw_rate_radps": float(yaw[k]),
+            "heading": float(heading[k]),
+        },
+    )
+
+
+def local_fit(values: Floats, dt: float) -> tuple[Floats, Floats]:
+    """Fit a parabola to seven neighbours of each sample: value and slope there."""
+    fitted, slopes = np.empty_like(values), np.empty_like(values)
+    for k in range(len(values)):
+        start = min(max(k - 3, 0), len(values) - 7)
+        times = (np.arange(start, start + 7) - k) * dt
+        seven = values[start : start + 7]
+        value, slope, _ = np.polynomial.polynomial.polyfit(times, seven, 2)
+        fitted[k], slopes[k] = value, slope
+    return fitted, slopes
+
+
+def columns(driven: tuple[Frame, ...]) -> tuple[Floats, Floats, Floats, Floats]:
+    table = np.array(
+        [
+            (
+                f.acceleration_mps2,
+                f.lateral_acceleration_mps2,
+                f.yaw_rate_radps,
+                f.heading,
+            )
+            for f in driven
+        ]
+    ).T
+    return table[0], table[1], table[2], table[3]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_si_comfort_against_local_fits(seed: int) -> None:
+    driven = random_frames(seed, 93)
+    along, left, yaw, heading = columns(driven)
+    a, jerk_along = local_fit(along, 0.05)
+    b, _ = local_fit(left, 0.05)
+    w, spin = local_fit(yaw, 0.05)
+    east = local_fit(along * np.cos(heading) - left * np.sin(heading), 0.05)[1]
+    north = local_fit(along * np.sin(heading) + left * np.cos(heading), 0.05)[1]
+    fine = (a >= -4.05) & (a <= 2.40) & (abs(b) <= 4.89) & (abs(w) <= 0.95)
+    fine &= (abs(spin) <= 1.93) & (abs(jerk_along) <= 4.13)
+    fine &= np.sqrt(east**2 + north**2) <= 8.37
+
+    assert smooth_frames(drive(driven=driven)).tolist() == fine.tolist()
+    whole = [fine[k : k + 20].all() for k in range(0, 80, 20)]
+    assert comfort(drive(driven=driven)).value == np.mean(whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "inside", "outside"),
+    [
+        ("acceleration_mps2", 2.39, 2.41),
+        ("acceleration_mps2", -4.04, -4.06),
+        ("lateral_acceleration_mps2", 4.88, 4.90),
+        ("lateral_acceleration_mps2", -4.88, -4.90),
+        ("yaw_rate_radps", 0.94, 0.96),
+        ("yaw_rate_radps", -0.94, -0.96),
+    ],
+)
+def test_bounds_of_the_three_levels(name: str, inside: float, outside: float) -> None:
+    assert comfort(held(40, **{name: inside})).value == 1.0
+    assert comfort(held(40, **{name: outside})).value == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "inside", "outside"),
+    [
+        ("acceleration_mps2", 4.12, 4.14),
+        ("lateral_acceleration_mps2", 8.36, 8.38),
+        ("yaw_rate_radps", 1.92, 1.94),
+    ],
+)
+def test_bounds_of_the_three_slopes(name: str, inside: float, outside: float) -> None:
+    def ramp(slope: float) -> Episode:
+        # 20 frames of 0.05 s around zero: the level stays in range, the slope decides.
+        return drive(driven=frames(20, lambda k: {name: slope * 0.05 * (k - 9.5)}))
+
+    assert comfort(ramp(inside)).value == 1.0
+    assert comfort(ramp(outside)).value == 0.0
+
+
+def test_fewer_than_20_frames_are_left_out() -> None:
+    assert comfort(held(19)).reason == "19 frames, 20 are needed"
+    assert comfort(held(20)).value == 1.0
+
+
+def test_an_incomplete_segment_is_dropped() -> None:
+    rough = drive(
+        driven=frames(39, lambda k: {"acceleration_mps2": 3.0 if k > 30 else 0.0})
+    )
+
+    assert comfort(rough).value == 1.0
+
+
+@pytest.mark.parametrize(("seconds", "value"), [(61, 1.0), (59, 0.0)])
+def test_standing_blocked_is_not_uncomfortable(seconds: int, value: float) -> None:
+    shaken = held(20 * seconds, speed_mps=0.05, lateral_acceleration_mps2=6.0)
+
+    assert comfort(shaken).value == value
+
+
+def test_bench2drive_takes_degrees_for_radians() -> None:
+    gentle_turn = held(40, yaw_rate_radps=np.radians(1.0), speed_mps=8.0)
+
+    assert comfort(gentle_turn).value == 1.0
+    assert bench2drive.smoothness(gentle_turn).value == 0.0
+
+
+def test_bench2drive_halves_the_jerk() -> None:
+    def ramp(slope: float) -> Episode:
+        return drive(
+            driven=frames(20, lambda k: {"acceleration_mps2": slope * 0.05 * (k - 9.5)})
+        )
+
+    assert bench2drive.smoothness(ramp(4.7)).value == 1.0
+    assert comfort(ramp(4.7)).value == 0.0
+
+
+def original(driven: tuple[Frame, ...]) -> list[bool]:
+    """Bench2Drive's blocks, filters spelled out as local fits (delta 0.1 s)."""
+    along, left, yaw, _ = columns(driven)
+    omega, norm = np.degrees(yaw), np.hypot(along, left)
+    blocks = []
+    for k in range(0, len(driven) - 19, 20):
+        part = slice(k, k + 20)
+        a, _ = local_fit(along[part], 0.1)
+        b, _ = local_fit(left[part], 0.1)
+        m, _ = local_fit(norm[part], 0.1)
+        raw = omega[part]
+        turns = np.concatenate([[0.0], np.cumsum(np.round(np.diff(raw) / 6.283185307))])
+        w, _ = local_fit(raw - 2 * np.pi * turns, 0.1)
+        fine = (a > -4.05) & (a < 2.40) & (abs(b) < 4.89) & (abs(w) < 0.95)
+        fine &= (abs(local_fit(m, 0.1)[1]) < 8.37) & (abs(local_fit(a, 0.1)[1]) < 4.13)
+        blocks.append(bool(fine.all()))
+    return blocks
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bench2drive_smoothness_against_local_fits(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    calm = random_frames(seed, 215)
+    scale = float(rng.uniform(0.01, 0.2))
+    driven = tuple(
+        Frame(
+            *(f.time_us, f.x, f.y, f.heading, f.speed_mps),
+            acceleration_mps2=f.acceleration_mps2,
+            lateral_acceleration_mps2=f.lateral_acceleration_mps2,
+            yaw_rate_radps=f.yaw_rate_radps * scale,
+            steering_rad=0.0,
+            route_m=0.0,
+            traffic_speed_mps=None,
+        )
+        for f in calm
+    )
+    expected = original(driven)
+
+    assert bench2drive.smoothness(drive(driven=driven)).value == np.mean(expected)
+
+
+def test_bench2drive_judges_short_routes_as_one_block() -> None:
+    assert bench2drive.smoothness(held(3)).value == 1.0
+    assert bench2drive.smoothness(held(12, acceleration_mps2=2.5)).value == 0.0
+    assert bench2drive.smoothness(held(2)).reason == "2 frames, 3 are needed"

@@ -1,0 +1,102 @@
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from me2e_compress.metrics.episode import (
+    Decision,
+    Ending,
+    Episode,
+    Frame,
+)
+from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from tests.metrics.drives import cruise, drive, infraction
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+times = st.integers(0, 10**10)
+frame_rows = st.builds(
+    Frame,
+    times,
+    *[numbers] * 9,
+    traffic_speed_mps=st.none() | numbers,
+    acceleration_norm_mps2=st.none() | numbers,
+)
+infractions = st.builds(
+    Infraction,
+    st.sampled_from(InfractionKind),
+    times,
+    numbers,
+    numbers,
+    st.text(max_size=8),
+    st.none() | numbers,
+)
+episodes = st.builds(
+    Episode,
+    st.text(max_size=8),
+    st.text(max_size=8),
+    st.lists(st.text(max_size=4), max_size=2).map(tuple),
+    numbers,
+    numbers,
+    st.sampled_from(Ending),
+    st.none() | st.text(max_size=8),
+    st.lists(infractions, max_size=2).map(tuple),
+    st.lists(frame_rows, max_size=4).map(tuple),
+    st.lists(st.builds(Decision, times, times), max_size=3).map(tuple),
+    st.none() | numbers,
+    st.none() | st.lists(numbers, max_size=3).map(tuple),
+)
+
+
+@given(episodes)
+def test_json_brings_back_every_bit(episode: Episode) -> None:
+    text = json.dumps(episode.to_json(), allow_nan=False)
+
+    assert Episode.from_json(json.loads(text)) == episode
+
+
+def _drop_a_field(record: dict[str, Any]) -> None:
+    del record["scenario"]
+
+
+def _add_a_field(record: dict[str, Any]) -> None:
+    record["weather"] = "fog"
+
+
+def _not_a_number(record: dict[str, Any]) -> None:
+    record["frames"]["speed_mps"][0] = float("nan")
+
+
+def _cut_a_column(record: dict[str, Any]) -> None:
+    record["frames"]["x"].pop()
+
+
+def _rows_for_columns(record: dict[str, Any]) -> None:
+    record["decisions"] = [[0, 0]]
+
+
+def _unknown_ending(record: dict[str, Any]) -> None:
+    record["ending"] = "fell asleep"
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        _drop_a_field,
+        _add_a_field,
+        _not_a_number,
+        _cut_a_column,
+        _rows_for_columns,
+        _unknown_ending,
+    ],
+)
+def test_a_spoiled_record_is_refused(
+    spoil: Callable[[dict[str, Any]], None],
+) -> None:
+    record = drive(infraction(InfractionKind.STOP), driven=cruise()).to_json()
+    spoil(record)
+
+    with pytest.raises(ValueError, match=r".+"):
+        Episode.from_json(record)

@@ -1,0 +1,115 @@
+import math
+from statistics import fmean, pstdev
+
+import numpy as np
+import pytest
+
+from me2e_compress.metrics.abilities import ABILITIES
+from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.intervals import binomial_interval, bootstrap_interval
+from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.scores import score
+from tests.metrics.drives import cruise, drive, infraction
+
+CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
+SET = [
+    drive(route="a", abilities=("Overtaking",), driven=cruise(traffic=5.0)),
+    drive(CRASH, route="b", abilities=("Merging",), completion=50.0),
+    drive(route="c", abilities=("Merging", "Traffic_Signs")),
+    drive(route="d", abilities=("Emergency_Brake",)),
+    drive(CRASH, route="e", abilities=("Give_Way",), completion=10.0),
+]
+
+
+def test_means_over_the_routes_that_were_driven() -> None:
+    scores = score(SET, expected=220)
+
+    assert scores.driving_score.value == pytest.approx((3 * 100 + 30 + 6) / 5)
+    assert scores.success_rate.value == pytest.approx(60.0)
+    assert scores.efficiency.value == pytest.approx(200.0)
+    assert scores.efficiency.n == 1
+    assert scores.abilities.value == pytest.approx((100 + 50 + 100 + 0 + 100) / 5)
+    assert [scores.each_ability[name].n for name in ABILITIES] == [1, 2, 1, 1, 1]
+
+
+def test_a_partial_set_is_said_so_and_never_divided_by_220() -> None:
+    scores = score(SET)
+
+    assert scores.partial
+    assert scores.to_json()["routes"] == {
+        "driven": 5,
+        "expected": 220,
+        "partial": True,
+    }
+    assert not score(SET, expected=5).partial
+
+
+def test_an_ability_that_was_not_driven_is_not_zero() -> None:
+    scores = score(SET[:2])
+
+    assert scores.abilities.value is None
+    assert scores.abilities.measure.reason == (
+        "no route for Emergency_Brake, Give_Way, Traffic_Signs was driven"
+    )
+    assert scores.each_ability["Give_Way"].value is None
+
+
+def test_json_has_value_low_high_and_n_for_each_score() -> None:
+    record = score(SET).to_json()
+
+    for key in (
+        "driving_score",
+        "success_rate",
+        "efficiency",
+        "comfort",
+        "abilities",
+    ):
+        assert {"value", "low", "high", "n"} <= set(record[key])
+    assert set(record["abilities"]["each"]) == set(ABILITIES)
+    assert set(record["bench2drive"]) == {"efficiency", "smoothness"}
+
+
+def test_no_routes_no_scores() -> None:
+    assert score([]).driving_score.measure == Measure(None, "%", "no route was driven")
+
+
+def test_the_order_of_the_routes_changes_no_mean() -> None:
+    forward, backward = score(SET), score(SET[::-1])
+
+    assert forward.driving_score.value == backward.driving_score.value
+    assert forward.success_rate == backward.success_rate
+
+
+def test_the_exact_binomial_interval() -> None:
+    # Clopper and Pearson: with no failure the lower end is (alpha / 2) ** (1 / n).
+    low, high = binomial_interval(10, 10)
+
+    assert low == pytest.approx(0.025**0.1)
+    assert high == 1.0
+
+
+def test_the_bootstrap_is_seeded_and_holds_the_mean() -> None:
+    values = np.random.default_rng(3).normal(50.0, 10.0, 200).tolist()
+    low, high = bootstrap_interval(values, seed=1)
+
+    assert (low, high) == bootstrap_interval(values, seed=1)
+    assert (low, high) != bootstrap_interval(values, seed=2)
+    assert low is not None
+    assert high is not None
+    mean, error = fmean(values), pstdev(values) / math.sqrt(200)
+    assert low == pytest.approx(mean - 1.96 * error, abs=0.4 * error)
+    assert high == pytest.approx(mean + 1.96 * error, abs=0.4 * error)
+
+
+def test_one_route_has_no_interval() -> None:
+    assert bootstrap_interval([3.0]) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"), [(None, ""), (1.0, "why"), (math.nan, "")]
+)
+def test_a_measure_is_a_finite_value_or_a_reason(
+    value: float | None, reason: str
+) -> None:
+    with pytest.raises(ValueError, match="measure"):
+        Measure(value, "%", reason)
