@@ -27,6 +27,7 @@ def progress(title: str) -> Iterator[Advance]:
         TimeElapsedColumn(),
         console=errors,
         transient=True,
+        disable=not errors.is_terminal,  # a log wants no bar
     )
     with bar:
         task = bar.add_task(title, total=1, what="")
