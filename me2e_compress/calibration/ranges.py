@@ -1,15 +1,13 @@
 """What calibration found, and for which graph and frames it holds."""
 
 import dataclasses
-import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Self
 
 import pydantic
 
 from me2e_compress.errors import FramesError
+from me2e_compress.runtime.atomic import write_json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,14 +35,7 @@ class Ranges:
 
     def save(self, path: Path) -> None:
         """Write JSON, all or nothing."""
-        text = json.dumps(dataclasses.asdict(self), indent=1) + "\n"
-        handle, draft = tempfile.mkstemp(dir=path.parent, prefix=".ranges-")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(text)
-            os.replace(draft, path)
-        finally:
-            Path(draft).unlink(missing_ok=True)
+        write_json(path, dataclasses.asdict(self), indent=1)
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -1,6 +1,5 @@
 """One compression, from files to files: what ``compress`` and ``demo`` share."""
 
-import json
 from pathlib import Path
 
 import onnx_ir as ir
@@ -13,6 +12,7 @@ from me2e_compress.manager import PassManager, Report
 from me2e_compress.modules import ModuleMap, detect
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.runtime.atomic import write_json
 
 
 def check_output(model: Path, output: Path) -> None:
@@ -96,6 +96,5 @@ def write(report: Report, source: Path, output: Path) -> Path:
     """Write the graph, and beside it what was done to it; give the report's path."""
     graph.save(report.model, output)
     path = output.with_name(output.stem + ".report.json")
-    text = json.dumps(report.record(source, output), indent=2)
-    graph.write_text(path, text + "\n")
+    write_json(path, report.record(source, output), indent=2)
     return path

@@ -5,7 +5,7 @@ package says about it, besides walking nodes and values.
 """
 
 from me2e_compress.graph.digest import digest
-from me2e_compress.graph.files import is_external, load, save, sha256_of, write_text
+from me2e_compress.graph.files import is_external, load, save, sha256_of
 from me2e_compress.graph.interface import Port, interface
 from me2e_compress.graph.measure import Size, macs, node_count, size
 from me2e_compress.graph.provenance import Provenance
@@ -38,5 +38,4 @@ __all__ = [
     "sort",
     "static_shape",
     "sweep",
-    "write_text",
 ]

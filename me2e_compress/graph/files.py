@@ -80,13 +80,6 @@ def is_external(model: ir.Model) -> bool:
     return any(True for _ in _external(model))
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, all or nothing."""
-    draft = path.with_name(f".{path.name}.draft")
-    draft.write_text(text, encoding="utf-8")
-    os.replace(draft, path)
-
-
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
     seal = hashlib.sha256()

@@ -26,7 +26,8 @@ def add_constant(
     while unique in graph.initializers:
         count += 1
         unique = f"{name}_{count}"
-    tensor = ir.tensor(array, name=unique)
+    flat = np.ascontiguousarray(array).reshape(array.shape)
+    tensor = ir.tensor(flat, name=unique)
     value = ir.Value(
         name=unique,
         shape=ir.Shape(array.shape),

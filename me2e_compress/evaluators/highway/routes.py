@@ -1,7 +1,6 @@
 """Routes and their manifest: a JSON list of objects."""
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
+from me2e_compress.runtime.atomic import write_bytes
 
 Parameter = bool | int | float | str
 
@@ -97,13 +97,8 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
         EvaluationError: The file cannot be written.
     """
     lines = ",\n".join(json.dumps(asdict(route)) for route in routes)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        try:
-            temporary.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_bytes(path, f"[\n{lines}\n]\n".encode())
     except OSError as error:
         raise EvaluationError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -10,10 +10,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, provenance, static_shape
+from me2e_compress.graph import add_constant, array_of, provenance, static_shape
 from me2e_compress.passes.edits import (
     bypass,
-    constant_value,
     is_standard,
     put,
     single_reader,
@@ -79,7 +78,7 @@ class Site:
         value = self.shapes.get(sizes)
         if value is None or value.graph is not self.graph:
             name = f"{reader.outputs[0].name}_shape"
-            value = constant_value(self.graph, np.array(sizes, np.int64), name)
+            value = add_constant(self.graph, np.array(sizes, np.int64), name)
             self.shapes[sizes] = value
         return value
 
@@ -201,7 +200,7 @@ def _slices(node: ir.Node, site: Site) -> ir.Node | None:
         return None
     name = node.outputs[0].name or ""
     inputs = [
-        constant_value(site.graph, np.array([*one, *two], np.int64), f"{name}_{part}")
+        add_constant(site.graph, np.array([*one, *two], np.int64), f"{name}_{part}")
         for part, one, two in zip(
             ("starts", "ends", "axes", "steps"), first, second, strict=True
         )

@@ -5,8 +5,8 @@ import hashlib
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import provenance, replace_value
-from me2e_compress.passes.edits import Array, constant_value, put
+from me2e_compress.graph import add_constant, provenance, replace_value
+from me2e_compress.passes.edits import Array, put
 from me2e_compress.passes.fold_constants.choice import Choice
 
 
@@ -52,7 +52,7 @@ class _Store:
         content = hashlib.blake2b(data, digest_size=16)
         key = (str(array.dtype), array.shape, content.digest())
         if key not in self.known:
-            self.known[key] = constant_value(self.graph, array, name)
+            self.known[key] = add_constant(self.graph, array, name)
         return self.known[key]
 
 

@@ -12,8 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import provenance
-from me2e_compress.passes.edits import constant_value
+from me2e_compress.graph import add_constant, provenance
 from me2e_compress.passes.fold_constants.inference import branch_fits
 
 
@@ -34,7 +33,7 @@ def _seat(choice: ir.Node, graph: ir.Graph, opsets: Mapping[str, int], by: str) 
         if use.node.op_type == "Range" and use.node.graph is graph
     ]
     for node, index, value in bounds:
-        shape = constant_value(graph, np.zeros(0, np.int64), f"{value.name}_shape")
+        shape = add_constant(graph, np.zeros(0, np.int64), f"{value.name}_shape")
         scalar = ir.node("Reshape", [value, shape], name=f"{node.name}_bound_{index}")
         scalar.outputs[0].name = f"{value.name}_scalar_{node.name}_{index}"
         scalar.outputs[0].type = value.type

@@ -12,8 +12,8 @@ import dataclasses
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import provenance, replace_value, static_shape
-from me2e_compress.passes.edits import Array, constant_value, single_reader
+from me2e_compress.graph import add_constant, provenance, replace_value, static_shape
+from me2e_compress.passes.edits import Array, single_reader
 from me2e_compress.passes.fuse_basic.match import (
     Numbers,
     Site,
@@ -180,7 +180,7 @@ def _write_bias(layer: ir.Node, site: Site, bias: Array) -> None:
     weight = layer.inputs[1]
     stem = (weight.name if weight is not None else None) or layer.name or "layer"
     name = f"{stem.removesuffix('.weight')}.bias"
-    value = constant_value(site.graph, bias, name)
+    value = add_constant(site.graph, bias, name)
     if len(layer.inputs) < 3:
         layer.resize_inputs(3)
     layer.replace_input_with(2, value)

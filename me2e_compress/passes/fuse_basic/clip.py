@@ -7,8 +7,8 @@ Result:  Clip(x, 0, 6)
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, static_shape
-from me2e_compress.passes.edits import Array, constant_value, put
+from me2e_compress.graph import add_constant, array_of, static_shape
+from me2e_compress.passes.edits import Array, put
 from me2e_compress.passes.fuse_basic.match import Site, sole_maker
 
 SINCE = 12
@@ -40,7 +40,7 @@ def fuse_clip(node: ir.Node, site: Site) -> bool:
         return site.refuse(f"Clip of all types needs opset {SINCE}")
     name = node.outputs[0].name or ""
     limits = [
-        constant_value(site.graph, array, f"{name}_{which}")
+        add_constant(site.graph, array, f"{name}_{which}")
         for which, array in (("min", low), ("max", high))
     ]
     put(node, "Clip", [bound[0], *limits], by=site.by, sources=[inner])

@@ -9,8 +9,8 @@ import dataclasses
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, static_shape
-from me2e_compress.passes.edits import constant_value, put, single_reader
+from me2e_compress.graph import add_constant, array_of, static_shape
+from me2e_compress.passes.edits import put, single_reader
 from me2e_compress.passes.fuse_basic.match import (
     Site,
     constant_and_rest,
@@ -47,7 +47,7 @@ def fuse_layer_norm(node: ir.Node, site: Site) -> bool:
     last, bias = _affine(last, "Add", shape[core.axis :])
     if scale is None:
         ones = np.ones(shape[core.axis :], kind.numpy())
-        scale = constant_value(site.graph, ones, f"{node.outputs[0].name}_scale")
+        scale = add_constant(site.graph, ones, f"{node.outputs[0].name}_scale")
     put(
         last,
         "LayerNormalization",

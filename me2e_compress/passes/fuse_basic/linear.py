@@ -10,8 +10,14 @@ attention patterns and misplace the quantizers.
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, provenance, replace_value, static_shape
-from me2e_compress.passes.edits import FLOATS, constant_value, put, single_reader
+from me2e_compress.graph import (
+    add_constant,
+    array_of,
+    provenance,
+    replace_value,
+    static_shape,
+)
+from me2e_compress.passes.edits import FLOATS, put, single_reader
 from me2e_compress.passes.fuse_basic.match import (
     Numbers,
     Site,
@@ -98,7 +104,7 @@ def fuse_chain(node: ir.Node, site: Site) -> bool:
         return site.refuse("constants that grow when combined")
     array = together.astype(kind.numpy())
     name = f"{node.outputs[0].name}_{node.op_type.lower()}"
-    value = constant_value(site.graph, array, name)
+    value = add_constant(site.graph, array, name)
     put(node, node.op_type, [inner[1], value], by=site.by, sources=[inner_node])
     return True
 
