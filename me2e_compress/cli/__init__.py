@@ -1,51 +1,12 @@
 """The ``me2e-compress`` command, one short file each; the only room that prints."""
 
-import sys
-
-import typer
-from rich.markup import escape
-
-from me2e_compress.cli.compare import compare
-from me2e_compress.cli.compress import compress
-from me2e_compress.cli.console import errors
-from me2e_compress.cli.demo import demo
-from me2e_compress.cli.doctor import doctor
-from me2e_compress.cli.export import export
-from me2e_compress.cli.extras import closed_loop
-from me2e_compress.cli.frames import frames
-from me2e_compress.cli.inspect import inspect
-from me2e_compress.cli.profile import profile
-from me2e_compress.errors import Me2eError
-
-__all__ = ["app", "main"]
-
-app = typer.Typer(
-    name="me2e-compress",
-    help="Make modular end-to-end driving models small, and prove that they drive.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-for command in (demo, doctor, export, inspect, frames, compress, compare, profile):
-    app.command()(command)
-closed_loop(app)
-
 
 def main() -> int:
-    """Run the command; our own errors become one line and exit code 1."""
-    try:
-        app(standalone_mode=True)
-    except (Me2eError, OSError) as error:
-        line = " ".join(str(error).split())
-        errors.print(f"me2e-compress: {escape(line)}", soft_wrap=True)
-        return 1
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else int(bool(done.code))
-    except KeyboardInterrupt:
-        errors.print("me2e-compress: interrupted")
-        return 130
-    return 0
+    """Run the command and give its exit code.
 
+    The commands are imported here, not above: the processes that ``evaluate`` spawns
+    import this module again, and need none of them.
+    """
+    from me2e_compress.cli.app import run
 
-if __name__ == "__main__":
-    sys.exit(main())
+    return run()

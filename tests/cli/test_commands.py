@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from me2e_compress.cli import app
+from me2e_compress.cli.app import app
 from tests.cli.conftest import Command
 
 NAMES = sorted(typer.main.get_command(app).commands)  # type: ignore[attr-defined]

@@ -1,0 +1,43 @@
+"""All commands together."""
+
+import typer
+from rich.markup import escape
+
+from me2e_compress.cli.compare import compare
+from me2e_compress.cli.compress import compress
+from me2e_compress.cli.console import errors
+from me2e_compress.cli.demo import demo
+from me2e_compress.cli.doctor import doctor
+from me2e_compress.cli.export import export
+from me2e_compress.cli.extras import closed_loop
+from me2e_compress.cli.frames import frames
+from me2e_compress.cli.inspect import inspect
+from me2e_compress.cli.profile import profile
+from me2e_compress.errors import Me2eError
+
+app = typer.Typer(
+    name="me2e-compress",
+    help="Make modular end-to-end driving models small, and prove that they drive.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for command in (demo, doctor, export, inspect, frames, compress, compare, profile):
+    app.command()(command)
+closed_loop(app)
+
+
+def run() -> int:
+    """Run the command; our own errors become one line and exit code 1."""
+    try:
+        app(standalone_mode=True)
+    except (Me2eError, OSError) as error:
+        line = " ".join(str(error).split())
+        errors.print(f"me2e-compress: {escape(line)}", soft_wrap=True)
+        return 1
+    except SystemExit as done:
+        return done.code if isinstance(done.code, int) else int(bool(done.code))
+    except KeyboardInterrupt:
+        errors.print("me2e-compress: interrupted")
+        return 130
+    return 0
