@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -42,7 +43,8 @@ def table(title: str, *columns: str, left: int = 1) -> Table:
     """Make a table whose first ``left`` columns are words and the rest numbers."""
     made = Table(title=title, title_justify="left", title_style="bold")
     for at, name in enumerate(columns):
-        made.add_column(name, justify="left" if at < left else "right")
+        side: Literal["left", "right"] = "left" if at < left else "right"
+        made.add_column(name, justify=side, overflow="fold")
     return made
 
 

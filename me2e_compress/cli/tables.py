@@ -81,6 +81,8 @@ def modules_table(before: Iterable[Item], after: Iterable[Item]) -> Table:
             f" {megabytes(now.weight_bytes if now else 0)}",
             f"{_giga(item.macs)} → {_giga(now.macs if now else 0)}",
         )
+    shown.caption = "before: once imported, its shape arithmetic done"
+    shown.caption_justify = "left"
     return shown
 
 
