@@ -22,7 +22,8 @@ class Step:
         text: the pass with its options, as a pipeline writes it.
         exact: whether it promises the same outputs.
         changes: places it changed.
-        seconds: CPU time of the pass alone, without the checks after it.
+        seconds: CPU time of its transaction: clone, pass and contract checks, without
+            the numeric check of exact passes.
         before: the graph's size before.
         after: the graph's size after.
         notes: what it has to say.
