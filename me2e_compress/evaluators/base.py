@@ -28,7 +28,9 @@ class Observation:
     """What a policy is shown at one decision.
 
     Attributes:
-        time_us: Simulated time since the route began, in microseconds.
+        time_us: Simulated time since the route began, in microseconds; a model is told
+            it in seconds (``timestamp``), so that a recurrent one knows how far apart
+            its frames are.
         images: Six cameras, uint8 [6, H, W, 3] in RGB, in the order of the rig;
             None unless the policy asks for images.
         lidar2img: float32 [6, 4, 4], ego frame (x forward, y left, z up, metres) to

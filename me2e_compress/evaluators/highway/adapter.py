@@ -19,6 +19,7 @@ IMAGE = "me2e.image"
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 Triple: TypeAlias = tuple[float, float, float]
+Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]
 
 
 class ImageNormalization(BaseModel):
@@ -70,7 +71,8 @@ class Adapter(BaseModel):
     """What a TOML adapter says; everything left out follows from the model.
 
     Attributes:
-        inputs: The contract's name (img, lidar2img, can_bus, command) to the graph's.
+        inputs: The contract's name (img, lidar2img, can_bus, command, timestamp) to
+            the graph's.
         recurrent: Recurrent input to the output that answers it.
         plan: Which output is the plan, whether it holds steps, which mode is taken;
             ``command_input = "command"`` lets the navigator's command pick it.
@@ -80,7 +82,7 @@ class Adapter(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    inputs: dict[Literal["img", "lidar2img", "can_bus", "command"], str] = {}
+    inputs: dict[Contract, str] = {}
     recurrent: dict[str, str] | None = None
     plan: PlanAdapter | None = None
     image: ImageNormalization | None = None

@@ -24,15 +24,19 @@ from me2e_compress.metrics.adapter import PlanAdapter
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Session
 
+MICROSECONDS = 1_000_000
+"""In a second."""
+
 
 @dataclass
 class OnnxPolicy:
     """Keeps the policy contract with an ONNX graph, one onnxruntime thread, no spin.
 
-    Inputs ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus`` [18]
-    and ``command`` int64 [1], of which a model may lack any; recurrent inputs ``X``
-    answered by ``X_out``, zeros at the start of a route; output ``plan`` [1, 6, 2]. An
-    `Adapter` explains what is named or laid out otherwise.
+    Inputs ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus`` [18],
+    ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route began, of
+    which a model may lack any; recurrent inputs ``X`` answered by ``X_out``, zeros at
+    the start of a route; output ``plan`` [1, 6, 2]. An `Adapter` explains what is named
+    or laid out otherwise.
 
     Attributes:
         session: The loaded graph.
@@ -117,6 +121,7 @@ class OnnxPolicy:
             "lidar2img": self.adapter.projection(observation.lidar2img),
             "can_bus": observation.can_bus,
             "command": np.asarray(observation.command),
+            "timestamp": np.asarray(observation.time_us / MICROSECONDS),
         }
         if self.normalization is not None:
             if observation.images is None:

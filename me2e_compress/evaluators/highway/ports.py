@@ -17,6 +17,7 @@ CONTRACT: Mapping[str, Shape] = {
     "lidar2img": (CAMERAS, 4, 4),
     "can_bus": (CAN_BUS_SIZE,),
     "command": (),
+    "timestamp": (),
 }
 """Inputs of the contract without their batch dimension, which is one or open."""
 

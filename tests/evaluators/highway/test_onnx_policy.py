@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from pathlib import Path
 
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import Observation
+from me2e_compress.evaluators.base import Observation, Plan
 from me2e_compress.evaluators.highway.adapter import (
     Adapter,
     Axes,
@@ -91,6 +92,55 @@ def test_recurrent_state_is_fed_forward_and_reset(tmp_path: Path) -> None:
     assert counted == [1.0, 2.0, 3.0, 1.0, 2.0, 3.0]
 
 
+CLOCK = {
+    "inputs": "float[1] timestamp, float[1] last",
+    "body": """
+        since = Sub (timestamp, last)
+        plan = Add (zero, since)
+        last_out = Identity (timestamp)""",
+    "outputs": "float[1, 6, 2] plan, float[1] last_out",
+    "initializers": ", float[1, 6, 2] zero = {" + ", ".join(["0.0"] * 12) + "}",
+}
+
+
+@pytest.mark.parametrize("name", ["timestamp", "seconds"])
+def test_a_recurrent_model_knows_how_far_apart_its_frames_are(
+    tmp_path: Path, name: str
+) -> None:
+    renamed = {key: text.replace("timestamp", name) for key, text in CLOCK.items()}
+    path = straight_on(tmp_path / "m.onnx", **renamed)  # type: ignore[arg-type]
+    policy = OnnxPolicy.open(path, Adapter(inputs={"timestamp": name}))
+    elapsed = []
+    for _ in range(2):
+        policy.reset(EXIT)
+        for time_us in (0, 350_000, 400_000):
+            seen = dataclasses.replace(observation(), time_us=time_us)
+            elapsed.append(policy.plan(seen)[0, 0])
+
+    assert elapsed == pytest.approx([0.0, 0.35, 0.05] * 2)
+
+
+def test_the_clock_starts_with_the_route(tmp_path: Path) -> None:
+    """A plan of as many metres as seconds: the first decision is told 0."""
+    body = "plan = Add (zero, timestamp)"
+    clock = {**CLOCK, "inputs": "float[1] timestamp", "body": body}
+    clock["outputs"] = "float[1, 6, 2] plan"
+    policy = OnnxPolicy.open(straight_on(tmp_path / "m.onnx", **clock))  # type: ignore[arg-type]
+    told = []
+    answer = policy.plan
+
+    def listen(seen: Observation) -> Plan:
+        told.append(float(answer(seen)[0, 0]))
+        return np.zeros((6, 2))
+
+    policy.plan = listen  # type: ignore[method-assign]
+    episode = drive(EXIT, policy, Conditions())
+
+    decided = [decision.time_us / 1e6 for decision in episode.decisions]
+    assert told == pytest.approx(decided)
+    assert told[0] == 0.0
+
+
 def test_an_adapter_names_the_recurrent_pair(tmp_path: Path) -> None:
     named = {key: text.replace("steps_out", "state") for key, text in COUNTER.items()}
     path = straight_on(tmp_path / "m.onnx", **named)  # type: ignore[arg-type]
@@ -154,6 +204,7 @@ def test_the_projection_is_turned_with_the_axes() -> None:
         ({"inputs": "float[1, 5, 4, 4] lidar2img"}, "lidar2img has shape [1, 5, 4, 4]"),
         ({"inputs": "float[2, 6, 4, 4] lidar2img"}, "it must be [1, 6, 4, 4]"),
         ({"inputs": "float[17] can_bus"}, "it must be [1, 18]"),
+        ({"inputs": "float[2] timestamp"}, "timestamp has shape [2], it must be [1]"),
         ({"inputs": "float[18] speed"}, "input speed is none of img, lidar2img"),
         ({"inputs": "string[1] command"}, "it cannot be fed"),
         (
