@@ -28,6 +28,23 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> Interval:
     return resampled_interval(mean, len(values), seed)
 
 
+def paired_interval(
+    values: Sequence[float], reference: Sequence[float], seed: int = 0
+) -> Interval:
+    """Return the interval of the mean difference of two drivers on the same routes.
+
+    Routes are drawn, not drivers: what makes a route hard for both cancels out, so
+    the interval is narrower than the two of the means suggest.
+
+    Args:
+        values: One a route.
+        reference: The other driver's, in the same order of routes.
+        seed: The same seed gives the same interval.
+    """
+    gaps = [one - other for one, other in zip(values, reference, strict=True)]
+    return bootstrap_interval(gaps, seed)
+
+
 def resampled_interval(
     statistic: Callable[[npt.NDArray[np.int64]], Floats], routes: int, seed: int = 0
 ) -> Interval:
