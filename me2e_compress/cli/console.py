@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from me2e_compress.graph import file_bytes as file_bytes
+
 console = Console(record=True)
 errors = Console(stderr=True, highlight=False)
 
@@ -61,12 +63,6 @@ def megabytes(count: float) -> str:
 def number(value: float | None, form: str = ",.0f") -> str:
     """Write a number, or a dash for what was not measured."""
     return "-" if value is None else format(value, form)
-
-
-def file_bytes(path: Path) -> int:
-    """Count the bytes of a model: the file and the weights beside it."""
-    data = path.with_name(path.name + ".data")
-    return path.stat().st_size + (data.stat().st_size if data.exists() else 0)
 
 
 def _plain(value: object) -> object:

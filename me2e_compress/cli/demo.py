@@ -28,7 +28,7 @@ from me2e_compress.cli.tables import (
     steps_table,
     verification_table,
 )
-from me2e_compress.modules import Item
+from me2e_compress.modules import Item, map_of
 from me2e_compress.runtime.race import Lap, race
 from me2e_compress.runtime.session import Session
 
@@ -73,7 +73,7 @@ def demo(
 
 def _weigh(path: Path) -> tuple[Item, ...]:
     model = graph.load(path)
-    return weigh(model, job.modules_of(model, None))
+    return weigh(model, map_of(model, None))
 
 
 def _files(paths: tuple[Path, ...], frames: Path, rounds: int, threads: int) -> Table:

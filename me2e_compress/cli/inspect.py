@@ -16,9 +16,9 @@ from me2e_compress.cli.console import (
     print_json,
     table,
 )
-from me2e_compress.cli.job import modules_of, run_on
+from me2e_compress.cli.job import run_on
 from me2e_compress.graph import Port, provenance
-from me2e_compress.modules import Item, ModuleMap, assign, itemise
+from me2e_compress.modules import Item, ModuleMap, assign, itemise, map_of
 
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
@@ -77,7 +77,7 @@ def inspect(
 def look(path: Path, module_map: str | None) -> Inspection:
     """Read a file and weigh its modules."""
     model = graph.load(path)
-    modules = modules_of(model, module_map)
+    modules = map_of(model, module_map)
     placed = assign(model, modules)
     inputs, outputs = graph.interface(model)
     items = itemise(model, modules, placed.module_of)

@@ -7,9 +7,9 @@ import onnx_ir as ir
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.cli.console import progress
-from me2e_compress.errors import GraphError, ModuleMapError, RecipeError
+from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.manager import PassManager, Report
-from me2e_compress.modules import ModuleMap, detect
+from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.atomic import write_json
@@ -64,7 +64,7 @@ def run(
 ) -> Report:
     """Load, check the frames, run the passes."""
     loaded = graph.load(model)
-    modules = modules_of(loaded, module_map)
+    modules = map_of(loaded, module_map)
     recording = None
     if frames is not None:
         recording = CalibrationSet(frames)
@@ -77,19 +77,6 @@ def run(
 def run_on(model: ir.Model, passes: tuple[Pass, ...], modules: ModuleMap) -> ir.Model:
     """Run passes on a graph in memory, without frames and unverified."""
     return PassManager(passes, verify_frames=0).run(model, Context(modules)).model
-
-
-def modules_of(model: ir.Model, module_map: str | None) -> ModuleMap:
-    """Load the map that is asked for, or find the preset that fits.
-
-    A graph that no preset fits is one module, named ``model``.
-    """
-    if module_map is not None:
-        return ModuleMap.load(module_map)
-    try:
-        return detect(model)
-    except ModuleMapError:
-        return ModuleMap.whole()
 
 
 def write(report: Report, source: Path, output: Path) -> Path:

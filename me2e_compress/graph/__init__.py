@@ -5,7 +5,13 @@ package says about it, besides walking nodes and values.
 """
 
 from me2e_compress.graph.digest import digest
-from me2e_compress.graph.files import is_external, load, save, sha256_of
+from me2e_compress.graph.files import (
+    file_bytes,
+    is_external,
+    load,
+    save,
+    sha256_of,
+)
 from me2e_compress.graph.interface import Port, interface
 from me2e_compress.graph.measure import Size, macs, node_count, size
 from me2e_compress.graph.provenance import Provenance
@@ -25,6 +31,7 @@ __all__ = [
     "add_constant",
     "array_of",
     "digest",
+    "file_bytes",
     "infer_shapes",
     "interface",
     "is_external",

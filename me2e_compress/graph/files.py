@@ -80,6 +80,12 @@ def is_external(model: ir.Model) -> bool:
     return any(True for _ in _external(model))
 
 
+def file_bytes(path: Path) -> int:
+    """Count the bytes of a model: the file and the weights beside it."""
+    data = path.with_name(path.name + ".data")
+    return path.stat().st_size + (data.stat().st_size if data.exists() else 0)
+
+
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
     seal = hashlib.sha256()

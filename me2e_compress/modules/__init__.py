@@ -1,7 +1,7 @@
 """Modules: which node of a graph belongs to which part of the driving stack."""
 
 from me2e_compress.modules.assign import Assignment, Placement, assign
-from me2e_compress.modules.detect import detect
+from me2e_compress.modules.detect import detect, map_of
 from me2e_compress.modules.inventory import Inventory, Weight, inventory
 from me2e_compress.modules.itemise import Item, itemise
 from me2e_compress.modules.map import Module, ModuleMap, Role, Substitute, presets
@@ -24,6 +24,7 @@ __all__ = [
     "exits",
     "inventory",
     "itemise",
+    "map_of",
     "presets",
     "scope_of",
 ]

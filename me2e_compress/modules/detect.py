@@ -41,6 +41,26 @@ def detect(model: ir.Model) -> ModuleMap:
     return ModuleMap.load(best)
 
 
+def map_of(model: ir.Model, name: str | None) -> ModuleMap:
+    """Load the map that is asked for, or find the preset that fits.
+
+    A graph that no preset fits is one module, named ``model``.
+
+    Args:
+        model: The graph.
+        name: A preset or a TOML file; None to look for a preset.
+
+    Raises:
+        ModuleMapError: No such map.
+    """
+    if name is not None:
+        return ModuleMap.load(name)
+    try:
+        return detect(model)
+    except ModuleMapError:
+        return ModuleMap.whole()
+
+
 def _fit(modules: ModuleMap, paths: list[str]) -> tuple[float, int]:
     claimed = [module for path in paths if (module := modules.match(path)) is not None]
     return len(dict.fromkeys(claimed)) / len(modules.modules), len(claimed)
