@@ -57,6 +57,11 @@ class Driver:
         return "+".join(digests)
 
     @property
+    def is_model(self) -> bool:
+        """Whether it is an ONNX file, not one of the drivers that are built in."""
+        return self.name != EXPERT and not self._is_blind
+
+    @property
     def _is_blind(self) -> bool:
         return self.name == BLIND or self.name.startswith(f"{BLIND}:")
 
