@@ -1,12 +1,24 @@
 """Models timed side by side, so that a noisy machine is noisy to all of them."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain, islice, repeat
+from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
 
-from me2e_compress.runtime.frames import Frame
+from me2e_compress import graph
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.frames import Frame, Frames
+from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.profile import WARM_UP, TimedSession, processor
 from me2e_compress.runtime.session import Session, replay
+
+BLOCK = 10
+"""Inferences of one model in a row: as warm as alone, and a noise that lasts a second
+falls on all models."""
+RE_WARM = 2
+"""Inferences at the start of a block that do not count: the caches are another's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,3 +72,63 @@ def race(
                 wall[name].append(perf_counter() - start)
                 cpu[name].append(process_time() - used)
     return {name: Lap(tuple(wall[name]), tuple(cpu[name])) for name in sessions}
+
+
+def traces_in_turn(
+    models: Mapping[str, Path],
+    frames: Frames,
+    *,
+    samples: int,
+    warm_up: int = WARM_UP,
+    threads: int = 1,
+    on_sample: Callable[[int, int, str], None] = lambda done, total, name: None,
+) -> dict[str, LatencyTrace]:
+    """Record the latency of models, each warm and alone, block by block in turn.
+
+    Recurrent state is fed forward and reset where scenes begin; the recording is
+    repeated as often as it takes.
+
+    Args:
+        models: ONNX files by name.
+        frames: what they see.
+        samples: latencies of each model.
+        warm_up: inferences of each before the first block.
+        threads: of onnxruntime.
+        on_sample: told samples done, samples in all and the model's name.
+
+    Raises:
+        EvaluationError: there is nothing to measure.
+        GraphError: a model cannot be run.
+        FramesError: a frame does not fit.
+    """
+    if samples < 1 or warm_up < 0 or not len(frames):
+        raise EvaluationError(
+            f"{samples} samples after {warm_up} of warm-up on {len(frames)} frames: "
+            "at least one sample and one frame are needed"
+        )
+    sessions = {
+        name: TimedSession(path, threads=threads) for name, path in models.items()
+    }
+    runs = {
+        name: replay(session, chain.from_iterable(repeat(frames)))
+        for name, session in sessions.items()
+    }
+    kept = {name: list[int]() for name in models}
+    for run in runs.values():
+        _advance(run, warm_up)
+    for done in range(0, samples, BLOCK):
+        block = min(BLOCK, samples - done)
+        for place, (name, session) in enumerate(sessions.items()):
+            _advance(runs[name], RE_WARM + block)
+            kept[name] += session.taken_us[-block:]
+            on_sample(done * len(models) + place * block, samples * len(models), name)
+    machine = f"{processor()}, onnxruntime on {threads or 'all'} threads, in turn"
+    return {
+        name: LatencyTrace(graph.sha256_of(path), machine, tuple(kept[name]))
+        for name, path in models.items()
+    }
+
+
+def _advance(runs: Iterator[object], count: int) -> None:
+    for _ in islice(runs, count):
+        pass
