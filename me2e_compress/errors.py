@@ -9,6 +9,7 @@
   x PassError            a pass broke (the cause is chained)
   x VerificationError    the graph after a pass is not a valid successor
   x EvaluationError      a route, a policy or a results folder is not usable
+  x StudyError           a study is malformed, or names what it does not have
   x MissingExtraError    an optional package is not installed
 
 Every message says what was found, what there is, and names the culprit, on one line.
@@ -49,6 +50,10 @@ class VerificationError(Me2eError):
 
 class EvaluationError(Me2eError):
     """A route, a policy or a folder of results is not usable."""
+
+
+class StudyError(Me2eError):
+    """A study is malformed, or names what it does not have."""
 
 
 class MissingExtraError(Me2eError):

@@ -1,0 +1,18 @@
+"""Schemes held against each other: size, latency, fidelity and the road."""
+
+from me2e_compress.study.definition import Condition, Scheme, Study, Timing
+from me2e_compress.study.file import load_study
+from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.run import run_study
+from me2e_compress.study.workplace import Listener
+
+__all__ = [
+    "Condition",
+    "Listener",
+    "Outcome",
+    "Scheme",
+    "Study",
+    "Timing",
+    "load_study",
+    "run_study",
+]

@@ -1,0 +1,194 @@
+"""What a study is: schemes, the conditions they drive under, the one they face."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from me2e_compress.errors import StudyError
+from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.latency import parse_latency
+from me2e_compress.passes import Pass
+
+TRACE = "trace"
+"""A condition's latency: what was measured of each model, under the device scale."""
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """One way to have a driver: a file as it is, or what passes make of it.
+
+    Args:
+        name: Letters, digits, ``_``, ``+`` and ``-``; names its folder of results.
+        policy: ``expert``, ``blind``, ``blind:MPS`` or the path of an ONNX file.
+        passes: What is applied to the file; none leaves it as it is.
+        module_map: Preset or TOML file for the passes; None finds the preset.
+        adapter: TOML file that adapts the model to the policy contract.
+        trace: Latencies recorded on a device; None measures them here.
+
+    Raises:
+        StudyError: A bad name, or passes, an adapter or a trace without a model.
+    """
+
+    name: str
+    policy: str
+    passes: tuple[Pass, ...] = ()
+    module_map: str | None = None
+    adapter: Path | None = None
+    trace: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what could not be run."""
+        _check_name("scheme", self.name)
+        options = (self.passes, self.module_map, self.adapter, self.trace)
+        if not self.is_model and any(options):
+            raise StudyError(
+                f"scheme {self.name}: {self.policy} is no model: there is nothing "
+                "to compress, adapt or time"
+            )
+
+    @property
+    def is_model(self) -> bool:
+        """Whether an ONNX file drives."""
+        return Driver(self.policy).is_model
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What decisions cost.
+
+    Args:
+        name: As a scheme's.
+        latency: ``none``, ``fps:F``, or ``trace``: each model's own latencies.
+
+    Raises:
+        StudyError: A bad name.
+        EvaluationError: Another latency.
+    """
+
+    name: str
+    latency: str
+
+    def __post_init__(self) -> None:
+        """Refuse a latency that nobody knows."""
+        _check_name("condition", self.name)
+        if self.traced:
+            return
+        if self.latency.startswith(TRACE) or self.latency == "measured":
+            raise StudyError(
+                f"condition {self.name}: latency {self.latency!r}: a study knows "
+                f"none, fps:F and {TRACE}"
+            )
+        parse_latency(self.latency)
+
+    @property
+    def traced(self) -> bool:
+        """Whether each model is charged what was measured of it."""
+        return self.latency == TRACE
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How latencies are measured, and what device they stand for.
+
+    Args:
+        samples: Inferences that count, of each model.
+        threads: Of onnxruntime.
+        baseline_median_s: Median latency of the baseline on the device imagined; one
+            scale makes it so, for all models alike. None takes this machine as it is.
+
+    Raises:
+        StudyError: A number that is not positive.
+    """
+
+    samples: int = 200
+    threads: int = 1
+    baseline_median_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be measured."""
+        median_s = self.baseline_median_s
+        if self.samples < 1 or self.threads < 1:
+            raise StudyError(
+                f"latency: {self.samples} samples on {self.threads} threads: both must "
+                "be 1 or more"
+            )
+        if median_s is not None and not 0.0 < median_s < float("inf"):
+            raise StudyError(f"latency: a median of {median_s} s is not positive")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Schemes x conditions on the same routes.
+
+    Args:
+        title: Heads the report.
+        schemes: In the order of the tables.
+        conditions: In the order of the tables.
+        baseline: Name of the scheme that the others are held against.
+        routes: What each of them drives.
+        set_size: How many routes the whole set has.
+        frames: Folder of recorded frames that passes calibrate on.
+        held_out: Folder of other frames: fidelity and latency are measured on them.
+        timing: How latencies are measured.
+        seed: Of bootstraps, of passes and of draws from traces.
+
+    Raises:
+        StudyError: Nothing to drive, a name twice, a baseline that is no scheme, or a
+            trace asked for without frames to measure it on.
+    """
+
+    title: str
+    schemes: tuple[Scheme, ...]
+    conditions: tuple[Condition, ...]
+    baseline: str
+    routes: tuple[Route, ...]
+    set_size: int
+    frames: Path | None = None
+    held_out: Path | None = None
+    timing: Timing = field(default_factory=Timing)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what could not be finished."""
+        _unique("scheme", (scheme.name for scheme in self.schemes))
+        _unique("condition", (condition.name for condition in self.conditions))
+        names = [scheme.name for scheme in self.schemes]
+        if self.baseline not in names:
+            raise StudyError(
+                f"baseline {self.baseline!r} is no scheme; there are {', '.join(names)}"
+            )
+        if not self.routes:
+            raise StudyError(f"{self.title}: there is no route to drive")
+        untimed = [each for each in self.schemes if each.is_model and not each.trace]
+        traced = [each.name for each in self.conditions if each.traced]
+        if traced and untimed and self.held_out is None:
+            raise StudyError(
+                f"condition {traced[0]}: the latency of {untimed[0].name} is measured "
+                "on held-out frames, and there are none (held_out = FRAMES)"
+            )
+
+    @property
+    def reference(self) -> Scheme:
+        """The baseline."""
+        return next(each for each in self.schemes if each.name == self.baseline)
+
+
+def _check_name(kind: str, name: str) -> None:
+    if _NAME.fullmatch(name) is None:
+        raise StudyError(
+            f"{kind} {name!r}: a name is made of letters, digits, '_', '+' and '-'"
+        )
+
+
+def _unique(kind: str, names: Iterable[str]) -> None:
+    counts = Counter(names)
+    if not counts:
+        raise StudyError(f"the study has no {kind}")
+    name, count = counts.most_common(1)[0]
+    if count > 1:
+        raise StudyError(f"{count} {kind}s are named {name}")

@@ -1,0 +1,180 @@
+"""Every scheme under every condition, driven and scored."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.evaluators.highway.drivers import image_size_of
+from me2e_compress.evaluators.highway.engine import Engine
+from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
+from me2e_compress.evaluators.highway.runner import Conditions
+from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.metrics.differences import Difference, difference
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.scores import Scores, score
+from me2e_compress.study.definition import Condition, Study
+from me2e_compress.study.models import Contender
+from me2e_compress.study.timing import Clock
+from me2e_compress.study.workplace import Listener, Workplace
+
+
+@dataclass(frozen=True)
+class RouteOutcome:
+    """One route of one drive.
+
+    Attributes:
+        route: Its id.
+        driving_score: Percent.
+        succeeded: The whole route without an infraction.
+        ending: Why it was over, in words.
+    """
+
+    route: str
+    driving_score: float
+    succeeded: bool
+    ending: str
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One scheme under one condition.
+
+    Attributes:
+        scheme: Its name.
+        condition: Its name.
+        scores: Over all routes; None where it was not driven.
+        difference: To the baseline under the same condition, paired by route; None
+            for the baseline itself and where one of the two was not driven.
+        routes: One a route, in the order of the study.
+        reason: Why it was not driven; empty if it was.
+    """
+
+    scheme: str
+    condition: str
+    scores: Scores | None
+    difference: Difference | None = None
+    routes: tuple[RouteOutcome, ...] = ()
+    reason: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return scores, difference and routes."""
+        return {
+            "scheme": self.scheme,
+            "condition": self.condition,
+            "reason": self.reason or None,
+            "scores": self.scores.to_json() if self.scores else None,
+            "difference": self.difference.to_json() if self.difference else None,
+            "routes": [
+                {
+                    "route": each.route,
+                    "driving_score": each.driving_score,
+                    "succeeded": each.succeeded,
+                    "ending": each.ending,
+                }
+                for each in self.routes
+            ],
+        }
+
+
+@dataclass(frozen=True)
+class Road:
+    """What all drives of a study share.
+
+    Args:
+        study: Schemes, conditions, routes.
+        clock: Latencies of the models.
+        workplace: Where results go.
+        engine: Where routes are driven.
+        listener: Who is told.
+    """
+
+    study: Study
+    clock: Clock
+    workplace: Workplace
+    engine: Engine
+    listener: Listener
+
+    def under(
+        self, condition: Condition, contenders: Sequence[Contender]
+    ) -> tuple[Drive, ...]:
+        """Drive all schemes under one condition, the baseline first.
+
+        Raises:
+            EvaluationError: A folder is of another evaluation or cannot be written.
+        """
+        names = [each.scheme.name for each in contenders]
+        baseline = contenders[names.index(self.study.baseline)]
+        reference = self._episodes(baseline, condition)
+        return tuple(
+            self._drive(
+                each,
+                condition,
+                reference if each is baseline else self._episodes(each, condition),
+                None if each is baseline else reference,
+            )
+            for each in contenders
+        )
+
+    def job(self, contender: Contender, condition: Condition) -> Job | None:
+        """Return who drives under what; None if its latency is not known."""
+        latency = self.clock.source(contender.scheme, condition, self.study.seed)
+        if latency is None:
+            return None
+        size = image_size_of(contender.driver.open())
+        return Job(contender.driver, Conditions(latency, image_size=size))
+
+    def _episodes(
+        self, contender: Contender, condition: Condition
+    ) -> tuple[Episode, ...] | None:
+        job = self.job(contender, condition)
+        if job is None:
+            return None
+        evaluator = HighwayEvaluator(
+            job,
+            self.study.routes,
+            self.workplace.results(contender.scheme, condition),
+            self.study.set_size,
+            self.engine,
+            self._teller(f"{contender.scheme.name}, {condition.name}"),
+            self.listener.on_warning,
+        )
+        return tuple(evaluator.episodes())
+
+    def _drive(
+        self,
+        contender: Contender,
+        condition: Condition,
+        episodes: tuple[Episode, ...] | None,
+        reference: tuple[Episode, ...] | None,
+    ) -> Drive:
+        name, seed = contender.scheme.name, self.study.seed
+        if episodes is None:
+            why = "no model: it has no latency of its own"
+            if contender.model is not None:
+                why = f"its latency was not measured: {self.clock.reason}"
+            return Drive(name, condition.name, None, reason=why)
+        return Drive(
+            name,
+            condition.name,
+            score(episodes, self.study.set_size, seed),
+            None if reference is None else difference(episodes, reference, seed),
+            tuple(
+                RouteOutcome(
+                    each.route,
+                    route_score(each).composed,
+                    each.succeeded,
+                    each.ending.value,
+                )
+                for each in episodes
+            ),
+        )
+
+    def _teller(self, stage: str) -> Callable[[Progress], None]:
+        def tell(now: Progress) -> None:
+            words = ""
+            if now.driving_score is not None:
+                words = f"DS {now.driving_score:.1f}  SR {now.success_rate:.1f} %"
+            self.listener.on_progress(stage, now.done, now.total, words)
+
+        return tell

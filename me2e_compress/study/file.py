@@ -1,0 +1,169 @@
+"""A study as a TOML file."""
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from me2e_compress import recipe
+from me2e_compress.errors import StudyError
+from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
+from me2e_compress.passes import Pass
+from me2e_compress.study.definition import Condition, Scheme, Study, Timing
+
+Resolve = Callable[[str], Path]
+"""From the name of a model that ships to its file; the name itself if none does."""
+
+
+def load_study(path: Path, resolve: Resolve = Path, routes: str | None = None) -> Study:
+    """Read a study.
+
+    Files are looked for beside the study's own file.
+
+    Args:
+        path: The TOML file.
+        resolve: Finds models that are no files.
+        routes: Drive these instead of the study's.
+
+    Raises:
+        StudyError: No such file, not TOML, a key that is unknown, missing or of
+            another type, or a study that could not be finished.
+        RecipeError: An unknown recipe or pass.
+        EvaluationError: Unknown routes or latency.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise StudyError(f"{path}: not TOML: {error}") from error
+    try:
+        table = _Study.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        known = ", ".join(_keys_at(first["loc"]))
+        hint = f"; there are {known}" if first["type"] == "extra_forbidden" else ""
+        raise StudyError(f"{path}: {where}: {first['msg']}{hint}") from error
+    return _Reader(path, resolve).study(table, routes)
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class _Scheme(_Table):
+    name: str
+    policy: str
+    recipe: str | None = None
+    passes: str | None = None
+    map: str | None = None
+    adapter: str | None = None
+    trace: str | None = None
+
+
+class _Condition(_Table):
+    name: str
+    latency: str
+
+
+class _Latency(_Table):
+    samples: int = 200
+    threads: int = 1
+    baseline_median_s: float | None = None
+
+
+class _Study(_Table):
+    title: str
+    baseline: str
+    routes: str | int = "all"
+    seed: int = 0
+    frames: str | None = None
+    held_out: str | None = None
+    latency: _Latency = Field(default_factory=_Latency)
+    scheme: list[_Scheme]
+    condition: list[_Condition]
+
+
+_KINDS: dict[object, type[_Table]] = {
+    "scheme": _Scheme,
+    "condition": _Condition,
+    "latency": _Latency,
+}
+
+
+def _keys_at(where: tuple[int | str, ...]) -> list[str]:
+    """Name the keys that the table of a wrong key may have."""
+    kind = _KINDS.get(where[0], _Study) if len(where) > 1 else _Study
+    return list(kind.model_fields)
+
+
+class _Reader:
+    """Turns tables into a study; knows where its file lies."""
+
+    def __init__(self, path: Path, resolve: Resolve) -> None:
+        self.path, self.resolve = path, resolve
+
+    def study(self, table: _Study, routes: str | None) -> Study:
+        timing = table.latency
+        driven, set_size = self._routes(routes or str(table.routes))
+        return Study(
+            title=table.title,
+            schemes=tuple(self._scheme(each) for each in table.scheme),
+            conditions=tuple(
+                Condition(each.name, each.latency) for each in table.condition
+            ),
+            baseline=table.baseline,
+            routes=driven,
+            set_size=set_size,
+            frames=self._file(table.frames),
+            held_out=self._file(table.held_out),
+            timing=Timing(timing.samples, timing.threads, timing.baseline_median_s),
+            seed=table.seed,
+        )
+
+    def _scheme(self, table: _Scheme) -> Scheme:
+        policy = table.policy
+        if Driver(policy).is_model:
+            beside = self._beside(policy)
+            policy = str(beside if beside.is_file() else self.resolve(policy))
+        return Scheme(
+            table.name,
+            policy,
+            self._passes(table),
+            self._map(table.map),
+            self._file(table.adapter),
+            self._file(table.trace),
+        )
+
+    def _passes(self, table: _Scheme) -> tuple[Pass, ...]:
+        if table.recipe is not None and table.passes is not None:
+            raise StudyError(
+                f"{self.path}: scheme {table.name}: give a recipe or passes, not both"
+            )
+        if table.passes is not None:
+            return recipe.parse(table.passes)
+        if table.recipe is None:
+            return ()
+        beside = self._beside(table.recipe)
+        return recipe.load(beside if beside.is_file() else table.recipe)
+
+    def _map(self, name: str | None) -> str | None:
+        if name is None or not self._beside(name).is_file():
+            return name
+        return str(self._beside(name))
+
+    def _routes(self, which: str) -> tuple[tuple[Route, ...], int]:
+        if which.endswith(".json"):
+            found = load_routes(self._beside(which))
+            return found, len(found)
+        shipped = load_routes()
+        return pick_routes(shipped, which), len(shipped)
+
+    def _file(self, name: str | None) -> Path | None:
+        return None if name is None else self._beside(name)
+
+    def _beside(self, name: str) -> Path:
+        return self.path.parent / name

@@ -1,0 +1,109 @@
+"""The file that drives: given, or made by passes once and kept."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from me2e_compress import __version__, graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import StudyError
+from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap, map_of
+from me2e_compress.passes import Context
+from me2e_compress.passes.spec import to_text
+from me2e_compress.runtime.atomic import write_json
+from me2e_compress.study.definition import Scheme, Study
+from me2e_compress.study.workplace import Listener, Workplace
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A scheme whose driver is ready.
+
+    Attributes:
+        scheme: Which.
+        driver: What drives.
+        model: The ONNX file; None for a driver without one.
+        pipeline: What made it of the source, as text; empty if nothing did.
+        sha256: Of the model.
+        size_bytes: Of the model with its weights.
+    """
+
+    scheme: Scheme
+    driver: Driver
+    model: Path | None = None
+    pipeline: str = ""
+    sha256: str | None = None
+    size_bytes: int | None = None
+
+
+def contend(
+    study: Study, scheme: Scheme, workplace: Workplace, listener: Listener
+) -> Contender:
+    """Find or make a scheme's driver, and open it once.
+
+    Raises:
+        StudyError: No such model.
+        EvaluationError: It cannot drive.
+        Me2eError: A pass refused the graph or broke.
+    """
+    if not scheme.is_model:
+        driver = Driver(scheme.policy)
+        driver.open()
+        return Contender(scheme, driver)
+    model = source = Path(scheme.policy)
+    if not source.is_file():
+        raise StudyError(f"scheme {scheme.name}: {source}: no such model")
+    if scheme.passes:
+        model = _compressed(study, scheme, workplace, listener)
+    driver = Driver(str(model), scheme.adapter)
+    driver.open()
+    return Contender(
+        scheme,
+        driver,
+        model,
+        to_text(scheme.passes),
+        graph.sha256_of(model),
+        graph.file_bytes(model),
+    )
+
+
+def _compressed(
+    study: Study, scheme: Scheme, workplace: Workplace, listener: Listener
+) -> Path:
+    """Apply the passes, unless the same was done before; the report is written last."""
+    source = Path(scheme.policy)
+    frames = None if study.frames is None else CalibrationSet(study.frames)
+    path = workplace.model(scheme, _key(scheme, source, frames, study.seed))
+    report_path = path.with_name(f"{path.stem}.report.json")
+    if path.is_file() and report_path.is_file():
+        return path
+    loaded = graph.load(source)
+    if frames is not None:
+        frames.check(loaded)
+    context = Context(map_of(loaded, scheme.module_map), frames, study.seed)
+    manager = PassManager(scheme.passes, reproducers=path.parent)
+    stage = f"compress {scheme.name}"
+    report = manager.run(
+        loaded,
+        context,
+        lambda done, total, words: listener.on_progress(stage, done, total, words),
+    )
+    graph.save(report.model, path)
+    write_json(report_path, report.record(source, path), indent=2)
+    return path
+
+
+def _key(scheme: Scheme, source: Path, frames: CalibrationSet | None, seed: int) -> str:
+    """Hash everything that decides what the passes make."""
+    modules = scheme.module_map
+    decisive = (
+        __version__,
+        graph.sha256_of(source),
+        to_text(scheme.passes),
+        "" if frames is None else frames.fingerprint,
+        "" if modules is None else repr(ModuleMap.load(modules)),
+        str(seed),
+    )
+    return hashlib.sha256("\n".join(decisive).encode()).hexdigest()

@@ -1,0 +1,145 @@
+"""What a study found."""
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.metrics.measure import Measure
+from me2e_compress.runtime.profile import processor
+from me2e_compress.study.definition import Condition, Study
+from me2e_compress.study.drives import Drive
+from me2e_compress.study.fidelity import Faithfulness, measure_json
+from me2e_compress.study.models import Contender
+from me2e_compress.study.timing import Clock
+
+LATENCY_PERCENTILES = (50, 99)
+
+
+@dataclass(frozen=True)
+class SchemeOutcome:
+    """What a scheme is, apart from how it drives.
+
+    Attributes:
+        contender: Its driver and its file.
+        size_mb: Of the file with its weights, 1e6 bytes.
+        latency_ms: Percentile to milliseconds on the device.
+        fidelity: Its plan against the baseline's.
+    """
+
+    contender: Contender
+    size_mb: Measure
+    latency_ms: Mapping[int, Measure]
+    fidelity: Faithfulness
+
+    @property
+    def name(self) -> str:
+        """The scheme's name."""
+        return self.contender.scheme.name
+
+    @classmethod
+    def of(
+        cls, contender: Contender, clock: Clock, fidelity: Faithfulness
+    ) -> "SchemeOutcome":
+        """Put together what was found."""
+        size = contender.size_bytes
+        name = contender.scheme.name
+        why = "no model" if contender.model is None else clock.reason
+        return cls(
+            contender,
+            Measure(None, "MB", "no model") if size is None else _mb(size),
+            {
+                percent: _ms(clock.milliseconds(name, percent), why)
+                for percent in LATENCY_PERCENTILES
+            },
+            fidelity,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what the scheme is; all that was measured by a clock is `latency`."""
+        contender = self.contender
+        return {
+            "name": self.name,
+            "policy": contender.scheme.policy,
+            "pipeline": contender.pipeline or None,
+            "model_sha256": contender.sha256,
+            "size": measure_json(self.size_mb),
+            "fidelity": self.fidelity.to_json(),
+            "latency": {
+                f"p{percent}": measure_json(measure)
+                for percent, measure in self.latency_ms.items()
+            },
+        }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything that a study found, and what it was made with.
+
+    Attributes:
+        study: What was asked.
+        schemes: One a scheme, in the study's order.
+        drives: Condition by condition, the schemes in the study's order.
+        device_scale: How many times slower the device is than the machine timed on.
+        machine: What it was made on, in words.
+        versions: Of the packages that decide the result.
+    """
+
+    study: Study
+    schemes: tuple[SchemeOutcome, ...]
+    drives: tuple[Drive, ...]
+    device_scale: float
+    machine: str
+    versions: Mapping[str, str]
+
+    @property
+    def timed(self) -> bool:
+        """Whether the latency of any scheme is known."""
+        return any(each.latency_ms[50].value is not None for each in self.schemes)
+
+    def under(self, condition: Condition) -> tuple[Drive, ...]:
+        """Return the drives under one condition."""
+        return tuple(each for each in self.drives if each.condition == condition.name)
+
+    def scheme(self, name: str) -> SchemeOutcome:
+        """Return a scheme by its name."""
+        return next(each for each in self.schemes if each.name == name)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a document; the same study and seed give the same bytes but latency.
+
+        Latencies, and the scale taken from them, stand under the keys ``latency``.
+        """
+        study = self.study
+        return {
+            "title": study.title,
+            "baseline": study.baseline,
+            "seed": study.seed,
+            "routes": {"driven": len(study.routes), "set": study.set_size},
+            "conditions": [
+                {"name": each.name, "charged": each.latency}
+                for each in study.conditions
+            ],
+            "latency": {
+                "device_scale": self.device_scale,
+                "samples": study.timing.samples,
+                "threads": study.timing.threads,
+            },
+            "schemes": [each.to_json() for each in self.schemes],
+            "drives": [each.to_json() for each in self.drives],
+            "machine": self.machine,
+            "versions": dict(self.versions),
+        }
+
+
+def this_machine() -> str:
+    """Name processor and system, in words."""
+    return f"{processor()}, {platform.system()} {platform.machine()}"
+
+
+def _mb(size_bytes: int) -> Measure:
+    return Measure(size_bytes / 1e6, "MB")
+
+
+def _ms(value: float | None, why: str) -> Measure:
+    return Measure(value, "ms", "" if value is not None else why or "not measured")

@@ -1,0 +1,62 @@
+"""A whole study, from what is asked to what was found."""
+
+from pathlib import Path
+
+from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.manager.report import versions
+from me2e_compress.study.definition import Study
+from me2e_compress.study.drives import Road
+from me2e_compress.study.fidelity import judge
+from me2e_compress.study.models import Contender, contend
+from me2e_compress.study.outcome import Outcome, SchemeOutcome, this_machine
+from me2e_compress.study.timing import Clock, time_all
+from me2e_compress.study.workplace import SILENT, Listener, Workplace
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    engine: Engine | None = None,
+    listener: Listener = SILENT,
+) -> Outcome:
+    """Make the models, time them, hold them against the baseline, drive them.
+
+    Run again with the same folder it goes on: models, traces and routes that are there
+    are not made again. Studies may share a folder where they share schemes.
+
+    Args:
+        study: What is asked.
+        folder: Where models, traces and results go.
+        engine: Where routes are driven; None for one process of this machine.
+        listener: Who is told how it goes.
+
+    Raises:
+        Me2eError: A model cannot drive, a pass refused its graph, frames do not fit,
+            or the folder is of another study; one line that names the culprit.
+    """
+    workplace = Workplace(folder)
+    contenders = [
+        contend(study, scheme, workplace, listener) for scheme in study.schemes
+    ]
+    clock = time_all(study, contenders, workplace, listener)
+    schemes = _schemes(study, contenders, clock, listener)
+    road = Road(study, clock, workplace, engine or LocalEngine(), listener)
+    drives = [
+        drive
+        for condition in study.conditions
+        for drive in road.under(condition, contenders)
+    ]
+    return Outcome(
+        study, schemes, tuple(drives), clock.scale, this_machine(), versions()
+    )
+
+
+def _schemes(
+    study: Study, contenders: list[Contender], clock: Clock, listener: Listener
+) -> tuple[SchemeOutcome, ...]:
+    names = [each.scheme.name for each in contenders]
+    baseline = contenders[names.index(study.baseline)]
+    return tuple(
+        SchemeOutcome.of(each, clock, judge(study, baseline, each, listener))
+        for each in contenders
+    )
