@@ -16,6 +16,9 @@ from me2e_compress.study.definition import Study
 from me2e_compress.study.models import Contender
 from me2e_compress.study.workplace import Listener
 
+EXACT = "no noise: equal to the bit"
+"""Why a plan that did not move has no signal to noise."""
+
 
 @dataclass(frozen=True)
 class Faithfulness:
@@ -110,6 +113,6 @@ def _of(found: Fidelity, session: Session) -> Faithfulness:
         Measure(found.plan.max_m, "m"),
         Measure(sqnr_db, "dB")
         if math.isfinite(sqnr_db)
-        else Measure(None, "dB", "no noise: equal to the bit" if exact else "no plan"),
+        else Measure(None, "dB", EXACT if exact else "no plan"),
         found.frames,
     )

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.drives import Drive
+from me2e_compress.study.fidelity import EXACT
 from me2e_compress.study.outcome import Outcome, SchemeOutcome
 
 MISSING = "\N{EN DASH}"
 """Stands where nothing was measured."""
+INFINITE = "\N{INFINITY}"
 MINUS = "\N{MINUS SIGN}"
 
 
@@ -139,7 +141,8 @@ def estimate_cell(
 def measure_cell(measure: Measure, form: str) -> Cell:
     """Show a number, or a dash that knows why."""
     if measure.value is None:
-        return Cell(MISSING, reason=measure.reason)
+        infinite = measure.reason == EXACT
+        return Cell(INFINITE if infinite else MISSING, reason=measure.reason)
     return Cell(number(measure.value, form))
 
 

@@ -75,28 +75,52 @@ def time_all(
             missing.append(each)
     if study.held_out is None:
         return Clock(traces, _scale(study, traces), "no held-out frames were given")
-    if missing:
-        measured = _measured(study, missing, listener)
-        for each in missing:
-            name = each.scheme.name
-            measured[name].save(workplace.trace(each.scheme))
-            traces[name] = measured[name]
+    baseline = next(each for each in contenders if each.scheme is study.reference)
+    yardstick = None if baseline.scheme.trace else traces.get(study.baseline)
+    measured = _measured(study, missing, baseline, yardstick, listener)
+    for each in missing:
+        name = each.scheme.name
+        measured[name].save(workplace.trace(each.scheme))
+        traces[name] = measured[name]
     return Clock(traces, _scale(study, traces), "not a model")
 
 
 def _measured(
-    study: Study, missing: Sequence[Contender], listener: Listener
+    study: Study,
+    missing: Sequence[Contender],
+    baseline: Contender,
+    kept: LatencyTrace | None,
+    listener: Listener,
 ) -> dict[str, LatencyTrace]:
-    if study.held_out is None:
+    """Measure in turn, beside the baseline: it is the yardstick of another day.
+
+    Where the baseline's trace is kept, the others are put on its scale: machines are
+    slower on some days than on others.
+    """
+    if study.held_out is None or not missing:
         return {}
-    return traces_in_turn(
-        {each.scheme.name: each.model for each in missing if each.model is not None},
+    name = baseline.scheme.name
+    timed = missing if kept is None else (baseline, *missing)
+    found = traces_in_turn(
+        {each.scheme.name: each.model for each in timed if each.model is not None},
         CalibrationSet(study.held_out),
         samples=study.timing.samples,
         threads=study.timing.threads,
-        on_sample=lambda done, total, name: listener.on_progress(
-            "latency", done, total, name
+        on_sample=lambda done, total, words: listener.on_progress(
+            "latency", done, total, words
         ),
+    )
+    if kept is None:
+        return found
+    pace = kept.percentile_us(50) / max(1, found.pop(name).percentile_us(50))
+    return {each: _paced(trace, pace) for each, trace in found.items()}
+
+
+def _paced(trace: LatencyTrace, pace: float) -> LatencyTrace:
+    return LatencyTrace(
+        trace.model_sha256,
+        trace.machine,
+        tuple(round(sample * pace) for sample in trace.samples_us),
     )
 
 
