@@ -1,0 +1,224 @@
+"""The driver that ships, in figures: ablated, compressed, slowed down.
+
+    python -m benchmarks.bench_driver OUT [--only NAME ...] [--workers N] [--routes N]
+                                          [--model M.onnx] [--frames F --held-out H]
+
+Studies, one after the other: baselines (expert, blind, the driver), ablation (each
+module away, then pairs), schemes (float to int8, at no latency and at each model's own
+under one device scale), latency (fewer and fewer decisions a second), determinism (the
+driver twice, compared byte by byte). They share OUT, so what one has driven the next
+does not drive again, and a run that was stopped goes on. Tables go to OUT/<study>/ and
+to OUT/tables.md, for docs/benchmarks.md.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+from me2e_compress import recipe
+from me2e_compress.cli.frames import frames as make_frames
+from me2e_compress.cli.models import model_path
+from me2e_compress.errors import Me2eError
+from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
+from me2e_compress.study import (
+    Condition,
+    Listener,
+    Outcome,
+    Scheme,
+    Study,
+    Timing,
+    run_study,
+)
+from me2e_compress.study.tables import all_tables
+from me2e_compress.study.workplace import Workplace
+from me2e_compress.study.write import MARKDOWN, write_tables
+
+DRIVER = "highway"
+MODULES = ("track", "map", "motion", "occ")
+SCHEMES = ("exact", "feature-ext", "prediction", "full")
+FPS = (20, 10, 5, 2, 1)
+FLOAT_MEDIAN_S = 0.43
+"""Median latency of the float driver on the device imagined."""
+CALIBRATION = (256, 0)
+"""Frames that passes calibrate on, and their seed."""
+HELD_OUT = (64, 1)
+LATENCY_SAMPLES = 300
+IDEAL = Condition("ideal", "none")
+DEVICE = Condition("device", "trace")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all studies share."""
+
+    out: Path
+    model: str
+    routes: tuple[Route, ...]
+    set_size: int
+    frames: Path
+    held_out: Path
+
+    @property
+    def float(self) -> Scheme:
+        return Scheme("float", self.model)
+
+    def without(self, *modules: str) -> Scheme:
+        """Drop modules; what read them reads the means over the calibration frames."""
+        text = (
+            "import-normalize,fold-constants,"
+            f"ablate-modules{{drop=[{', '.join(modules)}], fill=means, "
+            "drop_outputs=true},eliminate-redundant,fuse-basic"
+        )
+        return Scheme(f"minus-{'-'.join(modules)}", self.model, recipe.parse(text))
+
+    def study(
+        self,
+        title: str,
+        schemes: tuple[Scheme, ...],
+        conditions: tuple[Condition, ...] = (IDEAL,),
+    ) -> Study:
+        return Study(
+            title,
+            schemes,
+            conditions,
+            self.float.name,
+            self.routes,
+            self.set_size,
+            self.frames,
+            self.held_out,
+            Timing(LATENCY_SAMPLES, baseline_median_s=FLOAT_MEDIAN_S),
+        )
+
+
+def baselines(bench: Bench) -> Study:
+    drivers = (Scheme("expert", "expert"), Scheme("blind", "blind"))
+    return bench.study("Baselines", (*drivers, bench.float))
+
+
+def ablation(bench: Bench) -> Study:
+    single = [bench.without(name) for name in MODULES]
+    pairs = [bench.without(*pair) for pair in combinations(MODULES, 2)]
+    return bench.study("Ablation", (bench.float, *single, *pairs))
+
+
+def schemes(bench: Bench) -> Study:
+    made = [Scheme(name, bench.model, recipe.load(name)) for name in SCHEMES]
+    return bench.study("Schemes", (bench.float, *made), (IDEAL, DEVICE))
+
+
+def latency(bench: Bench) -> Study:
+    slower = [Condition(f"fps-{fps}", f"fps:{fps}") for fps in FPS]
+    return bench.study("Latency", (bench.float,), (IDEAL, *slower))
+
+
+def determinism(bench: Bench) -> Study:
+    again = Scheme("float-again", bench.model)
+    return bench.study("Determinism", (bench.float, again))
+
+
+STUDIES: Mapping[str, Callable[[Bench], Study]] = {
+    "baselines": baselines,
+    "ablation": ablation,
+    "schemes": schemes,
+    "latency": latency,
+    "determinism": determinism,
+}
+
+
+def same_bytes(bench: Bench) -> str:
+    """Hold the two drives of the same model against each other, file by file."""
+    workplace = Workplace(bench.out)
+    first, again = (
+        {
+            path.name: path.read_bytes()
+            for path in (workplace.results(scheme, IDEAL) / "routes").glob("*.json")
+        }
+        for scheme in determinism(bench).schemes
+    )
+    equal = sum(first[name] == again.get(name) for name in first)
+    size = sum(map(len, first.values()))
+    return f"{equal} of {len(first)} files equal to the byte ({size:,} bytes).\n"
+
+
+def told() -> Listener:
+    """Say every half minute how far a study is."""
+    begun, last = time.monotonic(), -60.0
+
+    def on_progress(stage: str, done: int, total: int, words: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last > 30.0 or done == total:
+            minutes = (now - begun) / 60
+            print(f"{minutes:6.1f} min  {stage}: {done}/{total}  {words}", flush=True)
+            last = now
+
+    return Listener(on_progress, lambda line: print(f"warning: {line}", flush=True))
+
+
+def run(bench: Bench, name: str, workers: int) -> Outcome:
+    """Run one study and write its tables."""
+    study = STUDIES[name](bench)
+    outcome = run_study(study, bench.out, LocalEngine(workers), told())
+    write_tables(outcome, bench.out / name)
+    parts = [table.markdown() for table in all_tables(outcome)]
+    if name == "determinism":
+        parts.append(same_bytes(bench))
+    print("\n".join(parts))
+    return outcome
+
+
+def collect(out: Path) -> None:
+    """Put the tables of all studies that were run into one file."""
+    found = [out / name / MARKDOWN for name in STUDIES]
+    texts = [path.read_text("utf-8") for path in found if path.is_file()]
+    (out / MARKDOWN).write_text("\n".join(texts), "utf-8")
+
+
+def frames_of(path: Path | None, out: Path, name: str, what: tuple[int, int]) -> Path:
+    """Take the frames that are given, or make them once."""
+    if path is not None:
+        return path
+    made = out / name
+    if not (made / "scenes.json").is_file():
+        make_frames(DRIVER, made, what[0], seed=what[1])
+    return made
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--only", action="append", choices=STUDIES)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--model", default=DRIVER)
+    parser.add_argument("--routes", default="all", help="all, a number or ids")
+    parser.add_argument("--frames", type=Path, help="to calibrate on")
+    parser.add_argument("--held-out", type=Path, help="for fidelity and latency")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    shipped = load_routes()
+    try:
+        bench = Bench(
+            given.out,
+            str(model_path(given.model)),
+            pick_routes(shipped, given.routes),
+            len(shipped),
+            frames_of(given.frames, given.out, "frames", CALIBRATION),
+            frames_of(given.held_out, given.out, "frames-held-out", HELD_OUT),
+        )
+        for name in given.only or STUDIES:
+            print(f"\n## {name}\n", flush=True)
+            run(bench, name, given.workers)
+            collect(given.out)
+    except Me2eError as error:
+        sys.exit(f"bench_driver: {error}")
+
+
+if __name__ == "__main__":
+    main()
