@@ -8,10 +8,11 @@ from pydantic import TypeAdapter, ValidationError
 from rich.markup import escape
 
 from me2e_compress.cli.console import console, errors, number, print_json, progress
+from me2e_compress.cli.drivers import driver_of
 from me2e_compress.cli.score import scores_table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.cameras import Weather
-from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
+from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
@@ -24,7 +25,9 @@ from me2e_compress.metrics.scores import Scores, score
 
 
 def evaluate(
-    policy: Annotated[str, typer.Argument(help="M.onnx, expert, blind or blind:MPS")],
+    policy: Annotated[
+        str, typer.Argument(help="M.onnx, highway, expert, blind or blind:MPS")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the results folder")],
     routes: Annotated[
         str, typer.Option(help="all, a number, ID,ID or a file of routes")
@@ -54,7 +57,7 @@ def evaluate(
     """Drive a policy over routes of highway-env; run it again to go on."""
     picked, set_size = _routes(routes)
     shown = None if show is None else pick_routes(picked, show)
-    driver = Driver(policy, adapter)
+    driver = driver_of(policy, adapter)
     conditions = Conditions(
         parse_latency(latency, in_order=in_order, scale=latency_scale, seed=seed),
         round(dt_ms * 1000),
@@ -74,7 +77,7 @@ def evaluate(
             picked,
             output,
             set_size,
-            _engine(engine, workers, address),
+            engine_of(engine, workers, address),
             on_progress,
             lambda line: errors.print(f"warning: {escape(line)}", soft_wrap=True),
         )
@@ -101,7 +104,12 @@ def _routes(text: str) -> tuple[tuple[Route, ...], int]:
     return pick_routes(shipped, text), len(shipped)
 
 
-def _engine(name: str, workers: int, address: str | None) -> Engine:
+def engine_of(name: str, workers: int, address: str | None) -> Engine:
+    """Give the engine that the words of the command line mean.
+
+    Raises:
+        EvaluationError: No such engine, or an address without a cluster.
+    """
     if name == "local" and address is None:
         return LocalEngine(workers)
     if name == "ray":

@@ -6,22 +6,24 @@ import typer
 
 from me2e_compress.errors import MissingExtraError
 
-_NEEDED = ("highway_env", "cv2", "matplotlib", "scipy")
+_NEEDED = ("highway_env", "cv2", "jinja2", "matplotlib", "scipy")
+_NAMES = ("evaluate", "routes", "score", "study")
 
 
 def closed_loop(app: typer.Typer) -> None:
-    """Add ``evaluate``, ``routes`` and ``score``: the extra ``highway`` brings them."""
+    """Add the commands that drive or score: the extra ``highway`` brings them."""
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        for name in ("evaluate", "routes", "score"):
+        for name in _NAMES:
             anything = {"allow_extra_args": True, "ignore_unknown_options": True}
             app.command(name, context_settings=anything)(_advise)
         return
     from me2e_compress.cli.evaluate import evaluate
     from me2e_compress.cli.routes import routes
     from me2e_compress.cli.score import score
+    from me2e_compress.cli.study import study
 
-    for command in (evaluate, routes, score):
+    for command in (evaluate, routes, score, study):
         app.command()(command)
 
 

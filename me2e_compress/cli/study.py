@@ -1,0 +1,74 @@
+"""``me2e-compress study``."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table as Shown
+
+from me2e_compress.cli.console import console, errors, print_json, progress, table
+from me2e_compress.cli.evaluate import engine_of
+from me2e_compress.cli.models import model_path
+from me2e_compress.study import Listener, load_study, run_study
+from me2e_compress.study.tables import Cell, Table, all_tables
+from me2e_compress.study.write import write_tables
+
+WIDE = 120
+"""Columns that a terminal must have for intervals beside the numbers."""
+
+
+def study(
+    definition: Annotated[Path, typer.Argument(help="STUDY.toml")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
+    routes: Annotated[
+        str | None, typer.Option(help="instead of the study's: all, N, ID,ID")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="routes at a time")] = 1,
+    engine: Annotated[str, typer.Option(help="local or ray")] = "local",
+    address: Annotated[str | None, typer.Option(help="of a Ray cluster")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
+) -> None:
+    """Drive schemes under conditions and compare them; run it again to go on."""
+    asked = load_study(definition, model_path, routes)
+    with listener() as told:
+        found = run_study(asked, output, engine_of(engine, workers, address), told)
+    written = write_tables(found, output)
+    if as_json:
+        print_json(found.to_json())
+        return
+    for each in all_tables(found):
+        console.print(shown(each))
+    console.print(f"{written.record} and {written.tables} are yours.")
+
+
+@contextmanager
+def listener() -> Iterator[Listener]:
+    """Show a study's stages in one bar, and its surprises on stderr."""
+    with progress("study") as advance:
+
+        def on_progress(stage: str, done: int, total: int, words: str) -> None:
+            advance(done, total, f"{stage}  {words}")
+
+        yield Listener(
+            on_progress,
+            lambda line: errors.print(f"warning: {escape(line)}", soft_wrap=True),
+        )
+
+
+def shown(content: Table) -> Shown:
+    """Show a study's table on the terminal, with its intervals if it is wide enough."""
+    made = table(content.title, *content.columns)
+    wide = console.width >= WIDE
+    for row in content.rows:
+        made.add_row(*(_text(cell, wide) for cell in row))
+    made.caption, made.caption_justify = content.note, "left"
+    return made
+
+
+def _text(cell: Cell, wide: bool) -> str:
+    if not (cell.detail and wide):
+        return cell.text
+    return f"{cell.text}\n[dim]{cell.detail}[/dim]"
