@@ -8,6 +8,7 @@ import typer
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.cli.console import console, print_json, progress
+from me2e_compress.cli.models import model_path
 from me2e_compress.cli.tables import fidelity_table, plan_line
 from me2e_compress.metrics.fidelity import Fidelity
 from me2e_compress.metrics.fidelity import compare as measure
@@ -15,13 +16,13 @@ from me2e_compress.runtime.session import Session
 
 
 def compare(
-    reference: Annotated[Path, typer.Argument(help="the graph to be true to")],
-    candidate: Annotated[Path, typer.Argument(help="the graph that is judged")],
+    reference: Annotated[str, typer.Argument(help="the graph to be true to")],
+    candidate: Annotated[str, typer.Argument(help="the graph that is judged")],
     frames: Annotated[Path, typer.Argument(help="the recorded FRAMES")],
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres."""
-    found = judge(reference, candidate, frames)
+    found = judge(model_path(reference), model_path(candidate), frames)
     if as_json:
         print_json(found)
         return

@@ -13,11 +13,14 @@ from me2e_compress.cli.console import (
     print_json,
 )
 from me2e_compress.cli.job import check_output, choose, run, write
+from me2e_compress.cli.models import model_path
 from me2e_compress.cli.tables import notes, steps_table, verification_table
 
 
 def compress(
-    model: Annotated[Path, typer.Argument(help="the ONNX file; it is not changed")],
+    model: Annotated[
+        str, typer.Argument(help="the ONNX file, or highway; it is not changed")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the smaller one")],
     recipe_name: Annotated[
         str | None,
@@ -33,7 +36,7 @@ def compress(
     ] = None,
     frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
     module_map: Annotated[
-        str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
+        str | None, typer.Option("--map", help="a preset or a TOML file")
     ] = None,
     seed: Annotated[int, typer.Option(help="of everything random")] = 0,
     verify_frames: Annotated[
@@ -42,18 +45,19 @@ def compress(
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report."""
-    check_output(model, output)
+    source = model_path(model)
+    check_output(source, output)
     chosen = choose(recipe_name, passes, scheme)
-    report = run(model, chosen, frames, module_map, seed, verify_frames, output.parent)
-    report_path = write(report, model, output)
+    report = run(source, chosen, frames, module_map, seed, verify_frames, output.parent)
+    report_path = write(report, source, output)
     if as_json:
         print_json(json.loads(report_path.read_text(encoding="utf-8")))
         return
     console.print(steps_table(report.steps))
     console.print(notes(report.steps))
     console.print(verification_table(report.verifications))
-    before, after = file_bytes(model), file_bytes(output)
+    before, after = file_bytes(source), file_bytes(output)
     console.print(
-        f"{output}: {megabytes(after)} MB, {after / before:.1%} of {model.name};"
+        f"{output}: {megabytes(after)} MB, {after / before:.1%} of {source.name};"
         f" report: {report_path}"
     )

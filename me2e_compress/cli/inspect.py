@@ -17,6 +17,7 @@ from me2e_compress.cli.console import (
     table,
 )
 from me2e_compress.cli.job import run_on
+from me2e_compress.cli.models import model_path
 from me2e_compress.graph import Port, provenance
 from me2e_compress.modules import Item, ModuleMap, assign, itemise, map_of
 
@@ -51,14 +52,14 @@ class Inspection:
 
 
 def inspect(
-    model: Annotated[Path, typer.Argument(help="the ONNX file")],
+    model: Annotated[str, typer.Argument(help="the ONNX file, or highway")],
     module_map: Annotated[
-        str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
+        str | None, typer.Option("--map", help="a preset or a TOML file")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Show what a graph holds: interface, and nodes, parameters, MACs by module."""
-    found = look(model, module_map)
+    found = look(model_path(model), module_map)
     if as_json:
         print_json(found)
         return

@@ -7,13 +7,14 @@ import typer
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.cli.console import console, number, print_json, progress, table
+from me2e_compress.cli.models import model_path
 from me2e_compress.runtime.latency_trace import PERCENTILES, LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 
 
 def profile(
-    model: Annotated[Path, typer.Argument(help="the graph")],
+    model: Annotated[str, typer.Argument(help="the graph, or highway")],
     frames: Annotated[Path, typer.Argument(help="the recorded FRAMES")],
     output: Annotated[Path, typer.Option("-o", "--output", help="the trace")],
     samples: Annotated[int | None, typer.Option(help="how many latencies")] = None,
@@ -24,7 +25,7 @@ def profile(
     """Measure a model alone and warm, and write its latencies as a trace."""
     with progress("profile") as advance:
         trace = measure(
-            model,
+            model_path(model),
             CalibrationSet(frames),
             samples=samples,
             warm_up=warm_up,

@@ -79,9 +79,12 @@ def build(
 
     Raises:
         MissingExtraError: torch is not installed.
-        GraphError: Unknown stack or heads.
+        GraphError: Unknown stack or heads, or a stack whose trained weights ship.
     """
-    find(stack)
+    if find(stack).trained:
+        raise GraphError(
+            f"{stack} is trained, a seed does not make it: zoo.shipped has its file"
+        )
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
     from me2e_compress.zoo.vad.build import build as build_vad
@@ -124,10 +127,14 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
 
 
 def example(spec: Stack) -> "tuple[Tensor, ...]":
-    """Zeros in the shapes of the inputs: a trace looks at nothing else."""
+    """Zeros in the shapes and types of the inputs: a trace looks at nothing else."""
     import torch
 
-    return tuple(torch.zeros(shape) for shape in spec.inputs.values())
+    types = {"float32": torch.float32, "int64": torch.int64}
+    return tuple(
+        torch.zeros(shape, dtype=types[spec.dtypes.get(name, "float32")])
+        for name, shape in spec.inputs.items()
+    )
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from me2e_compress.errors import FramesError
+from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.zoo.cameras import render, rig
 from me2e_compress.zoo.stacks import Stack, find
 from me2e_compress.zoo.traffic import draw_world
@@ -52,9 +52,14 @@ def write_frames(
 
     Raises:
         FramesError: A count below 1, or the folder holds something else.
-        GraphError: Unknown stack.
+        GraphError: Unknown stack, or one that sees another world than this one.
     """
     spec = find(stack)
+    if spec.trained:
+        raise GraphError(
+            f"{stack} sees highway-env, not this world: evaluators.highway.frames"
+            " drives for its frames"
+        )
     _refuse_foreign(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))

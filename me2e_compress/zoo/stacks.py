@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from me2e_compress.errors import GraphError
 
@@ -11,11 +12,23 @@ Shape = tuple[int, ...]
 
 @dataclass(frozen=True)
 class ImageNorm:
-    """How pixels become the image input: (pixel - mean) / std, channel by channel."""
+    """How pixels become the image input: (pixel - mean) / std, channel by channel.
+
+    Attributes:
+        mean: In grey levels 0 to 255, in the order of `order`.
+        std: The same.
+        order: Channels of the model: red first or blue first.
+    """
 
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
-    order: str
+    order: Literal["rgb", "bgr"]
+
+
+IMAGENET = ImageNorm(
+    mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), order="rgb"
+)
+"""Statistics of ImageNet in grey levels, as torchvision and mmdetection have them."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +37,16 @@ class Stack:
 
     Attributes:
         name: What the command line calls it.
-        inputs: Shapes by input name, all float32.
+        inputs: Shapes by input name.
         outputs: Names of the outputs, in order.
         recurrent: Output that answers each recurrent input.
         plan: Name of the output that is the plan.
         plan_deltas: The plan is metres a step, not positions.
-        default_mode: Row of the plan that is driven without a command, by heads.
+        default_mode: Row of the plan that is driven without a command, by heads;
+            empty where the plan has one row.
         image: How the image input is normalised.
+        dtypes: Element type of the inputs that are not float32.
+        trained: The weights ship; else they are drawn from a seed.
     """
 
     name: str
@@ -41,14 +57,20 @@ class Stack:
     plan_deltas: bool
     default_mode: Mapping[str, int]
     image: ImageNorm
+    dtypes: Mapping[str, Literal["int64"]] = field(default_factory=dict)
+    trained: bool = False
 
-    def metadata(self, heads: str) -> dict[str, str]:
-        """What the exported file says of itself, as ONNX metadata properties."""
+    def metadata(self, heads: str | None = None) -> dict[str, str]:
+        """What the exported file says of itself, as ONNX metadata properties.
+
+        Args:
+            heads: Key of `default_mode`; None where the plan has one row.
+        """
         plan = {
             "output": self.plan,
             "deltas": self.plan_deltas,
             "command_input": None,
-            "default_mode": self.default_mode[heads],
+            "default_mode": 0 if heads is None else self.default_mode[heads],
         }
         image = {
             "input": "img",
@@ -87,14 +109,44 @@ VAD_TINY = Stack(
     plan="ego_fut_preds",
     plan_deltas=True,
     default_mode={"nuscenes": 2, "bench2drive": 3},
-    image=ImageNorm(
-        mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375), order="RGB"
-    ),
+    image=IMAGENET,
 )
 """hustvl/VAD, VAD_tiny_e2e.py: image statistics of ImageNet; commands right, left and
 straight. Bench2DriveZoo: six road options, of which the fourth follows the lane."""
 
-STACKS: dict[str, Stack] = {stack.name: stack for stack in (VAD_TINY,)}
+HIGHWAY = Stack(
+    name="highway",
+    inputs={
+        "img": (1, 6, 3, 96, 160),
+        "lidar2img": (1, 6, 4, 4),
+        "can_bus": (18,),
+        "command": (1,),
+        "timestamp": (1,),
+        "prev_bev": (1, 768, 65),
+        "prev_memory": (1, 2),
+    },
+    outputs=(
+        "plan",
+        "boxes",
+        "scores",
+        "futures",
+        "route",
+        "occupancy",
+        "prev_bev_out",
+        "prev_memory_out",
+    ),
+    recurrent={"prev_bev": "prev_bev_out", "prev_memory": "prev_memory_out"},
+    plan="plan",
+    plan_deltas=False,
+    default_mode={},
+    image=IMAGENET,
+    dtypes={"command": "int64"},
+    trained=True,
+)
+"""The toolkit's own driver: the policy contract of highway-env, 32 x 24 cells of 64
+channels and how well each is known, and two numbers that it remembers of the ego."""
+
+STACKS: dict[str, Stack] = {stack.name: stack for stack in (VAD_TINY, HIGHWAY)}
 
 
 def find(name: str) -> Stack:

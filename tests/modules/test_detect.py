@@ -19,7 +19,7 @@ def chain(*scopes: str, **props: str) -> ir.Model:
 
 
 def test_the_metadata_decides() -> None:
-    for stack, name in (("vad-tiny", "vad"), ("vad", "vad"), ("tcp", "tcp")):
+    for stack, name in (("vad-tiny", "vad"), ("vad", "vad"), ("highway", "highway")):
         assert detect(chain("motion_head", **{"me2e.stack": stack})).name == name
 
 
@@ -49,6 +49,7 @@ def test_the_metadata_decides() -> None:
             "uniad",
         ),
         (["perception", "measurements", "join_traj", "wp_att"], "tcp"),
+        (["backbone/stem", "neck", "bev_encoder", "map", "planner"], "highway"),
     ],
 )
 def test_otherwise_the_names_do(scopes: list[str], name: str) -> None:

@@ -116,7 +116,7 @@ def test_a_missing_file_and_an_unknown_preset_are_told_apart(tmp_path: Path) -> 
 
 
 def test_every_preset_reads() -> None:
-    assert presets() == ("tcp", "uniad", "vad")
+    assert presets() == ("highway", "tcp", "uniad", "vad")
     for name in presets():
         read = ModuleMap.load(name)
         assert read.name == name

@@ -67,9 +67,27 @@ TCP = {
     "action_head.0.weight": "control",
 }
 
+HIGHWAY = {
+    "backbone.stem.0.weight": "backbone",
+    "neck.laterals.0.bias": "neck",
+    "bev_encoder.cross.weights.weight": "bev_encoder",
+    "track.cells_place": "track",
+    "map.raster.2.weight": "map",
+    "motion.layers.0.self_attn.query.weight": "motion",
+    "occ.grow.0.weight": "occ",
+    "planner.anchors": "planner",
+    "module.planner.score.0.bias": "planner",
+    "occupancy": None,
+}
+
 CASES = [
     (preset, path, module)
-    for preset, table in (("vad", VAD), ("uniad", UNIAD), ("tcp", TCP))
+    for preset, table in (
+        ("vad", VAD),
+        ("uniad", UNIAD),
+        ("tcp", TCP),
+        ("highway", HIGHWAY),
+    )
     for path, module in table.items()
 ]
 
@@ -80,7 +98,7 @@ def test_preset(preset: str, path: str, module: str | None) -> None:
 
 
 def test_feature_extraction_is_backbone_neck_and_bev_encoder() -> None:
-    for preset in ("vad", "uniad"):
+    for preset in ("vad", "uniad", "highway"):
         features = ModuleMap.load(preset).names("feature")
         assert features == ("backbone", "neck", "bev_encoder")
 

@@ -11,10 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from me2e_compress.errors import GraphError, MissingExtraError
+from me2e_compress.evaluators.highway.adapter import Adapter
+from me2e_compress.metrics.adapter import PlanAdapter
 from me2e_compress.zoo import export as exporting
 from me2e_compress.zoo.export import export
 from me2e_compress.zoo.frames import Frame
-from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.stacks import HIGHWAY, STACKS, VAD_TINY, Stack
 from me2e_compress.zoo.vad.stack import VadTiny
 
 TINY = replace(VAD_TINY, name="tiny", inputs={"x": (1,)}, outputs=("y",))
@@ -121,7 +123,7 @@ def test_metadata_says_what_the_file_is(graph: onnx.ModelProto) -> None:
         "command_input": None,
         "default_mode": 2,
     }
-    assert json.loads(said["me2e.image"])["order"] == "RGB"
+    assert json.loads(said["me2e.image"])["order"] == "rgb"
 
 
 @pytest.mark.parametrize("opset", [12, 18])
@@ -151,6 +153,28 @@ def test_another_opset_in_the_file_is_an_error(
 def test_unknown_stack(tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="no stack 'vad-huge' in the zoo"):
         export("vad-huge", tmp_path / "x.onnx")
+
+
+def test_a_trained_stack_is_not_made_from_a_seed(tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match="highway is trained, a seed does not"):
+        export("highway", tmp_path / "x.onnx")
+
+
+def test_examples_have_the_types_of_the_inputs() -> None:
+    by_name = dict(zip(HIGHWAY.inputs, exporting.example(HIGHWAY), strict=True))
+    assert by_name["command"].dtype == torch.int64
+    assert by_name["timestamp"].dtype == torch.float32
+    assert tuple(by_name["prev_memory"].shape) == HIGHWAY.inputs["prev_memory"]
+
+
+@pytest.mark.parametrize("stack", STACKS.values(), ids=lambda stack: stack.name)
+def test_a_driver_reads_the_metadata_of_every_stack(stack: Stack) -> None:
+    said = stack.metadata(next(iter(stack.default_mode), None))
+    norm = Adapter().normalization(said)
+    assert (norm.mean, norm.std) == (stack.image.mean, stack.image.std)
+    plan = PlanAdapter.of(said, stack.outputs)
+    assert plan is not None
+    assert plan.output == stack.plan
 
 
 def test_without_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,137 @@
+"""Trained models that come with the package, each beside a card that vouches for it."""
+
+import functools
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Self
+
+import pydantic
+
+from me2e_compress.errors import GraphError
+from me2e_compress.zoo.stacks import STACKS
+
+WEIGHTS = Path(__file__).with_name("weights")
+"""One ``NAME.onnx`` and one ``NAME.json`` a model."""
+
+SHIPPED = tuple(stack.name for stack in STACKS.values() if stack.trained)
+"""Names of the models."""
+
+
+class TrainingData(pydantic.BaseModel):
+    """What a model learned from.
+
+    Attributes:
+        seeds: of the generated routes; none of them is a route it is judged on.
+        frames: camera frames in all.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    seeds: tuple[int, ...]
+    frames: int = pydantic.Field(ge=0)
+
+
+class ModelCard(pydantic.BaseModel):
+    """What is known of a shipped model; the file beside it must have its digest.
+
+    Attributes:
+        sha256: of the ``.onnx``, lower-case hex.
+        bytes: of the ``.onnx``.
+        parameters: trained numbers in it.
+        seed: of the initial weights and of everything drawn in training.
+        data: what it learned from.
+        command: what trains it again.
+        hours: of training on the machine that ``command`` names or describes; None:
+            not measured.
+        scores: by name with the unit in it (``driving_score_percent``); None: not
+            measured, as a whole or one by one.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    sha256: str = pydantic.Field(pattern="^[0-9a-f]{64}$")
+    bytes: int = pydantic.Field(gt=0)
+    parameters: int = pydantic.Field(gt=0)
+    seed: int
+    data: TrainingData
+    command: str
+    hours: float | None = None
+    scores: dict[str, float | None] | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a card.
+
+        Raises:
+            GraphError: the file is missing or no card.
+        """
+        try:
+            return cls.model_validate_json(path.read_bytes(), strict=True)
+        except OSError as error:
+            raise GraphError(f"{path}: cannot be read: {error.strerror}") from error
+        except pydantic.ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"])) or "the file"
+            raise GraphError(f"{path}: {where}: {first['msg']}") from error
+
+
+def card(name: str, folder: Path | None = None) -> ModelCard:
+    """Give the card of a shipped model.
+
+    Raises:
+        GraphError: no such model, or its card is missing or malformed.
+    """
+    if name not in SHIPPED:
+        raise GraphError(f"no model {name!r} ships; there is {', '.join(SHIPPED)}")
+    return ModelCard.load((folder or WEIGHTS) / f"{name}.json")
+
+
+def shipped(name: str, folder: Path | None = None) -> Path:
+    """Give the file of a shipped model, once its digest agrees with its card.
+
+    A process checks a file once.
+
+    Args:
+        name: one of `SHIPPED`.
+        folder: where models and cards lie; None for those of the package.
+
+    Raises:
+        GraphError: no such model, or its file or card is missing or altered.
+    """
+    return _checked(name, folder or WEIGHTS)
+
+
+@functools.cache
+def _checked(name: str, folder: Path) -> Path:
+    expected = card(name, folder).sha256
+    path = folder / f"{name}.onnx"
+    try:
+        found = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise GraphError(
+            f"{path}: cannot be read: {error.strerror}; expected sha256 {expected}"
+        ) from error
+    if found != expected:
+        raise GraphError(
+            f"{path}: altered or incomplete: sha256 {found}, expected {expected}"
+        )
+    return path
+
+
+def copy(name: str, target: Path, folder: Path | None = None) -> Path:
+    """Write a copy of a shipped model, replaced in one step; give its path.
+
+    Raises:
+        GraphError: as `shipped`, or ``target`` is the shipped file itself.
+    """
+    source = shipped(name, folder)
+    if target.exists() and target.samefile(source):
+        raise GraphError(f"{target} is the shipped model: choose another output")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".copy-") as draft:
+        file = Path(draft) / target.name
+        file.write_bytes(source.read_bytes())
+        os.replace(file, target)
+    return target

@@ -1,0 +1,173 @@
+"""The shipped driver by its name, wherever a model is asked for."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.cli.models import model_path
+from me2e_compress.errors import GraphError
+from me2e_compress.evaluators.highway.routes import save_routes
+from me2e_compress.zoo import shipped
+from tests.cli.conftest import Command
+from tests.evaluators.highway.drivers import EXIT
+from tests.stand_in import write_model, write_shipped
+
+
+@pytest.fixture(autouse=True)
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a small driver, in the place of the package's."""
+    write_shipped(tmp_path / "weights")
+    monkeypatch.setattr(shipped, "WEIGHTS", tmp_path / "weights")
+    return tmp_path / "weights"
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """Two frames of noise."""
+    folder, random = tmp_path / "frames", np.random.default_rng(3)
+    folder.mkdir()
+    for index in range(2):
+        np.savez(
+            folder / f"{index}.npz",
+            img=random.normal(size=(1, 6, 3, 16, 24)).astype(np.float32),
+            lidar2img=random.normal(size=(1, 6, 4, 4)).astype(np.float32),
+            can_bus=random.normal(size=18).astype(np.float32),
+            command=np.array([3]),
+            timestamp=np.array([0.5 * index], np.float32),
+        )
+    (folder / "scenes.json").write_text('{"scenes": [0]}')
+    return folder
+
+
+def test_a_name_is_the_shipped_file(weights: Path) -> None:
+    assert model_path("highway") == weights / "highway.onnx"
+
+
+def test_a_file_of_that_name_wins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_model(tmp_path / "highway", seed=1)
+
+    assert model_path("highway") == Path("highway")
+
+
+def test_neither_a_file_nor_a_name() -> None:
+    with pytest.raises(GraphError, match=r"^uniad: no such file; .*ship: highway$"):
+        model_path("uniad")
+
+
+def test_inspect(
+    command: Command, capsys: pytest.CaptureFixture[str], weights: Path
+) -> None:
+    assert command("inspect", "highway", "--json") == 0
+
+    found = json.loads(capsys.readouterr().out)
+    assert found["map"] == "highway"
+    assert found["file_bytes"] == (weights / "highway.onnx").stat().st_size
+    assert [item["module"] for item in found["modules"]] == [
+        *("backbone", "neck", "bev_encoder", "track", "map", "motion", "occ"),
+        "planner",
+    ]
+
+
+def test_compress_compare_and_profile(
+    command: Command,
+    frames: Path,
+    weights: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    small, trace = tmp_path / "small.onnx", tmp_path / "trace.json"
+    before = (weights / "highway.onnx").read_bytes()
+
+    assert command("compress", "highway", "-r", "exact", "-o", small) == 0
+    assert command("profile", "highway", frames, "-o", trace) == 0
+    capsys.readouterr()
+    assert command("compare", "highway", small, frames, "--json") == 0
+
+    found = json.loads(capsys.readouterr().out)
+    assert found["plan"]["max_m"] < 1e-3
+    assert json.loads(trace.read_text())["samples_us"]
+    assert (weights / "highway.onnx").read_bytes() == before
+
+
+def test_the_shipped_file_is_not_compressed_in_place(
+    command: Command, weights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("compress", "highway", "-r", "exact", "-o", weights / "highway.onnx")
+
+    assert command(*words) == 1
+    assert "highway.onnx is the input" in capsys.readouterr().err
+
+
+def test_evaluate_drives_it(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_routes((EXIT,), tmp_path / "routes.json")
+    words = ("evaluate", "highway", "--routes", tmp_path / "routes.json", "--json")
+
+    assert command(*words, "-o", tmp_path / "results") == 0
+    assert json.loads(capsys.readouterr().out)["routes"]["driven"] == 1
+
+
+def test_evaluate_names_everything_that_could_drive(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("evaluate", "nobody", "-o", tmp_path / "results") == 1
+
+    line = capsys.readouterr().err.strip()
+    assert "nobody: no such file; models that ship: highway; or expert, blind" in line
+    assert "\n" not in line
+
+
+def test_export_copies_it(command: Command, weights: Path, tmp_path: Path) -> None:
+    assert command("export", "highway", "-o", tmp_path / "mine.onnx") == 0
+
+    mine = (tmp_path / "mine.onnx").read_bytes()
+    assert mine == (weights / "highway.onnx").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--opset", "16"), ("--seed", "0"), ("--heads", "nuscenes")],
+)
+def test_a_trained_model_leaves_nothing_to_choose(
+    command: Command,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    option: str,
+    value: str,
+) -> None:
+    output = tmp_path / "mine.onnx"
+
+    assert command("export", "highway", "-o", output, option, value) == 1
+    line = capsys.readouterr().err.strip()
+    assert f"{option}" in line
+    assert "cannot be chosen" in line
+    assert "\n" not in line
+    assert not output.exists()
+
+
+@pytest.mark.parametrize("words", [("inspect",), ("evaluate", "-o", "results")])
+def test_altered_weights_are_one_line(
+    command: Command,
+    weights: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+) -> None:
+    (weights / "highway.onnx").write_bytes(b"something else")
+
+    assert command(words[0], "highway", *words[1:]) == 1
+    line = capsys.readouterr().err.strip()
+    assert "highway.onnx: altered or incomplete: sha256 " in line
+    assert "\n" not in line
+
+
+def test_no_weights_at_all(weights: Path) -> None:
+    (weights / "highway.onnx").unlink()
+
+    with pytest.raises(GraphError, match=r"highway\.onnx: cannot be read"):
+        model_path("highway")

@@ -1,0 +1,109 @@
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import GraphError
+from me2e_compress.zoo import shipped as room
+from me2e_compress.zoo.shipped import ModelCard, card, copy, shipped
+from tests.stand_in import write_shipped
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    write_shipped(tmp_path / "weights")
+    return tmp_path / "weights"
+
+
+def test_the_file_is_the_one_of_the_card(weights: Path) -> None:
+    path = shipped("highway", weights)
+
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert path == weights / "highway.onnx"
+    assert card("highway", weights).sha256 == digest
+
+
+def test_what_was_not_measured_is_none(weights: Path) -> None:
+    assert card("highway", weights).scores is None
+    assert card("highway", weights).hours is None
+
+
+def test_an_altered_file_names_both_digests(weights: Path) -> None:
+    path = weights / "highway.onnx"
+    altered = path.read_bytes()[:-1] + b"?"
+    path.write_bytes(altered)
+
+    with pytest.raises(GraphError) as caught:
+        shipped("highway", weights)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: altered")
+    assert hashlib.sha256(altered).hexdigest() in message
+    assert card("highway", weights).sha256 in message
+    assert "\n" not in message
+
+
+def test_a_missing_file_names_what_was_expected(weights: Path) -> None:
+    (weights / "highway.onnx").unlink()
+
+    with pytest.raises(GraphError, match=r"highway\.onnx: cannot be read") as caught:
+        shipped("highway", weights)
+    assert card("highway", weights).sha256 in str(caught.value)
+
+
+def test_no_card(weights: Path) -> None:
+    (weights / "highway.json").unlink()
+
+    with pytest.raises(GraphError, match=r"highway\.json: cannot be read"):
+        shipped("highway", weights)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"sha256": "ABC"}, "sha256"),
+        ({"bytes": 0}, "bytes"),
+        ({"hours": "long"}, "hours"),
+        ({"mood": 1}, "mood"),
+        ({"data": {"seeds": [1]}}, "data.frames"),
+    ],
+)
+def test_a_card_that_is_none(
+    weights: Path, change: dict[str, object], words: str
+) -> None:
+    path = weights / "highway.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+
+    with pytest.raises(GraphError, match=rf"highway\.json: {words}: ") as caught:
+        card("highway", weights)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_name_lists_what_ships(weights: Path) -> None:
+    with pytest.raises(GraphError, match="no model 'uniad' ships; there is highway"):
+        shipped("uniad", weights)
+
+
+def test_a_process_checks_once(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = list[str]()
+
+    def counted(name: str, folder: Path | None) -> ModelCard:
+        read.append(name)
+        return card(name, folder)
+
+    monkeypatch.setattr(room, "card", counted)
+
+    assert shipped("highway", weights) == shipped("highway", weights)
+    assert len(read) == 1
+
+
+def test_a_copy_has_the_same_bytes(weights: Path, tmp_path: Path) -> None:
+    target = copy("highway", tmp_path / "new" / "mine.onnx", weights)
+
+    assert target.read_bytes() == (weights / "highway.onnx").read_bytes()
+    assert sorted(path.name for path in target.parent.iterdir()) == ["mine.onnx"]
+
+
+def test_the_shipped_file_is_not_overwritten(weights: Path) -> None:
+    with pytest.raises(GraphError, match="is the shipped model"):
+        copy("highway", weights / "highway.onnx", weights)
