@@ -1,5 +1,6 @@
 """The classes seen from above, in the ego frame."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,7 @@ from me2e_compress.evaluators.highway.scene import Actor, Ego, Scene
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 SUBPIXEL_BITS = 4
 
@@ -60,15 +62,25 @@ def bev_classes(scene: Scene, texture: GroundTexture, grid: BevGrid) -> Bytes:
 
     Signals have no extent on the ground and are left out; the ego is drawn last.
     """
-    labels = _ground(texture, scene.ego, grid)
+    labels = ground_classes(scene.ego, texture, grid)
     for actor in scene.actors:
         _fill(labels, _footprint(actor, scene.ego), ACTOR_CLASSES[actor.kind], grid)
     _fill(labels, _footprint(scene.ego, scene.ego), PixelClass.EGO, grid)
     return labels
 
 
-def _ground(texture: GroundTexture, ego: Ego, grid: BevGrid) -> Bytes:
-    """Sample the class raster: an affine map from cells to texels."""
+def ground_classes(ego: Ego, texture: GroundTexture, grid: BevGrid) -> Bytes:
+    """What the ground is at the centre of each cell, whoever stands on it.
+
+    Args:
+        ego: Where the grid lies.
+        texture: The painted ground of the route.
+        grid: The cells.
+
+    Returns:
+        `PixelClass`, uint8 [rows, columns].
+    """
+    # an affine map from cells to texels
     cos, sin = np.cos(ego.heading), np.sin(ego.heading)
     scale = grid.cell_m / RESOLUTION_M
     # one row down is one cell back, one column right is one cell to the right
@@ -90,6 +102,20 @@ def _ground(texture: GroundTexture, ego: Ego, grid: BevGrid) -> Bytes:
     )
 
 
+def covered(actors: Sequence[Actor], ego: Ego, grid: BevGrid) -> Flags:
+    """Whether a cell is touched by an actor: bool [rows, columns].
+
+    Args:
+        actors: Boxes of any instant.
+        ego: Where the grid lies, at the same instant or another.
+        grid: The cells.
+    """
+    touched = np.zeros((grid.rows, grid.columns), np.uint8)
+    for actor in actors:
+        _fill(touched, _footprint(actor, ego), 1, grid)
+    return touched.astype(np.bool_)
+
+
 def _footprint(box: Actor | Ego, ego: Ego) -> Floats:
     """[4, 2] corners of a box in the ego frame."""
     half = np.array([box.length, box.width]) / 2
@@ -102,7 +128,7 @@ def _footprint(box: Actor | Ego, ego: Ego) -> Floats:
     return np.asarray(corners @ rotation + centre)
 
 
-def _fill(labels: Bytes, corners: Floats, kind: PixelClass, grid: BevGrid) -> None:
+def _fill(labels: Bytes, corners: Floats, value: int, grid: BevGrid) -> None:
     scaled = (grid.cells(corners) - 0.5) * (1 << SUBPIXEL_BITS)
     polygon = np.rint(scaled).astype(np.int32)
-    cv2.fillConvexPoly(labels, polygon, (int(kind),), cv2.LINE_8, SUBPIXEL_BITS)
+    cv2.fillConvexPoly(labels, polygon, (int(value),), cv2.LINE_8, SUBPIXEL_BITS)
