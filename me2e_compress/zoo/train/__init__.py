@@ -1,0 +1,1 @@
+"""Training of the driver: its data and its losses."""
