@@ -36,7 +36,7 @@ from me2e_compress.study import (
 )
 from me2e_compress.study.tables import all_tables
 from me2e_compress.study.workplace import Workplace
-from me2e_compress.study.write import MARKDOWN, write_tables
+from me2e_compress.study.write import MARKDOWN, write
 
 DRIVER = "highway"
 MODULES = ("track", "map", "motion", "occ")
@@ -48,6 +48,7 @@ CALIBRATION = (256, 0)
 """Frames that passes calibrate on, and their seed."""
 HELD_OUT = (64, 1)
 LATENCY_SAMPLES = 300
+COMMAND = ("python", "-m", "benchmarks.bench_driver")
 IDEAL = Condition("ideal", "none")
 DEVICE = Condition("device", "trace")
 
@@ -164,7 +165,7 @@ def run(bench: Bench, name: str, workers: int) -> Outcome:
     """Run one study and write its tables."""
     study = STUDIES[name](bench)
     outcome = run_study(study, bench.out, LocalEngine(workers), told())
-    write_tables(outcome, bench.out / name)
+    write(outcome, bench.out / name, (*COMMAND, str(bench.out), "--only", name))
     parts = [table.markdown() for table in all_tables(outcome)]
     if name == "determinism":
         parts.append(same_bytes(bench))

@@ -14,7 +14,7 @@ from me2e_compress.cli.evaluate import engine_of
 from me2e_compress.cli.models import model_path
 from me2e_compress.study import Listener, load_study, run_study
 from me2e_compress.study.tables import Cell, Table, all_tables
-from me2e_compress.study.write import write_tables
+from me2e_compress.study.write import write
 
 WIDE = 120
 """Columns that a terminal must have for intervals beside the numbers."""
@@ -35,13 +35,18 @@ def study(
     asked = load_study(definition, model_path, routes)
     with listener() as told:
         found = run_study(asked, output, engine_of(engine, workers, address), told)
-    written = write_tables(found, output)
+    written = write(found, output, _words(definition, output, routes))
     if as_json:
         print_json(found.to_json())
         return
     for each in all_tables(found):
         console.print(shown(each))
-    console.print(f"{written.record} and {written.tables} are yours.")
+    console.print(f"{written.report}, {written.tables} and {written.record} are yours.")
+
+
+def _words(definition: Path, output: Path, routes: str | None) -> tuple[str, ...]:
+    chosen = () if routes is None else ("--routes", routes)
+    return ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
 
 
 @contextmanager

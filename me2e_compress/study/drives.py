@@ -10,30 +10,13 @@ from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.differences import Difference, difference
-from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.study.definition import Condition, Study
 from me2e_compress.study.models import Contender
+from me2e_compress.study.routes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
 from me2e_compress.study.workplace import Listener, Workplace
-
-
-@dataclass(frozen=True)
-class RouteOutcome:
-    """One route of one drive.
-
-    Attributes:
-        route: Its id.
-        driving_score: Percent.
-        succeeded: The whole route without an infraction.
-        ending: Why it was over, in words.
-    """
-
-    route: str
-    driving_score: float
-    succeeded: bool
-    ending: str
 
 
 @dataclass(frozen=True)
@@ -65,15 +48,7 @@ class Drive:
             "reason": self.reason or None,
             "scores": self.scores.to_json() if self.scores else None,
             "difference": self.difference.to_json() if self.difference else None,
-            "routes": [
-                {
-                    "route": each.route,
-                    "driving_score": each.driving_score,
-                    "succeeded": each.succeeded,
-                    "ending": each.ending,
-                }
-                for each in self.routes
-            ],
+            "routes": [each.to_json() for each in self.routes],
         }
 
 
@@ -159,15 +134,7 @@ class Road:
             condition.name,
             score(episodes, self.study.set_size, seed),
             None if reference is None else difference(episodes, reference, seed),
-            tuple(
-                RouteOutcome(
-                    each.route,
-                    route_score(each).composed,
-                    each.succeeded,
-                    each.ending.value,
-                )
-                for each in episodes
-            ),
+            outcomes(episodes, reference),
         )
 
     def _teller(self, stage: str) -> Callable[[Progress], None]:

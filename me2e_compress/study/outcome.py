@@ -11,6 +11,7 @@ from me2e_compress.study.definition import Condition, Study
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.fidelity import Faithfulness, measure_json
 from me2e_compress.study.models import Contender
+from me2e_compress.study.pictures import Contrast
 from me2e_compress.study.timing import Clock
 
 LATENCY_PERCENTILES = (50, 99)
@@ -80,6 +81,7 @@ class Outcome:
         study: What was asked.
         schemes: One a scheme, in the study's order.
         drives: Condition by condition, the schemes in the study's order.
+        contrasts: The same moments as two drivers lived them.
         device_scale: How many times slower the device is than the machine timed on.
         machine: What it was made on, in words.
         versions: Of the packages that decide the result.
@@ -88,6 +90,7 @@ class Outcome:
     study: Study
     schemes: tuple[SchemeOutcome, ...]
     drives: tuple[Drive, ...]
+    contrasts: tuple[Contrast, ...]
     device_scale: float
     machine: str
     versions: Mapping[str, str]

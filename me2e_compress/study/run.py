@@ -9,6 +9,7 @@ from me2e_compress.study.drives import Road
 from me2e_compress.study.fidelity import judge
 from me2e_compress.study.models import Contender, contend
 from me2e_compress.study.outcome import Outcome, SchemeOutcome, this_machine
+from me2e_compress.study.pictures import take_pictures
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workplace import SILENT, Listener, Workplace
 
@@ -18,6 +19,7 @@ def run_study(
     folder: Path,
     engine: Engine | None = None,
     listener: Listener = SILENT,
+    pictures: int = 3,
 ) -> Outcome:
     """Make the models, time them, hold them against the baseline, drive them.
 
@@ -29,6 +31,7 @@ def run_study(
         folder: Where models, traces and results go.
         engine: Where routes are driven; None for one process of this machine.
         listener: Who is told how it goes.
+        pictures: On how many routes two drives are shown side by side.
 
     Raises:
         Me2eError: A model cannot drive, a pass refused its graph, frames do not fit,
@@ -46,8 +49,15 @@ def run_study(
         for condition in study.conditions
         for drive in road.under(condition, contenders)
     ]
+    contrasts = take_pictures(road, contenders, drives, pictures)
     return Outcome(
-        study, schemes, tuple(drives), clock.scale, this_machine(), versions()
+        study,
+        schemes,
+        tuple(drives),
+        contrasts,
+        clock.scale,
+        this_machine(),
+        versions(),
     )
 
 

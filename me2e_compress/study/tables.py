@@ -1,6 +1,6 @@
 """The tables of a study: one content for the terminal, Markdown and HTML."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from me2e_compress.metrics.measure import Estimate, Measure
@@ -56,19 +56,44 @@ class Table:
         return "\n\n".join(parts) + "\n"
 
 
-def scoreboard(outcome: Outcome, condition: Condition) -> Table:
-    """Show how every scheme drives, and what it weighs and takes."""
-    rows = []
-    for drive in outcome.under(condition):
-        scheme = outcome.scheme(drive.scheme)
-        rows.append((Cell(drive.scheme), *_scores(drive), *_costs(scheme)))
+def scoreboards(outcome: Outcome) -> tuple[Table, ...]:
+    """Show how every scheme drives, and what it weighs and takes.
+
+    One table a condition; one scheme alone has one table of all its conditions.
+    """
+    conditions = outcome.study.conditions
+    if len(outcome.schemes) > 1:
+        return tuple(
+            _scoreboard(
+                outcome,
+                f"Scoreboard, {_condition(outcome, each)}",
+                ("scheme", [drive.scheme for drive in outcome.under(each)]),
+                outcome.under(each),
+            )
+            for each in conditions
+        )
+    names = [condition.name for condition in conditions]
+    title = f"Scoreboard of {outcome.study.baseline}"
+    return (_scoreboard(outcome, title, ("condition", names), outcome.drives),)
+
+
+def _scoreboard(
+    outcome: Outcome,
+    title: str,
+    first: tuple[str, Sequence[str]],
+    drives: Sequence[Drive],
+) -> Table:
+    heading, names = first
     return Table(
-        f"Scoreboard, {_condition(outcome, condition)}",
+        title,
         (
-            *("scheme", "DS", "SR %", "DE %", "DC"),
+            *(heading, "DS", "SR %", "DE %", "DC"),
             *("size MB", "p50 ms", "p99 ms", "plan moves m", "plan SQNR dB"),
         ),
-        tuple(rows),
+        tuple(
+            (Cell(name), *_scores(drive), *_costs(outcome.scheme(drive.scheme)))
+            for name, drive in zip(names, drives, strict=True)
+        ),
         _scoreboard_note(outcome),
         outcome.study.baseline,
     )
@@ -117,7 +142,7 @@ def all_tables(outcome: Outcome) -> tuple[Table, ...]:
     conditions = outcome.study.conditions
     compared = [differences(outcome)] if len(outcome.schemes) > 1 else []
     return (
-        *(scoreboard(outcome, each) for each in conditions),
+        *scoreboards(outcome),
         *compared,
         *(abilities(outcome, each) for each in conditions),
     )

@@ -30,6 +30,13 @@ class Workplace:
         """Return where the latencies of a scheme's model go."""
         return self._made("traces") / f"{scheme.name}.json"
 
+    def picture(
+        self, scheme: Scheme, condition: Condition, route: str, time_us: int
+    ) -> Path:
+        """Return where the picture of one moment goes."""
+        name = f"{route}.{time_us // 1000}ms.{scheme.name}.{condition.name}.png"
+        return self._made("pictures") / name
+
     def _made(self, name: str) -> Path:
         path = self.folder / name
         try:

@@ -1,14 +1,16 @@
 """What a study leaves on disk: JSON for programs, Markdown, one HTML page."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_json
 from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.report import html
 from me2e_compress.study.tables import all_tables
 
-JSON, MARKDOWN = "study.json", "tables.md"
+JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
 
 
 @dataclass(frozen=True)
@@ -18,25 +20,33 @@ class Written:
     Attributes:
         record: JSON, everything that was found.
         tables: Markdown.
+        report: One HTML page that needs nothing beside it.
     """
 
     record: Path
     tables: Path
+    report: Path
 
 
-def write_tables(outcome: Outcome, folder: Path) -> Written:
-    """Write JSON and Markdown, each whole or not at all.
+def write(outcome: Outcome, folder: Path, command: Sequence[str] = ()) -> Written:
+    """Write JSON, Markdown and HTML, each whole or not at all.
+
+    Args:
+        outcome: What was found.
+        folder: It is made when needed.
+        command: What makes it again, word by word.
 
     Raises:
         StudyError: The folder cannot be written.
     """
-    written = Written(folder / JSON, folder / MARKDOWN)
+    written = Written(folder / JSON, folder / MARKDOWN, folder / HTML)
     heading = f"# {outcome.study.title}\n\n"
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(written.record, outcome.to_json(), indent=1)
         write_bytes(written.tables, text.encode())
+        write_bytes(written.report, html(outcome, command).encode())
     except OSError as error:
         raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
     return written

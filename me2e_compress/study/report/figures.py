@@ -1,0 +1,159 @@
+"""The figures of a report, as SVG."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.study.definition import Condition
+from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.report.labels import place
+from me2e_compress.study.report.style import (
+    ACCENT,
+    BASELINE,
+    INK,
+    MUTED,
+    bare,
+    styled,
+    svg,
+)
+
+WIDTH_IN = 9.2
+"""Of the page's column."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A scheme where cost meets driving score.
+
+    Attributes:
+        name: The scheme.
+        cost: Megabytes or milliseconds; less is better.
+        score: Driving score with its interval; more is better.
+        baseline: Whether the others are held against it.
+    """
+
+    name: str
+    cost: float
+    score: Estimate
+    baseline: bool
+
+    @property
+    def height(self) -> float:
+        """The driving score itself."""
+        return self.score.value or 0.0
+
+
+def front(points: Sequence[Point]) -> list[Point]:
+    """Give the points that no other beats on both counts, cheapest first."""
+    best, kept = float("-inf"), list[Point]()
+    for point in sorted(points, key=lambda p: (p.cost, -p.height)):
+        if point.height > best:
+            kept.append(point)
+            best = point.height
+    return kept
+
+
+def pareto(outcome: Outcome, condition: Condition) -> str | None:
+    """Draw driving score against latency and against size; None below two points."""
+    latency = _points(outcome, condition, "latency")
+    size = _points(outcome, condition, "size")
+    panels = [
+        (points, words)
+        for points, words in (
+            (latency, "median latency, ms"),
+            (size, "size, MB"),
+        )
+        if len(points) > 1
+    ]
+    if not panels:
+        return None
+    with styled():
+        figure = Figure(figsize=(WIDTH_IN, 3.4), layout="constrained")
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for each, (points, words) in zip(axes, panels, strict=True):
+            _scatter(each, points, words)
+        axes[0].set_ylabel("driving score")
+        figure.canvas.draw_idle()
+        for each, (points, _) in zip(axes, panels, strict=True):
+            place(figure, each, [(p.name, p.cost, p.height) for p in points])
+        return svg(figure)
+
+
+def forest(outcome: Outcome) -> str | None:
+    """Draw every difference to the baseline with its interval; None without one."""
+    rows = [each for each in outcome.drives if each.difference is not None]
+    if not rows:
+        return None
+    several = len(outcome.study.conditions) > 1
+    names = [f"{r.scheme}, {r.condition}" if several else r.scheme for r in rows]
+    with styled():
+        height = 0.9 + 0.26 * len(rows)
+        figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
+        panels = figure.subplots(1, 2, sharey=True)
+        driving = [r.difference.driving_score for r in rows if r.difference]
+        success = [r.difference.success_rate for r in rows if r.difference]
+        titles = ("driving score, points", "success rate, points")
+        for axes, found, title in zip(panels, (driving, success), titles, strict=True):
+            _whiskers(axes, found)
+            axes.set_title(title, color=MUTED)
+        panels[0].set_yticks(range(len(rows)), names, color=INK)
+        panels[0].invert_yaxis()
+        return svg(figure)
+
+
+def _points(outcome: Outcome, condition: Condition, kind: str) -> list[Point]:
+    found = list[Point]()
+    for drive in outcome.under(condition):
+        scheme = outcome.scheme(drive.scheme)
+        measure = scheme.size_mb if kind == "size" else scheme.latency_ms[50]
+        if drive.scores is not None and measure.value is not None:
+            baseline = drive.scheme == outcome.study.baseline
+            score = drive.scores.driving_score
+            found.append(Point(drive.scheme, measure.value, score, baseline))
+    return found
+
+
+def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
+    bare(axes)
+    axes.grid(visible=True, axis="y")
+    best = front(points)
+    axes.step(
+        [p.cost for p in best],
+        [p.height for p in best],
+        where="post",
+        color=ACCENT,
+        alpha=0.35,
+        linewidth=1.2,
+        zorder=1,
+    )
+    for point in points:
+        colour = BASELINE if point.baseline else ACCENT
+        if point.score.low is not None and point.score.high is not None:
+            axes.plot(
+                [point.cost] * 2,
+                [point.score.low, point.score.high],
+                color=colour,
+                alpha=0.3,
+                linewidth=1.2,
+                zorder=2,
+            )
+        axes.plot(point.cost, point.height, "o", color=colour, markersize=5, zorder=3)
+    axes.set_xlabel(words)
+    axes.margins(x=0.12)
+    axes.set_xlim(left=0.0)
+
+
+def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
+    bare(axes)
+    axes.axvline(0.0, color=INK, linewidth=0.8)
+    for row, estimate in enumerate(found):
+        low, high = estimate.low, estimate.high
+        sure = low is not None and high is not None and (low > 0.0 or high < 0.0)
+        colour = ACCENT if sure else MUTED
+        if low is not None and high is not None:
+            axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
+        axes.plot(estimate.value or 0.0, row, "o", color=colour, markersize=5)
+    axes.margins(y=0.08 if len(found) > 3 else 0.3)

@@ -1,0 +1,71 @@
+"""A study in sentences: one a scheme, with what is sure and what is not."""
+
+from dataclasses import dataclass
+
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.study.drives import Drive
+from me2e_compress.study.outcome import Outcome, SchemeOutcome
+from me2e_compress.study.tables import number
+
+TIMES = "\N{MULTIPLICATION SIGN}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a reader should take away about a scheme.
+
+    Attributes:
+        scheme: Its name.
+        text: One sentence.
+    """
+
+    scheme: str
+    text: str
+
+
+def findings(outcome: Outcome) -> tuple[Finding, ...]:
+    """Say of every scheme what it costs and how it drives, against the baseline."""
+    baseline = outcome.scheme(outcome.study.baseline)
+    return tuple(
+        Finding(scheme.name, _sentence(outcome, baseline, scheme))
+        for scheme in outcome.schemes
+        if scheme is not baseline
+    )
+
+
+def _sentence(outcome: Outcome, baseline: SchemeOutcome, scheme: SchemeOutcome) -> str:
+    costs = [
+        _times(scheme.size_mb, baseline.size_mb, "the size"),
+        _times(scheme.latency_ms[50], baseline.latency_ms[50], "the median latency"),
+    ]
+    drives = [each for each in outcome.drives if each.scheme == scheme.name]
+    several = len(outcome.study.conditions) > 1
+    roads = [_road(each, several) for each in drives]
+    parts = [", ".join(filter(None, costs)), *filter(None, roads)]
+    return "; ".join(filter(None, parts)) + "."
+
+
+def _times(one: Measure, other: Measure, what: str) -> str:
+    if one.value is None or not other.value:
+        return ""
+    return f"{one.value / other.value:.2f} {TIMES} {what}"
+
+
+def _road(drive: Drive, several: bool) -> str:
+    where = f"{drive.condition}: " if several else ""
+    if drive.difference is None:
+        return ""
+    found = drive.difference.driving_score
+    value = number(found.value or 0.0, "+.1f")
+    if found.low is None or found.high is None:
+        return f"{where}driving score {value} points on {found.n} route"
+    low, high = (number(each, "+.1f") for each in (found.low, found.high))
+    return f"{where}driving score {value} points ({low} to {high}), {_verdict(found)}"
+
+
+def _verdict(found: Estimate) -> str:
+    if found.low is not None and found.low > 0.0:
+        return "better"
+    if found.high is not None and found.high < 0.0:
+        return "worse"
+    return "no difference shown"

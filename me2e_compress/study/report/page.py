@@ -1,0 +1,141 @@
+"""The page: tables, figures and pictures put into the template."""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from me2e_compress.study.definition import Condition
+from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.pictures import Contrast
+from me2e_compress.study.report.figures import forest, pareto
+from me2e_compress.study.report.findings import findings
+from me2e_compress.study.routes import RouteOutcome
+from me2e_compress.study.tables import Table, abilities, differences, scoreboards
+
+TEMPLATE = "report.html"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A contrast, its pictures inside the page.
+
+    Attributes:
+        title: The route and the moment.
+        before: Words and data URI of the baseline.
+        after: The same of the scheme.
+    """
+
+    title: str
+    before: tuple[str, str]
+    after: tuple[str, str]
+
+
+def html(outcome: Outcome, command: Sequence[str] = ()) -> str:
+    """Give the whole page; it refers to nothing outside itself.
+
+    Args:
+        outcome: What was found.
+        command: What makes it again, word by word.
+    """
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    study = outcome.study
+    return environment.get_template(TEMPLATE).render(
+        title=study.title,
+        baseline=study.baseline,
+        lede=_lede(outcome),
+        findings=findings(outcome),
+        scoreboards=scoreboards(outcome),
+        differences=differences(outcome) if len(outcome.schemes) > 1 else None,
+        forest=_markup(forest(outcome)),
+        fronts=[
+            (each.name, _markup(drawn))
+            for each in study.conditions
+            if (drawn := pareto(outcome, each)) is not None
+        ],
+        abilities=_abilities(outcome, study.conditions),
+        contrasts=[_shown(each, study.baseline) for each in outcome.contrasts],
+        made=_made(outcome, command),
+        schemes=[_recipe(each.name, outcome) for each in outcome.schemes],
+    )
+
+
+def _lede(outcome: Outcome) -> str:
+    study = outcome.study
+    driven = len(study.routes)
+    share = f"{driven}" if driven == study.set_size else f"{driven} of {study.set_size}"
+    names = ", ".join(each.name for each in study.conditions)
+    return (
+        f"{_count(len(study.schemes), 'scheme')} on {share} routes of highway-env, "
+        f"closed loop; {_count(len(study.conditions), 'condition')}: {names}."
+    )
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
+def _abilities(outcome: Outcome, conditions: Sequence[Condition]) -> tuple[Table, ...]:
+    return tuple(abilities(outcome, each) for each in conditions)
+
+
+def _shown(contrast: Contrast, baseline: str) -> Shown:
+    route = contrast.route
+    return Shown(
+        f"{route.scenario}, {contrast.condition}, "
+        f"{contrast.time_us / 1e6:.1f} s into the route {route.route}",
+        (f"{baseline}: {_fate(route)}", _data_uri(contrast.before)),
+        (f"{contrast.scheme}: {_fate(contrast.other)}", _data_uri(contrast.after)),
+    )
+
+
+def _fate(route: RouteOutcome) -> str:
+    """Say how a route went, in words."""
+    kinds = [kind.replace("_", " ") for kind, _ in route.infractions]
+    words = ", ".join(dict.fromkeys(kinds)) or route.ending
+    return f"driving score {route.driving_score:.1f}, {words}"
+
+
+def _recipe(name: str, outcome: Outcome) -> tuple[str, str, str]:
+    contender = outcome.scheme(name).contender
+    source = Path(contender.scheme.policy).name
+    digest = (contender.sha256 or "")[:12]
+    return (
+        name,
+        f"{source} → {contender.pipeline}" if contender.pipeline else source,
+        (digest),
+    )
+
+
+def _made(outcome: Outcome, command: Sequence[str]) -> list[tuple[str, str]]:
+    study, timing = outcome.study, outcome.study.timing
+    versions = ", ".join(f"{name} {text}" for name, text in outcome.versions.items())
+    rows = [("Command", " ".join(command)), ("Machine", outcome.machine)]
+    if outcome.timed:
+        rows.append(
+            (
+                "Latency",
+                f"{timing.samples} inferences a model, in turn, on "
+                f"{_count(timing.threads, 'thread')}; device scale "
+                f"{outcome.device_scale:.3g}",
+            )
+        )
+    rows += [("Versions", versions), ("Seed", str(study.seed))]
+    return [(name, text) for name, text in rows if text]
+
+
+def _data_uri(path: Path) -> str:
+    return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
+
+
+def _markup(drawing: str | None) -> Markup | None:
+    return None if drawing is None else Markup(drawing)

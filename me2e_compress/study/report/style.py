@@ -1,0 +1,34 @@
+"""How figures look: as the page does."""
+
+import io
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.style import context
+
+INK, MUTED, RULE = "#1d2127", "#6b7480", "#d9dde3"
+ACCENT, BASELINE = "#2a6fb0", "#1d2127"
+STYLE = Path(__file__).with_name("report.mplstyle")
+PAGE_FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
+"""Texts stay texts: matplotlib measures one font, the reader sees the page's."""
+
+
+def styled() -> AbstractContextManager[None]:
+    """Draw within this: the reader's own settings of matplotlib do not matter."""
+    return context(STYLE, after_reset=True)
+
+
+def svg(figure: Figure) -> str:
+    """Give a figure as an SVG element: the same figure, the same text."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :].replace("'DejaVu Sans'", PAGE_FONT)
+
+
+def bare(axes: Axes) -> None:
+    """Leave a quiet grid along x, and nothing else."""
+    axes.grid(visible=True, axis="x")
+    axes.spines["left"].set_visible(False)

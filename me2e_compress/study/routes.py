@@ -1,0 +1,104 @@
+"""What became of each route, and when two drives of it part."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.infraction import InfractionKind
+
+
+@dataclass(frozen=True)
+class RouteOutcome:
+    """One route of one drive.
+
+    Attributes:
+        route: Its id.
+        scenario: Its type.
+        driving_score: Percent.
+        succeeded: The whole route without an infraction.
+        ending: Why it was over, in words.
+        infractions: Kind and time in microseconds, in order of time.
+        duration_us: Until the last frame.
+        apart_m: Greatest distance to the baseline's ego at the same time; None for the
+            baseline itself and for a route without frames.
+        apart_us: When that was.
+    """
+
+    route: str
+    scenario: str
+    driving_score: float
+    succeeded: bool
+    ending: str
+    infractions: tuple[tuple[str, int], ...]
+    duration_us: int
+    apart_m: float | None = None
+    apart_us: int | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a flat object; infractions as a list of kind and time."""
+        return {
+            "route": self.route,
+            "driving_score": self.driving_score,
+            "succeeded": self.succeeded,
+            "ending": self.ending,
+            "infractions": [
+                {"kind": kind, "time_us": time_us} for kind, time_us in self.infractions
+            ],
+            "apart_m": self.apart_m,
+        }
+
+
+def outcomes(
+    episodes: Sequence[Episode], reference: Sequence[Episode] | None
+) -> tuple[RouteOutcome, ...]:
+    """Sum up a drive, one a route, in its order.
+
+    Args:
+        episodes: The drive.
+        reference: The baseline's, on the same routes in the same order; None if this
+            is the baseline's.
+    """
+    if reference is None:
+        return tuple(_outcome(each, None, None) for each in episodes)
+    return tuple(
+        _outcome(each, *_apart(each, other))
+        for each, other in zip(episodes, reference, strict=True)
+    )
+
+
+def _outcome(
+    episode: Episode, apart_m: float | None, apart_us: int | None
+) -> RouteOutcome:
+    return RouteOutcome(
+        episode.route,
+        episode.scenario,
+        route_score(episode).composed,
+        episode.succeeded,
+        episode.ending.value,
+        tuple(
+            (each.kind.value, each.time_us)
+            for each in episode.infractions
+            if each.kind is not InfractionKind.MIN_SPEED
+        ),
+        episode.frames[-1].time_us if episode.frames else 0,
+        apart_m,
+        apart_us,
+    )
+
+
+def _apart(one: Episode, other: Episode) -> tuple[float | None, int | None]:
+    """Give the greatest distance at the same time, metres, and that time."""
+    count = min(len(one.frames), len(other.frames))
+    if not count:
+        return None, None
+    here, there = (
+        np.array([(frame.x, frame.y) for frame in each.frames[:count]])
+        for each in (one, other)
+    )
+    gaps = np.hypot(*(here - there).T)
+    at = int(gaps.argmax())
+    return float(gaps[at]), one.frames[at].time_us
