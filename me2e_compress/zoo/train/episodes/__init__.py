@@ -35,8 +35,8 @@ that sample, x forward and y left.
 """
 
 from me2e_compress.zoo.train.episodes.agents import GRID
-from me2e_compress.zoo.train.episodes.collect import Progress, collect
 from me2e_compress.zoo.train.episodes.collection import Collection
+from me2e_compress.zoo.train.episodes.driving import Progress, collect
 from me2e_compress.zoo.train.episodes.pictures import decode
 
 __all__ = ["GRID", "Collection", "Progress", "collect", "decode"]

@@ -84,14 +84,17 @@ def collect(
 
 
 def _check_student(what: Collection, student: Path | None) -> None:
-    found = None if student is None else sha256_of(student)
+    if student is None:
+        if what.student is not None:
+            raise EvaluationError(
+                f"collect: the collection's student is {what.student}, none was given"
+            )
+        return
+    policy, found = OnnxPolicy.open(student), sha256_of(student)
     if found != what.student:
         raise EvaluationError(
             f"student {student}: its sha256 is {found}, the collection's {what.student}"
         )
-    if student is None:
-        return
-    policy = OnnxPolicy.open(student)
     if policy.needs_images and policy.image_size != what.image_size:
         raise EvaluationError(
             f"student {student}: sees images of {policy.image_size}, the "
