@@ -10,6 +10,10 @@ from me2e_compress.evaluators.highway.cameras import (
     PixelClass,
     bev_classes,
 )
+from me2e_compress.evaluators.highway.cameras.birdseye import (
+    covered,
+    ground_classes,
+)
 from me2e_compress.evaluators.highway.scene import ActorKind, Scene
 from tests.evaluators.highway.cameras import town
 
@@ -84,3 +88,25 @@ def test_ground_classes_of_camera_and_grid_agree(
 def test_an_empty_grid_is_refused() -> None:
     with pytest.raises(EvaluationError, match=r"grid of 0 x 200 cells .* positive"):
         BevGrid(rows=0)
+
+
+def test_the_ground_is_what_lies_under_the_ego(texture: GroundTexture) -> None:
+    scene = town.scene()
+    seen = bev_classes(scene, texture, GRID)
+
+    ground = ground_classes(scene.ego, texture, GRID)
+
+    ego = seen == PixelClass.EGO
+    assert np.array_equal(ground[~ego], seen[~ego])
+    assert np.all(ground[ego] == PixelClass.DRIVABLE)
+
+
+def test_a_box_covers_what_its_class_is_painted_on(texture: GroundTexture) -> None:
+    car = town.actor(10.0, 4.0)
+    scene = town.scene(car)
+
+    touched = covered([car], scene.ego, GRID)
+
+    assert np.array_equal(
+        touched, bev_classes(scene, texture, GRID) == PixelClass.VEHICLE
+    )
