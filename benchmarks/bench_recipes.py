@@ -17,6 +17,7 @@ from time import process_time
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.cli.frames import record
 from me2e_compress.manager import PassManager
 from me2e_compress.metrics.fidelity import compare
 from me2e_compress.metrics.reaction import plan_reaction
@@ -24,7 +25,6 @@ from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.runtime.session import Session
 from me2e_compress.zoo.export import export
-from me2e_compress.zoo.frames import write_frames
 
 STACK, CAMERAS = "vad-tiny", 6
 HEAD = "recipe            MB   nodes  int8 MB  ego dB  plan m (max)  least move  CPU s"
@@ -40,8 +40,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         folder = options.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         source = export(STACK, folder / f"{STACK}.onnx")
-        seen = write_frames(STACK, folder / "frames", options.calibration, 0, 4)
-        held_out = write_frames(STACK, folder / "held-out", options.held_out, 1, 1)
+        seen = record(STACK, folder / "frames", options.calibration, 0, 4)
+        held_out = record(STACK, folder / "held-out", options.held_out, 1, 1)
         frames, others = CalibrationSet(seen), CalibrationSet(held_out)
         print(HEAD)
         reference = Session(source, threads=2, release=True)

@@ -12,8 +12,7 @@ _NAMES = ("evaluate", "routes", "score", "study")
 
 def closed_loop(app: typer.Typer) -> None:
     """Add the commands that drive or score: the extra ``highway`` brings them."""
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
+    if not _is_complete():
         for name in _NAMES:
             anything = {"allow_extra_args": True, "ignore_unknown_options": True}
             app.command(name, context_settings=anything)(_advise)
@@ -30,3 +29,17 @@ def closed_loop(app: typer.Typer) -> None:
 def _advise(context: typer.Context) -> None:
     """Say what to install: this command drives in closed loop."""
     raise MissingExtraError(f"what {context.info_name} needs", "highway")
+
+
+def need_closed_loop(what: str) -> None:
+    """Go on if the extra ``highway`` is installed.
+
+    Raises:
+        MissingExtraError: it is not, and ``what`` needs it.
+    """
+    if not _is_complete():
+        raise MissingExtraError(what, "highway")
+
+
+def _is_complete() -> bool:
+    return all(importlib.util.find_spec(name) is not None for name in _NEEDED)

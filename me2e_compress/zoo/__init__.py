@@ -3,7 +3,6 @@
 Importing this needs no torch; using an exporter does (extra ``zoo``).
 """
 
-from me2e_compress.zoo.frames import write_frames
 from me2e_compress.zoo.stacks import STACKS, Stack
 
-__all__ = ["STACKS", "Stack", "write_frames"]
+__all__ = ["STACKS", "Stack"]

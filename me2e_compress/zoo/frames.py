@@ -1,87 +1,21 @@
 """Synthetic calibration frames: scenes of a moving world seen by six cameras."""
 
-import json
 import math
-import os
-import shutil
-import tempfile
-import zipfile
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.errors import FramesError
 from me2e_compress.zoo.cameras import render, rig
-from me2e_compress.zoo.stacks import Stack, find
+from me2e_compress.zoo.stacks import Stack
 from me2e_compress.zoo.traffic import draw_world
 from me2e_compress.zoo.world import FRAME_S, World
 
 Frame = dict[str, NDArray[np.float32]]
 
-INDEX = "scenes.json"
 SENSOR_NOISE = 2.0
 """Standard deviation of pixel noise, in 1 / 255."""
-
-
-def write_frames(
-    stack: str,
-    folder: Path,
-    n: int,
-    seed: int,
-    scene_length: int = 8,
-    on_frame: Callable[[int], None] | None = None,
-) -> Path:
-    """Write a folder of calibration frames, all or nothing.
-
-    One ``000000.npz`` a frame, keyed by input name and without the recurrent inputs,
-    and ``scenes.json``, which says where scenes begin (there the recurrent state is
-    reset). A folder that holds earlier frames of the zoo is replaced.
-
-    Args:
-        stack: Name in `me2e_compress.zoo.stacks.STACKS`.
-        folder: To write.
-        n: Frames.
-        seed: Of the worlds and of the noise.
-        scene_length: Frames a scene; the last may be shorter.
-        on_frame: Told the number of frames written, after each.
-
-    Returns:
-        The folder.
-
-    Raises:
-        FramesError: A count below 1, or the folder holds something else.
-        GraphError: Unknown stack, or one that sees another world than this one.
-    """
-    spec = find(stack)
-    if spec.trained:
-        raise GraphError(
-            f"{stack} sees highway-env, not this world: evaluators.highway.frames"
-            " drives for its frames"
-        )
-    _refuse_foreign(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
-    try:
-        draft.chmod(0o755)
-        for index, frame in enumerate(frames(spec, n, seed, scene_length)):
-            _write_npz(draft / f"{index:06d}.npz", frame)
-            if on_frame is not None:
-                on_frame(index + 1)
-        index_of_frames = {
-            "scenes": list(range(0, n, scene_length)),
-            "stack": stack,
-            "seed": seed,
-            "count": n,
-        }
-        (draft / INDEX).write_text(json.dumps(index_of_frames, indent=1) + "\n")
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(draft, folder)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-    return folder
 
 
 def frames(spec: Stack, n: int, seed: int, scene_length: int = 8) -> Iterator[Frame]:
@@ -137,28 +71,3 @@ def _can_bus(world: World, step: int) -> NDArray[np.float32]:
     out[15] = turned / FRAME_S
     out[16], out[17] = now.yaw, math.degrees(turned)
     return out
-
-
-def _refuse_foreign(folder: Path) -> None:
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise FramesError(f"{folder} is a file, not a folder for frames")
-    names = sorted(path.name for path in folder.iterdir())
-    if not names:
-        return
-    if INDEX not in names:
-        raise FramesError(f"{folder} is not empty and not ours: it has {names[0]}")
-    for name in names:
-        if name != INDEX and not (name.endswith(".npz") and name[:-4].isdigit()):
-            raise FramesError(f"{folder} holds frames but also {name}: not replaced")
-
-
-def _write_npz(path: Path, frame: Frame) -> None:
-    """Like numpy.savez_compressed, at a fast level; the same frame, the same bytes."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, value in frame.items():
-            entry = zipfile.ZipInfo(f"{name}.npy")
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(entry, "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, value, allow_pickle=False)

@@ -11,7 +11,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.evaluators.highway.routes import save_routes
 from me2e_compress.zoo import shipped
 from tests.cli.conftest import Command
-from tests.evaluators.highway.drivers import EXIT
+from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.stand_in import write_model, write_shipped
 
 
@@ -171,3 +171,60 @@ def test_no_weights_at_all(weights: Path) -> None:
 
     with pytest.raises(GraphError, match=r"highway\.onnx: cannot be read"):
         model_path("highway")
+
+
+def test_frames_are_driven(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = tmp_path / "made"
+    words = ("frames", "highway", "-n", "3", "--scene-length", "2", "--seed", "1")
+
+    assert command(*words, "-o", made) == 0
+    assert command("compare", "highway", "highway", made, "--json") == 0
+    assert '"frames": 3' in capsys.readouterr().out
+    index = json.loads((made / "scenes.json").read_text())
+    assert index == {"scenes": [0, 2], "stack": "highway", "seed": 1, "count": 3}
+
+
+def test_frames_of_any_driver(command: Command, tmp_path: Path) -> None:
+    model = straight_on(tmp_path / "m.onnx")
+
+    assert command("frames", model, "-n", "1", "-o", tmp_path / "made") == 0
+    with np.load(tmp_path / "made" / "000000.npz") as frame:
+        assert list(frame) == ["command"]
+
+
+def test_frames_of_another_layout_are_refused(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames of a driver with other images: one line, and no model."""
+    model = write_model(tmp_path / "wide.onnx", size=(16, 32))
+    made, output = tmp_path / "made", tmp_path / "small.onnx"
+    assert command("frames", model, "-n", "1", "-o", made) == 0
+    words = ("compress", "highway", "-r", "full", "--frames", made, "-o", output)
+
+    assert command(*words) == 1
+    line = capsys.readouterr().err.strip()
+    assert "000000.npz: img has shape [1, 6, 3, 16, 32], expected [1,6,3,16,24]" in line
+    assert "\n" not in line
+    assert not output.exists()
+
+
+def test_frames_of_nothing(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("frames", "vad-huge", "-o", tmp_path / "made") == 1
+    assert "no stack 'vad-huge' in the zoo" in capsys.readouterr().err
+
+
+def test_frames_without_the_simulator(
+    command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+
+    assert command("frames", "highway", "-o", tmp_path / "made") == 1
+    assert "me2e-compress[highway]" in capsys.readouterr().err
+    assert not (tmp_path / "made").exists()

@@ -1,44 +1,15 @@
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.errors import FramesError
 from me2e_compress.zoo.cameras import HEIGHT, WIDTH, rig
-from me2e_compress.zoo.frames import Frame, frames, write_frames
+from me2e_compress.zoo.frames import Frame, frames
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.world import FRAME_S, Pose
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("zoo") / "frames"
-    return write_frames("vad-tiny", path, 3, seed=4, scene_length=2)
-
-
-def test_layout(folder: Path) -> None:
-    assert list(files(folder)) == [
-        "000000.npz",
-        "000001.npz",
-        "000002.npz",
-        "scenes.json",
-    ]
-    assert json.loads((folder / "scenes.json").read_text()) == {
-        "scenes": [0, 2],
-        "stack": "vad-tiny",
-        "seed": 4,
-        "count": 3,
-    }
-
-
-def test_frames_are_the_inputs_without_the_state(folder: Path) -> None:
-    with np.load(folder / "000001.npz") as frame:
-        shapes = {name: (frame[name].shape, frame[name].dtype) for name in frame}
+def test_frames_are_the_inputs_without_the_state(scenes: list[Frame]) -> None:
+    shapes = {name: (array.shape, array.dtype) for name, array in scenes[0].items()}
     assert shapes == {
         name: (shape, np.dtype(np.float32))
         for name, shape in VAD_TINY.inputs.items()
@@ -46,14 +17,15 @@ def test_frames_are_the_inputs_without_the_state(folder: Path) -> None:
     }
 
 
-def test_same_seed_same_bytes(folder: Path, tmp_path: Path) -> None:
-    again = write_frames("vad-tiny", tmp_path / "f", 3, seed=4, scene_length=2)
-    assert files(again) == files(folder)
+def test_same_seed_same_numbers(scenes: list[Frame]) -> None:
+    (again,) = frames(VAD_TINY, 1, seed=7, scene_length=2)
+    for name, array in scenes[0].items():
+        np.testing.assert_array_equal(again[name], array)
 
 
-def test_another_seed_another_world(scenes: list[Frame], folder: Path) -> None:
-    with np.load(folder / "000000.npz") as frame:
-        assert not np.array_equal(frame["img"], scenes[0]["img"])
+def test_another_seed_another_world(scenes: list[Frame]) -> None:
+    (other,) = frames(VAD_TINY, 1, seed=4, scene_length=2)
+    assert not np.array_equal(other["img"], scenes[0]["img"])
 
 
 def test_images_are_normalised_and_padded(scenes: list[Frame]) -> None:
@@ -114,41 +86,10 @@ def test_pose_round_trip() -> None:
     assert back[1] == pytest.approx(ahead, abs=1e-5)
 
 
-def test_earlier_frames_are_replaced(tmp_path: Path) -> None:
-    target = tmp_path / "frames"
-    write_frames("vad-tiny", target, 2, seed=0)
-    told: list[int] = []
-    write_frames("vad-tiny", target, 1, seed=1, on_frame=told.append)
-    assert list(files(target)) == ["000000.npz", "scenes.json"]
-    assert told == [1]
-    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
-
-
-@pytest.mark.parametrize("also", [(), ("scenes.json",)])
-def test_foreign_folder_is_refused(tmp_path: Path, also: tuple[str, ...]) -> None:
-    for name in ("thesis.tex", *also):
-        (tmp_path / name).write_text("mine")
-    with pytest.raises(FramesError, match=r"thesis\.tex"):
-        write_frames("vad-tiny", tmp_path, 1, seed=0)
-    assert (tmp_path / "thesis.tex").read_text() == "mine"
-
-
-def test_a_file_is_not_a_folder(tmp_path: Path) -> None:
-    path = tmp_path / "frames"
-    path.write_text("mine")
-    with pytest.raises(FramesError, match="is a file"):
-        write_frames("vad-tiny", path, 1, seed=0)
-
-
-def test_failure_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("count", "length"), [(0, 8), (4, 0)])
+def test_no_frames_are_an_error(count: int, length: int) -> None:
     with pytest.raises(FramesError, match="must be >= 1"):
-        write_frames("vad-tiny", tmp_path / "frames", 0, seed=0)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_unknown_stack(tmp_path: Path) -> None:
-    with pytest.raises(GraphError, match="no stack 'tcp2'"):
-        write_frames("tcp2", tmp_path / "frames", 1, seed=0)
+        list(frames(VAD_TINY, count, seed=0, scene_length=length))
 
 
 def test_frames_of_a_scene_do_not_depend_on_those_before() -> None:

@@ -109,14 +109,19 @@ class OnnxPolicy:
             EvaluationError: It sees images and there are none.
             GraphError: A node of the model failed.
         """
-        feeds = self._feeds(observation)
+        feeds = self.feeds(observation)
         outputs = self.session.run({**self._state, **feeds})
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
         command = np.array([observation.command])
         waypoints = self.plan_adapter.plan(outputs, {"command": command, **feeds})
         return self.adapter.to_ego(waypoints)
 
-    def _feeds(self, observation: Observation) -> dict[str, Array]:
+    def feeds(self, observation: Observation) -> dict[str, Array]:
+        """Lay an observation out as the graph takes it, recurrent inputs left out.
+
+        Raises:
+            EvaluationError: It sees images and there are none.
+        """
         arrays: dict[str, Array] = {
             "lidar2img": self.adapter.projection(observation.lidar2img),
             "can_bus": observation.can_bus,

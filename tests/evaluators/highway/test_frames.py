@@ -1,0 +1,142 @@
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.errors import FramesError
+from me2e_compress.evaluators.highway import frames as room
+from me2e_compress.evaluators.highway.cameras import CameraRig
+from me2e_compress.evaluators.highway.frames import driven_frames, fresh_routes
+from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+from me2e_compress.evaluators.highway.routes import load_routes
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import replay
+from tests.evaluators.highway.drivers import straight_on
+from tests.stand_in import write_model
+
+SIZE = (16, 24)
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> OnnxPolicy:
+    path = tmp_path_factory.mktemp("driver") / "m.onnx"
+    return OnnxPolicy.open(write_model(path, size=SIZE))
+
+
+@pytest.fixture(scope="module")
+def seen(policy: OnnxPolicy) -> list[Frame]:
+    """Two scenes and a bit."""
+    return list(driven_frames(policy, 10, seed=3, scene_length=4))
+
+
+def test_scenes_begin_where_routes_do(seen: list[Frame]) -> None:
+    assert [frame.index for frame in seen] == list(range(10))
+    assert [frame.starts_scene for frame in seen] == [
+        *([True, False, False, False] * 2),
+        *(True, False),
+    ]
+
+
+def test_the_inputs_are_the_models_own(policy: OnnxPolicy, seen: list[Frame]) -> None:
+    shapes = {name: array.shape for name, array in seen[0].arrays.items()}
+    types = {name: array.dtype for name, array in seen[0].arrays.items()}
+
+    assert shapes == {
+        "img": (1, 6, 3, *SIZE),
+        "lidar2img": (1, 6, 4, 4),
+        "can_bus": (18,),
+        "command": (1,),
+        "timestamp": (1,),
+    }
+    assert types.pop("command") == np.int64
+    assert set(types.values()) == {np.dtype(np.float32)}
+    answers = list(replay(policy.session, seen, ["plan"]))
+    assert all(np.isfinite(answer["plan"]).all() for answer in answers)
+
+
+def test_images_are_normalised_as_the_metadata_says(seen: list[Frame]) -> None:
+    mean = np.array([100, 110, 120], np.float32)[:, None, None]
+    std = np.array([50, 60, 70], np.float32)[:, None, None]
+
+    grey = np.asarray(seen[5].arrays["img"], np.float32)[0] * std + mean
+
+    assert np.abs(grey - np.rint(grey)).max() < 1e-3
+    assert grey.min() >= -1e-3
+    assert grey.max() <= 255.001
+    assert grey.std() > 10
+
+
+def test_the_cameras_are_those_of_the_drive(seen: list[Frame]) -> None:
+    found = seen[0].arrays["lidar2img"]
+    np.testing.assert_array_equal(found[0], CameraRig(*SIZE).lidar2img)
+
+
+def test_the_clock_starts_with_the_scene(seen: list[Frame]) -> None:
+    clock = [float(frame.arrays["timestamp"][0]) for frame in seen]
+    assert clock == [0.0, 0.5, 1.0, 1.5, 0.0, 0.5, 1.0, 1.5, 0.0, 0.5]
+
+
+def test_the_can_bus_counts_since_the_last_frame(seen: list[Frame]) -> None:
+    for scene in (seen[0:4], seen[4:8]):
+        buses = [np.asarray(frame.arrays["can_bus"], float) for frame in scene]
+        assert not buses[0][[0, 1, 2, 17]].any()
+        for before, now in itertools.pairwise(buses):
+            way = float(np.hypot(now[0], now[1]))
+            assert way == pytest.approx((before[7] + now[7]) / 4, abs=0.15)
+            turned = np.radians(now[17])
+            apart = (now[16] - before[16] - turned + np.pi) % (2 * np.pi) - np.pi
+            assert apart == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_model_without_images_gets_none(tmp_path: Path) -> None:
+    model = straight_on(tmp_path / "m.onnx", inputs="float[1, 18] can_bus")
+
+    (frame,) = driven_frames(OnnxPolicy.open(model), 1, seed=0)
+    assert {name: array.shape for name, array in frame.arrays.items()} == {
+        "can_bus": (1, 18)
+    }
+
+
+def test_same_seed_same_numbers(policy: OnnxPolicy, seen: list[Frame]) -> None:
+    again = list(driven_frames(policy, 5, seed=3, scene_length=4))
+
+    for one, other in zip(again, seen, strict=False):
+        for name, array in one.arrays.items():
+            np.testing.assert_array_equal(array, other.arrays[name])
+
+
+def test_another_seed_other_routes() -> None:
+    one, two = (itertools.islice(fresh_routes(seed), 3) for seed in (0, 1))
+    assert {route.seed for route in one}.isdisjoint(route.seed for route in two)
+
+
+def test_the_types_take_turns() -> None:
+    types = [route.scenario for route in itertools.islice(fresh_routes(5), 88)]
+    assert len(set(types[:44])) == 44
+    assert types[:44] == types[44:]
+
+
+def test_no_route_is_one_that_drivers_are_judged_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A route that the shipped set has is passed over."""
+    first, second = itertools.islice(fresh_routes(0), 2)
+    monkeypatch.setattr(room, "load_routes", lambda: (first, *load_routes()))
+
+    assert next(fresh_routes(0)) == second
+
+
+@pytest.mark.parametrize(
+    ("count", "seed", "length", "words"),
+    [
+        (0, 0, 4, "0 frames in scenes of 4: both must be >= 1"),
+        (4, 0, 0, "4 frames in scenes of 0: both must be >= 1"),
+        (4, -1, 4, "seed -1: it must be 0 or more"),
+    ],
+)
+def test_bad_numbers(
+    policy: OnnxPolicy, count: int, seed: int, length: int, words: str
+) -> None:
+    with pytest.raises(FramesError, match=words):
+        next(driven_frames(policy, count, seed=seed, scene_length=length))
