@@ -1,115 +1,42 @@
 """``me2e-compress demo``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
-from rich.table import Table
 
-from me2e_compress import graph, recipe
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.cli import job
-from me2e_compress.cli.compare import judge
-from me2e_compress.cli.console import (
-    console,
-    file_bytes,
-    megabytes,
-    progress,
-    table,
-)
-from me2e_compress.cli.export import export
-from me2e_compress.cli.frames import frames
-from me2e_compress.cli.inspect import weigh
-from me2e_compress.cli.tables import (
-    fidelity_table,
-    modules_table,
-    notes,
-    plan_line,
-    steps_table,
-    verification_table,
-)
-from me2e_compress.modules import Item, map_of
-from me2e_compress.runtime.race import Lap, race
-from me2e_compress.runtime.session import Session
-
-STACK = "vad-tiny"
-CALIBRATION_SEED, HELD_OUT_SEED = 0, 1
+from me2e_compress.cli.console import console
+from me2e_compress.cli.extras import need_closed_loop
+from me2e_compress.zoo.shipped import SHIPPED
 
 
 def demo(
     out: Annotated[Path, typer.Option(help="the folder to write")] = Path("out"),
+    stack: Annotated[
+        Literal["highway", "vad-tiny"],
+        typer.Option(help="the trained driver, or a stack of published size"),
+    ] = "highway",
     scheme: Annotated[
         str, typer.Option(help="feature-ext, prediction or full")
     ] = "feature-ext",
-    count: Annotated[int, typer.Option(help="calibration frames")] = 8,
-    rounds: Annotated[int, typer.Option(help="latency rounds")] = 4,
-    threads: Annotated[int, typer.Option(help="of onnxruntime, for latency")] = 2,
+    routes: Annotated[str, typer.Option(help="that highway drives: N or ID,ID")] = "5",
+    workers: Annotated[int, typer.Option(min=1, help="routes at a time")] = 2,
+    rounds: Annotated[int, typer.Option(help="latency rounds of vad-tiny")] = 4,
+    threads: Annotated[int, typer.Option(help="of onnxruntime, for vad-tiny")] = 2,
 ) -> None:
-    """Run the main job: export VAD-tiny, make it small, show what that did to it."""
+    """Run the main job on what ships: compress, verify, compare, drive, report.
+
+    The trained driver is compressed and drives before and after; vad-tiny, at its
+    published size and with random weights, is compressed, compared and timed.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    source = out / f"{STACK}.onnx"
-    export(STACK, source)
-    calibration, held_out = out / "frames", out / "frames-held-out"
-    frames(STACK, calibration, count, 4, CALIBRATION_SEED)
-    frames(STACK, held_out, 4, 4, HELD_OUT_SEED)
-    small = out / f"{STACK}.{scheme}.onnx"
-    report = job.run(source, recipe.load(scheme), calibration, None, 0, 2, out)
-    record = job.write(report, source, small)
-    console.print(steps_table(report.steps))
-    console.print(notes(report.steps))
-    console.print(verification_table(report.verifications))
-    console.print(modules_table(_weigh(source), _weigh(small)))
-    found = judge(source, small, held_out)
-    console.print(fidelity_table(found))
-    console.print(plan_line(found))
-    exact = out / f"{STACK}.exact.onnx"
-    job.write(
-        job.run(source, recipe.load("exact"), None, None, 0, 0, out), source, exact
-    )
-    console.print(_files((source, exact, small), held_out, rounds, threads))
-    console.print(f"{small} and {record} are yours.")
+    if stack in SHIPPED:
+        need_closed_loop("what the demo drives with")
+        from me2e_compress.cli.demo_driver import demo_driver
+
+        demo_driver(stack, out, scheme, routes, workers)
+    else:
+        from me2e_compress.cli.demo_stack import demo_stack
+
+        demo_stack(stack, out, scheme, rounds, threads)
     console.save_svg(str(out / "demo.svg"), title="me2e-compress demo")
-
-
-def _weigh(path: Path) -> tuple[Item, ...]:
-    model = graph.load(path)
-    return weigh(model, map_of(model, None))
-
-
-def _files(paths: tuple[Path, ...], frames: Path, rounds: int, threads: int) -> Table:
-    """Show size and latency of every file, measured in turn on one frame."""
-    recording = CalibrationSet(frames)
-    sessions = {
-        path.name: Session(path, threads=threads, release=True) for path in paths
-    }
-    with progress("latency") as advance:
-        laps = race(sessions, [recording[0]], rounds, advance)
-    shown = table(
-        f"Files, and latency on this CPU ({threads} threads, {rounds} rounds in turn)",
-        "file",
-        "MB",
-        "median s",
-        "best s",
-        "CPU s",
-        "ratio to the first",
-    )
-    first = laps[paths[0].name]
-    for path in paths:
-        lap = laps[path.name]
-        shown.add_row(
-            path.name,
-            megabytes(file_bytes(path)),
-            f"{lap.median_wall_s:.3f}",
-            f"{lap.best_wall_s:.3f}",
-            f"{min(lap.cpu_s):.3f}",
-            f"{_ratio(lap, first):.3f}",
-        )
-    shown.caption = (
-        "int8 here is placed for TensorRT; onnxruntime's CPU runs such graphs slower"
-    )
-    shown.caption_justify = "left"
-    return shown
-
-
-def _ratio(lap: Lap, first: Lap) -> float:
-    return lap.median_wall_s / first.median_wall_s
