@@ -20,7 +20,7 @@ from itertools import combinations
 from pathlib import Path
 
 from me2e_compress import recipe
-from me2e_compress.cli.frames import frames as make_frames
+from me2e_compress.cli.frames import record
 from me2e_compress.cli.models import model_path
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -180,14 +180,14 @@ def collect(out: Path) -> None:
     (out / MARKDOWN).write_text("\n".join(texts), "utf-8")
 
 
-def frames_of(path: Path | None, out: Path, name: str, what: tuple[int, int]) -> Path:
+def frames_of(
+    given: Path | None, made: Path, model: Path, what: tuple[int, int]
+) -> Path:
     """Take the frames that are given, or make them once."""
-    if path is not None:
-        return path
-    made = out / name
-    if not (made / "scenes.json").is_file():
-        make_frames(DRIVER, made, what[0], seed=what[1])
-    return made
+    if given is not None or (made / "scenes.json").is_file():
+        return given or made
+    count, seed = what
+    return record(str(model), made, count, seed)
 
 
 def main() -> None:
@@ -205,13 +205,15 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     shipped = load_routes()
     try:
+        model = model_path(given.model)
+        held_out = given.out / "frames-held-out"
         bench = Bench(
             given.out,
-            str(model_path(given.model)),
+            str(model),
             pick_routes(shipped, given.routes),
             len(shipped),
-            frames_of(given.frames, given.out, "frames", CALIBRATION),
-            frames_of(given.held_out, given.out, "frames-held-out", HELD_OUT),
+            frames_of(given.frames, given.out / "frames", model, CALIBRATION),
+            frames_of(given.held_out, held_out, model, HELD_OUT),
         )
         for name in given.only or STUDIES:
             print(f"\n## {name}\n", flush=True)

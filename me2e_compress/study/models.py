@@ -1,6 +1,7 @@
 """The file that drives: given, or made by passes once and kept."""
 
 import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,14 +60,22 @@ def contend(
         model = _compressed(study, scheme, workplace, listener)
     driver = Driver(str(model), scheme.adapter)
     driver.open()
-    return Contender(
-        scheme,
-        driver,
-        model,
-        to_text(scheme.passes),
-        graph.sha256_of(model),
-        graph.file_bytes(model),
-    )
+    sha256 = graph.sha256_of(model)
+    pipeline = to_text(scheme.passes) or _told_beside(model, sha256)
+    return Contender(scheme, driver, model, pipeline, sha256, graph.file_bytes(model))
+
+
+def _told_beside(model: Path, sha256: str) -> str:
+    """Read what made a file from the report beside it, if it is of this very file."""
+    path = model.with_name(f"{model.stem}.report.json")
+    try:
+        report = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return ""
+    if not isinstance(report, dict) or not isinstance(report.get("output"), dict):
+        return ""
+    same = report["output"].get("sha256") == sha256
+    return str(report.get("pipeline", "")) if same else ""
 
 
 def _compressed(

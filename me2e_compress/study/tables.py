@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from me2e_compress.metrics.differences import Difference
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.drives import Drive
@@ -104,10 +105,10 @@ def differences(outcome: Outcome) -> Table:
     baseline, rows = outcome.study.baseline, []
     several = len(outcome.study.conditions) > 1
     for drive in outcome.drives:
-        if drive.scheme == baseline:
+        if drive.difference is None:
             continue
         name = f"{drive.scheme}, {drive.condition}" if several else drive.scheme
-        rows.append((Cell(name), *_difference(drive)))
+        rows.append((Cell(name), *_difference(drive.difference)))
     return Table(
         f"Difference to {baseline} on the same routes",
         ("scheme", "DS, points", "SR, points", "routes better", "routes worse"),
@@ -197,10 +198,7 @@ def _costs(scheme: SchemeOutcome) -> tuple[Cell, ...]:
     )
 
 
-def _difference(drive: Drive) -> tuple[Cell, ...]:
-    if drive.difference is None:
-        return (Cell(MISSING, reason=drive.reason or "nothing to compare with"),) * 4
-    found = drive.difference
+def _difference(found: Difference) -> tuple[Cell, ...]:
     return (
         estimate_cell(found.driving_score, signed=True),
         estimate_cell(found.success_rate, signed=True),

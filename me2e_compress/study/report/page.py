@@ -8,6 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.outcome import Outcome
 from me2e_compress.study.pictures import Contrast
@@ -17,6 +18,21 @@ from me2e_compress.study.routes import RouteOutcome
 from me2e_compress.study.tables import Table, abilities, differences, scoreboards
 
 TEMPLATE = "report.html"
+WORDS = {
+    InfractionKind.COLLISION_PEDESTRIAN: "collision with a pedestrian",
+    InfractionKind.COLLISION_VEHICLE: "collision with a vehicle",
+    InfractionKind.COLLISION_LAYOUT: "collision with an obstacle",
+    InfractionKind.RED_LIGHT: "red light",
+    InfractionKind.STOP: "stop sign",
+    InfractionKind.GIVE_WAY: "give-way sign",
+    InfractionKind.OUTSIDE_ROUTE_LANES: "outside its lanes",
+    InfractionKind.MIN_SPEED: "too slow",
+    InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: "no way for an emergency vehicle",
+    InfractionKind.SCENARIO_TIMEOUT: "scenario timed out",
+    InfractionKind.ROUTE_DEVIATION: "left the route",
+    InfractionKind.VEHICLE_BLOCKED: "blocked",
+    InfractionKind.ROUTE_TIMEOUT: "timed out",
+}
 
 
 @dataclass(frozen=True)
@@ -100,7 +116,7 @@ def _shown(contrast: Contrast, baseline: str) -> Shown:
 
 def _fate(route: RouteOutcome) -> str:
     """Say how a route went, in words."""
-    kinds = [kind.replace("_", " ") for kind, _ in route.infractions]
+    kinds = [WORDS[InfractionKind(kind)] for kind, _ in route.infractions]
     words = ", ".join(dict.fromkeys(kinds)) or route.ending
     return f"driving score {route.driving_score:.1f}, {words}"
 
