@@ -4,13 +4,16 @@ from pathlib import Path
 
 from me2e_compress import graph, recipe
 from me2e_compress.cli import job
+from me2e_compress.cli.compare import judge
 from me2e_compress.cli.console import console, progress
 from me2e_compress.cli.frames import record
 from me2e_compress.cli.inspect import weigh
 from me2e_compress.cli.study import listener, shown
 from me2e_compress.cli.tables import (
+    fidelity_table,
     modules_table,
     notes,
+    plan_line,
     steps_table,
     verification_table,
 )
@@ -18,7 +21,7 @@ from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.routes import load_routes, pick_routes
 from me2e_compress.modules import Item, map_of
 from me2e_compress.study import Condition, Scheme, Study, Timing, run_study
-from me2e_compress.study.tables import all_tables
+from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.write import write
 from me2e_compress.zoo import shipped
 
@@ -41,6 +44,9 @@ def demo_driver(name: str, out: Path, scheme: str, routes: str, workers: int) ->
     frames = _frames(source, out / "frames", CALIBRATION_FRAMES, CALIBRATION_SEED)
     held_out = _frames(source, out / "frames-held-out", HELD_OUT_FRAMES, HELD_OUT_SEED)
     _compress(source, small, scheme, frames, out)
+    fidelity = judge(source, small, held_out)
+    console.print(fidelity_table(fidelity))
+    console.print(plan_line(fidelity))
     study = Study(
         f"{name} before and after {scheme}",
         (Scheme(FLOAT, str(source)), Scheme(scheme, str(small))),
@@ -55,7 +61,7 @@ def demo_driver(name: str, out: Path, scheme: str, routes: str, workers: int) ->
         found = run_study(study, out, LocalEngine(workers), told)
     words = ("me2e-compress", "demo", "--out", str(out), "--routes", routes)
     written = write(found, out, (*words, "--scheme", scheme))
-    for each in all_tables(found):
+    for each in (*scoreboards(found), differences(found)):
         console.print(shown(each))
     console.print(f"{small} and {written.report} are yours.")
 

@@ -66,6 +66,7 @@ def listener() -> Iterator[Listener]:
 def shown(content: Table) -> Shown:
     """Show a study's table on the terminal, with its intervals if it is wide enough."""
     made = table(content.title, *content.columns)
+    made.columns[0].no_wrap = True
     wide = console.width >= WIDE
     for row in content.rows:
         made.add_row(*(_text(cell, wide) for cell in row))

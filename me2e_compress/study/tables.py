@@ -89,7 +89,7 @@ def _scoreboard(
         title,
         (
             *(heading, "DS", "SR %", "DE %", "DC"),
-            *("size MB", "p50 ms", "p99 ms", "plan moves m", "plan SQNR dB"),
+            *("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB"),
         ),
         tuple(
             (Cell(name), *_scores(drive), *_costs(outcome.scheme(drive.scheme)))
@@ -232,7 +232,8 @@ def _scoreboard_note(outcome: Outcome) -> str:
             kind = f"x {outcome.device_scale:.2f}, one device scale for all"
         notes.append(f"Latency: measured here in turn, warm, {kind}.")
     notes.append(
-        f"Plan: waypoints against {study.baseline}'s on held-out frames. "
+        f"Plan and SQNR: how far waypoints move from {study.baseline}'s on held-out "
+        "frames, and the noise on them. "
         f"{MISSING} means not measured."
     )
     return " ".join(notes)
