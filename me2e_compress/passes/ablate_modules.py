@@ -6,11 +6,13 @@ from typing import ClassVar, Literal
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import PreconditionError
+from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Substitute
 from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.means import means_of
 from me2e_compress.passes.stand_ins import (
+    constant_like,
     depends,
     module_of,
     replace_readers,
@@ -23,7 +25,7 @@ from me2e_compress.passes.stand_ins import (
 
 @dataclasses.dataclass(frozen=True)
 class AblateModules:
-    """Remove modules; what read them reads a substitute, or zeros.
+    """Remove modules; what read them reads a substitute, a mean, or zeros.
 
     Given:   features -> occupancy -> plan
     Result:  features,   zeros     -> plan
@@ -31,24 +33,29 @@ class AblateModules:
     With ``fill="substitute"`` the substitutes of the module map go first: the result of
     one scope takes the place of another's (without the map, the ego query keeps what it
     knew of the agents). Whatever else leaves a dropped module is then zeros of its
-    shape. Everything that became dead is swept, in other modules too.
+    shape; with ``fill="means"``, what it is on average over the context's frames, so
+    that the others read nothing that they never saw. Everything that became dead is
+    swept, in other modules too.
 
     Attributes:
         drop: the modules to remove.
-        fill: ``substitute`` re-wires as the module map says, ``zeros`` never does.
+        fill: ``substitute`` re-wires as the module map says, and zeros the rest;
+            ``zeros`` and ``means`` never re-wire.
         keep: scopes of dropped modules that stay, because another module reads them
             (``*.lane_encoder``).
         drop_outputs: True removes the graph outputs that only a dropped module makes;
             False refuses to drop such a module.
+        means: an ``.npz`` of means by value name, for ``fill="means"`` without frames.
     """
 
     name: ClassVar[str] = "ablate-modules"
     exact: ClassVar[bool] = False
     changes_interface: ClassVar[bool] = False
     drop: tuple[str, ...]
-    fill: Literal["zeros", "substitute"] = "substitute"
+    fill: Literal["zeros", "substitute", "means"] = "substitute"
     keep: tuple[str, ...] = ()
     drop_outputs: bool = False
+    means: str | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Re-wire, cut, sweep.
@@ -57,8 +64,13 @@ class AblateModules:
             ModuleMapError: the map has no such module.
             PreconditionError: no node belongs to it, it makes a graph output (and
                 ``drop_outputs`` is False), it makes all of them, a value that leaves it
-                has no static shape, or a substitute does not fit.
+                has no static shape, or a substitute or a mean does not fit.
+            RecipeError: ``means`` without ``fill="means"``.
+            FramesError: means are asked for, and there are neither frames nor a file;
+                or they are of another graph.
         """
+        if self.means is not None and self.fill != "means":
+            raise RecipeError(f"{self.name}: means goes with fill=means only")
         known = [context.modules.module(name) for name in self.drop]
         _require_nodes(model, self.drop)
         for pattern in self.keep:
@@ -71,9 +83,7 @@ class AblateModules:
             for module in known:
                 notes += [self._substitute(model, each) for each in module.substitutes]
         graph.sweep(model)
-        for value in self._exits(model):
-            notes.append(f"{value.name} reads as zeros")
-            replace_readers(value, self._zeros(model.graph, value))
+        notes += self._fill(model, context)
         graph.sweep(model)
         graph.sort(model)
         removed = before - graph.node_count(model)
@@ -91,6 +101,19 @@ class AblateModules:
     def _readers(self, value: ir.Value) -> list[ir.Node]:
         """List who reads a value, those that stay first: new nodes are theirs."""
         return sorted(value.consumers(), key=self._goes)
+
+    def _fill(self, model: ir.Model, context: Context) -> list[str]:
+        """Put constants in the place of all that leaves the dropped modules."""
+        where, exits = model.graph, self._exits(model)
+        if self.fill == "means":
+            means, how = means_of(model, exits, context.frames, self.means)
+            for value in exits:
+                mean = means[str(value.name)]
+                replace_readers(value, constant_like(where, value, mean))
+            return [f"{value.name} reads as {how}" for value in exits]
+        for value in exits:
+            replace_readers(value, self._zeros(where, value))
+        return [f"{value.name} reads as zeros" for value in exits]
 
     def _zeros(self, where: ir.Graph, value: ir.Value) -> ir.Value:
         return zeros_like(where, value, self._readers(value), self.name)

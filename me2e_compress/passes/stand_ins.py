@@ -10,6 +10,7 @@ from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Pattern, exits, scope_of
+from me2e_compress.runtime.frames import Array
 
 _INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
 
@@ -100,6 +101,47 @@ def replace_readers(old: ir.Value, new: ir.Value) -> None:
             node.replace_input_with(index, new)
 
 
+def constant_like(where: ir.Graph, value: ir.Value, array: Array) -> ir.Value:
+    """Make a constant that stands for a value.
+
+    Args:
+        where: the graph that gets it.
+        value: what it stands for.
+        array: what it is.
+
+    Raises:
+        PreconditionError: the array has another type or shape than the value, or the
+            value is itself a shape.
+    """
+    shape, dtype = layout_of(value)
+    if array.dtype != dtype or array.shape != shape:
+        raise PreconditionError(
+            f"a constant {array.dtype} {list(array.shape)} cannot stand for"
+            f" {value.name}, which is {dtype} {list(shape)}"
+        )
+    return graph.add_constant(where, array, f"{value.name}_mean")
+
+
+def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
+    """Give the shape and the type that a stand-in must have.
+
+    Raises:
+        PreconditionError: the shape is not static, or the value is itself a shape.
+    """
+    if is_shape_arithmetic(value):
+        raise PreconditionError(
+            f"{value.name} is arithmetic on shapes, which no module owns: run"
+            " fold-constants first"
+        )
+    shape = graph.static_shape(value)
+    if shape is None or value.dtype is None:
+        raise PreconditionError(
+            f"{value.name} has shape {value.shape}: zeros or a mean need a static one,"
+            " run fold-constants first"
+        )
+    return shape, value.dtype.numpy()
+
+
 def zeros_like(
     where: ir.Graph, value: ir.Value, readers: Sequence[ir.Node], by: str
 ) -> ir.Value:
@@ -114,19 +156,9 @@ def zeros_like(
     Raises:
         PreconditionError: the shape is not static, or the value is itself a shape.
     """
-    if is_shape_arithmetic(value):
-        raise PreconditionError(
-            f"{value.name} is arithmetic on shapes, which no module owns: run"
-            " fold-constants first"
-        )
-    shape = graph.static_shape(value)
-    if shape is None or value.dtype is None:
-        raise PreconditionError(
-            f"{value.name} has shape {value.shape}: zeros need a static one, run"
-            " fold-constants first"
-        )
+    shape, dtype = layout_of(value)
     size = graph.add_constant(where, np.array(shape, np.int64), f"{value.name}_shape")
-    zero = ir.tensor(np.zeros(1, value.dtype.numpy()), name="zero")
+    zero = ir.tensor(np.zeros(1, dtype), name="zero")
     node = ir.node("ConstantOfShape", [size], {"value": zero})
     provenance.inherit(node, readers, by=by)
     return _finished(where, node, value, f"{value.name}_zeros")

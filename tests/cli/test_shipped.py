@@ -94,6 +94,21 @@ def test_compress_compare_and_profile(
     assert (weights / "highway.onnx").read_bytes() == before
 
 
+def test_a_module_is_taken_out(
+    command: Command, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "minus-occ.onnx"
+    words = ("compress", "highway", "-r", "minus-occ", "-o", output)
+
+    assert command(*words) == 1
+    assert "fill=means needs recorded frames (--frames)" in capsys.readouterr().err
+    assert not output.exists()
+    assert command(*words, "--frames", frames, "--json") == 0
+    notes = json.loads(capsys.readouterr().out)["steps"][2]["notes"]
+    assert "output removed: occupancy" in notes
+    assert any("reads as its mean over 2 frames" in note for note in notes)
+
+
 def test_the_shipped_file_is_not_compressed_in_place(
     command: Command, weights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,133 @@
+"""What a value is on average: the constant that stands in for a module that is gone."""
+
+import dataclasses
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.runtime.frames import Array, Frames
+from me2e_compress.runtime.session import Session, replay
+
+
+def token_means(
+    model: ir.Model, frames: Frames, values: Sequence[str], *, threads: int = 0
+) -> dict[str, Array]:
+    """Average values over a recording, element by element, in one streaming pass.
+
+    The model runs as it stands, its recurrent state fed forward and reset at the start
+    of a scene. A float is its mean; a boolean what it mostly is, True in a draw; an
+    integer its most frequent value, the smallest in a draw.
+
+    Args:
+        model: the graph; it stays as it is.
+        frames: the recording.
+        values: names of values anywhere in the main graph.
+        threads: within an operator; 0 for every core.
+
+    Returns:
+        One array a value, of its own shape and type.
+
+    Raises:
+        GraphError: no such value, or onnxruntime cannot run the graph.
+        FramesError: a frame does not fit, changes the shape of a value, or makes it
+            NaN or infinite; the message names the value and the frame.
+    """
+    if not values:
+        return {}
+    session = Session(_exposed(model, values), threads=threads)
+    averages = {name: _Average(name) for name in values}
+    for index, found in enumerate(replay(session, frames, list(values))):
+        for name, average in averages.items():
+            average.take(index, found[name])
+    return {name: average.result() for name, average in averages.items()}
+
+
+def load_means(path: Path, values: Sequence[str]) -> dict[str, Array]:
+    """Read means from an ``.npz`` keyed by value name.
+
+    Raises:
+        FramesError: the file is missing or no ``.npz``, or lacks one of the values.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            found: dict[str, Array] = {name: archive[name] for name in archive}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        line = " ".join(str(error).split())
+        raise FramesError(f"{path}: not a readable .npz ({line})") from error
+    if missing := [name for name in values if name not in found]:
+        raise FramesError(
+            f"{path}: holds no mean of {missing[0]}; there is"
+            f" {', '.join(found) or 'none'}"
+        )
+    return {name: found[name] for name in values}
+
+
+def _exposed(model: ir.Model, values: Sequence[str]) -> ir.Model:
+    """Copy a graph, with further values as its outputs."""
+    copy = model.clone()
+    made = {value.name: value for node in copy.graph for value in node.outputs}
+    if missing := [name for name in values if name not in made]:
+        raise GraphError(f"the graph has no value {missing[0]}")
+    exposed = {value.name for value in copy.graph.outputs}
+    copy.graph.outputs.extend(
+        made[name] for name in dict.fromkeys(values) if name not in exposed
+    )
+    return copy
+
+
+@dataclasses.dataclass
+class _Average:
+    """One value, frame by frame.
+
+    Floats and booleans are a running sum in float64; integers are few (indices), so
+    they are kept as they come.
+    """
+
+    name: str
+    count: int = 0
+    total: npt.NDArray[np.float64] | None = None
+    kept: list[Array] = dataclasses.field(default_factory=list)
+    like: Array | None = None
+
+    def take(self, index: int, value: Array) -> None:
+        if self.like is not None and value.shape != self.like.shape:
+            raise FramesError(
+                f"frame {index} makes {self.name} {list(value.shape)}, it was"
+                f" {list(self.like.shape)}: a mean needs one shape"
+            )
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            kind = "NaN" if np.isnan(value).any() else "infinite"
+            raise FramesError(f"frame {index} makes {self.name} {kind}: it has no mean")
+        self.like, self.count = value, self.count + 1
+        if value.dtype.kind in "iu":
+            self.kept.append(value)
+        else:
+            wide = value.astype(np.float64)
+            self.total = wide if self.total is None else self.total + wide
+
+    def result(self) -> Array:
+        if self.like is None:
+            raise FramesError(f"no frames: {self.name} has no mean")
+        if self.total is None:
+            return _most_frequent(np.stack(self.kept))
+        mean = np.asarray(self.total / self.count)
+        if self.like.dtype == np.bool_:
+            return np.asarray(mean >= 0.5)
+        return mean.astype(self.like.dtype)
+
+
+def _most_frequent(stack: Array) -> Array:
+    """[frames, ...] integers to what each element mostly was."""
+    columns = stack.reshape(len(stack), -1).T
+    picked = [_mode(column) for column in columns]
+    return np.array(picked, stack.dtype).reshape(stack.shape[1:])
+
+
+def _mode(column: Array) -> int:
+    values, counts = np.unique(column, return_counts=True)
+    return int(values[counts.argmax()])

@@ -1,0 +1,161 @@
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.means import load_means, token_means
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import run_once
+from tests.frames import record
+from tests.nets import conv_attention, image
+
+KINDS = """
+<ir_version: 9, opset_import: ["" : 17]>
+kinds (float[1,4] x) => (float[1,4] y) <float limit = {0.0}> {
+    best = ArgMax <axis = 1> (x)
+    brave = Greater (x, limit)
+    half = Cast <to = 10> (x)
+    y = Neg (x)
+}
+"""
+
+
+def kinds() -> ir.Model:
+    model = ir.from_onnx_text(KINDS)
+    graph.infer_shapes(model)
+    return model
+
+
+def rows(*values: list[float]) -> list[Frame]:
+    return [
+        Frame(index, index == 0, {"x": np.array([value], np.float32)})
+        for index, value in enumerate(values)
+    ]
+
+
+def test_the_mean_of_a_recurrent_model_over_scenes(tmp_path: Path) -> None:
+    """Against the arithmetic written out: state fed forward, zeros at a scene."""
+    model, seeds = conv_attention(), range(5)
+    frames = CalibrationSet(
+        record(tmp_path / "f", [image(seed) for seed in seeds], scenes=(0, 2))
+    )
+    seen: list[npt.NDArray[np.float32]] = []
+    memory: npt.NDArray[np.generic] = np.zeros((1, 8, 64), np.float32)
+    exposed = model.clone()
+    exposed.graph.outputs.append(exposed.graph[3].outputs[0])
+    for seed in seeds:
+        if seed in (0, 2):
+            memory = np.zeros((1, 8, 64), np.float32)
+        found = run_once(exposed, {**image(seed), "memory": memory})
+        memory = found["memory_out"]
+        seen.append(np.asarray(found["seen"], np.float32))
+
+    means = token_means(model, frames, ["seen", "y"])
+
+    assert list(means) == ["seen", "y"]
+    assert means["seen"].dtype == np.float32
+    found_mean = np.asarray(means["seen"], np.float32)
+    np.testing.assert_allclose(found_mean, np.mean(seen, axis=0), atol=1e-5)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(
+        st.lists(st.floats(-3, 3, width=32), min_size=4, max_size=4),
+        min_size=1,
+        max_size=6,
+    )
+)
+def test_means_majorities_and_modes(drawn: list[list[float]]) -> None:
+    table = np.array(drawn, np.float32)
+
+    means = token_means(kinds(), rows(*drawn), ["y", "brave", "best"], threads=1)
+
+    np.testing.assert_allclose(means["y"][0].tolist(), -table.mean(0), atol=1e-5)
+    np.testing.assert_array_equal(means["brave"][0], (table > 0).mean(0) >= 0.5)
+    best = np.bincount(table.argmax(1), minlength=4)
+    assert int(means["best"][0, 0]) == int(best.argmax())
+    assert means["best"].shape == (1, 1)
+
+
+def test_the_type_stays(tmp_path: Path) -> None:
+    means = token_means(kinds(), rows([1, 2, 3, 4], [2, 2, 2, 2]), ["half"])
+
+    assert means["half"].dtype == np.float16
+    assert means["half"].tolist() == [[1.5, 2.0, 2.5, 3.0]]
+
+
+def test_the_graph_stays_as_it_is() -> None:
+    model = kinds()
+    before = graph.digest(model)
+    token_means(model, rows([1, 2, 3, 4]), ["half"])
+
+    assert graph.digest(model) == before
+
+
+def test_nothing_asked_nothing_run() -> None:
+    assert token_means(kinds(), rows(), []) == {}
+
+
+def test_an_unknown_value() -> None:
+    with pytest.raises(GraphError, match="no value bev"):
+        token_means(kinds(), rows([1, 2, 3, 4]), ["y", "bev"])
+
+
+@pytest.mark.parametrize(("bad", "kind"), [(np.nan, "NaN"), (np.inf, "infinite")])
+def test_what_is_not_finite_has_no_mean(bad: float, kind: str) -> None:
+    frames = rows([1, 2, 3, 4], [1, bad, 3, 4])
+
+    with pytest.raises(FramesError, match=f"frame 1 makes y {kind}: it has no mean"):
+        token_means(kinds(), frames, ["y"])
+
+
+def test_one_value_one_shape() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>'
+        " m (float[1,4] x) => (int64[2,n] where) { where = NonZero(x) }"
+    )
+
+    with pytest.raises(FramesError, match=r"frame 1 makes where \[2, 1\], it was"):
+        token_means(model, rows([1, 2, 3, 4], [0, 0, 0, 4]), ["where"])
+
+
+def test_no_frames_no_mean() -> None:
+    with pytest.raises(FramesError, match="no frames: y has no mean"):
+        token_means(kinds(), rows(), ["y"])
+
+
+def test_means_are_read_by_the_names_of_exporters(tmp_path: Path) -> None:
+    file, name = tmp_path / "means.npz", "/occ/head/Sigmoid_output_0"
+    arrays = {name: np.arange(3.0), "other": np.zeros(1)}
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+
+    found = load_means(file, [name])
+    assert {key: array.tolist() for key, array in found.items()} == {name: [0, 1, 2]}
+
+
+def test_a_file_without_the_value(tmp_path: Path) -> None:
+    np.savez(tmp_path / "means.npz", other=np.zeros(1))
+
+    with pytest.raises(FramesError, match=r"means\.npz: holds no mean of a; .* other"):
+        load_means(tmp_path / "means.npz", ["a"])
+
+
+@pytest.mark.parametrize("content", [None, b"no archive"])
+def test_a_file_that_is_none(tmp_path: Path, content: bytes | None) -> None:
+    file = tmp_path / "means.npz"
+    if content is not None:
+        file.write_bytes(content)
+
+    with pytest.raises(
+        FramesError, match=r"means\.npz: not a readable \.npz"
+    ) as caught:
+        load_means(file, ["a"])
+    assert "\n" not in str(caught.value)
