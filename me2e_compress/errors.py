@@ -56,6 +56,10 @@ class StudyError(Me2eError):
     """A study is malformed, or names what it does not have."""
 
 
+class TrainingError(Me2eError):
+    """A driver cannot be trained as asked."""
+
+
 class MissingExtraError(Me2eError):
     """An optional package is not installed; the message says which extra brings it."""
 

@@ -139,7 +139,7 @@ HIGHWAY = Stack(
     plan="plan",
     plan_deltas=False,
     default_mode={},
-    image=IMAGENET,
+    image=ImageNorm(mean=(110.0, 110.0, 110.0), std=(60.0, 60.0, 60.0), order="rgb"),
     dtypes={"command": "int64"},
     trained=True,
 )

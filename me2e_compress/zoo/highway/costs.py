@@ -1,0 +1,103 @@
+"""What a candidate plan costs, computed from what the modules say."""
+
+import torch
+from torch import Tensor
+
+from me2e_compress.zoo.highway.config import BevArea
+from me2e_compress.zoo.highway.geometry import grid_of
+from me2e_compress.zoo.highway.layers import sample
+
+DISCS_M = (-1.5, 0.0, 1.5)
+"""The ego as three discs along its axis."""
+RADIUS_M = 1.25
+"""Of each: they cover 2 m of width, and a little air."""
+SOFT_M = 0.25
+"""How gradually a gap becomes an overlap."""
+NEAR_M = 2.0
+"""Distance at which nearness has fallen to 1 / e."""
+FRONT_M = 2.5
+"""From the ego's centre to its front bumper."""
+
+
+def discs_of(places: Tensor, headings: Tensor) -> Tensor:
+    """Centres [B, K, T, 3, 2] of the ego's discs at places [B, K, T, 2]."""
+    axis = torch.stack([headings.cos(), headings.sin()], -1)
+    return torch.stack([places + axis * shift for shift in DISCS_M], -2)
+
+
+def between(steps: Tensor) -> Tensor:
+    """Insert the middle of every step, the first one from 0: [B, T, N] to [B, 2 T, N]."""
+    before = torch.cat([torch.zeros_like(steps[:, :1]), steps[:, :-1]], 1)
+    return torch.stack([(before + steps) / 2, steps], 2).flatten(1, 2)
+
+
+def agent_costs(
+    discs: Tensor, boxes: Tensor, score: Tensor, travel: Tensor, modes: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Overlap with, and nearness to, everybody's predicted box.
+
+    Args:
+        discs: [B, K, 2 T, 3, 2].
+        boxes: [B, A, 8], see `Tracks`.
+        score: [B, A].
+        travel: [B, A, M, 2 T, 2].
+        modes: [B, A, M] probabilities.
+
+    Returns:
+        ([B, K, 2 T] in [0, 1], the same).
+    """
+    place = boxes[:, :, None, None, 0:2] + travel
+    # [B, 1, 2T, 1, A, M] against [B, K, 2T, 3, 1, 1]
+    x, y = (place[..., i].permute(0, 3, 1, 2)[:, None, :, None] for i in (0, 1))
+    dx = discs[..., 0, None, None] - x
+    dy = discs[..., 1, None, None] - y
+    cos, sin = (boxes[:, None, None, None, :, i, None] for i in (4, 5))
+    half_length, half_width = (
+        boxes[:, None, None, None, :, i, None] / 2 for i in (2, 3)
+    )
+    forward = ((dx * cos + dy * sin).abs() - half_length).clamp(min=0)
+    aside = ((dy * cos - dx * sin).abs() - half_width).clamp(min=0)
+    gap = (forward * forward + aside * aside + 1e-4).sqrt().amin(3)
+    share = (score[..., None] * modes)[:, None, None]
+    overlap = (torch.sigmoid((RADIUS_M - gap) / SOFT_M) * share).sum(-1).amax(-1)
+    near = (torch.exp(gap / -NEAR_M) * share).sum(-1).amax(-1)
+    return overlap, near
+
+
+def occupied(discs: Tensor, occupancy: Tensor, area: BevArea) -> Tensor:
+    """Probability that the ground under the ego is taken.
+
+    Args:
+        discs: [B, K, T, 3, 2].
+        occupancy: [B, T, rows, columns] probabilities.
+
+    Returns:
+        [B, K, T].
+    """
+    grid = grid_of(discs, area).transpose(1, 2).flatten(0, 1)
+    found = sample(occupancy.flatten(0, 1)[:, None], grid)
+    return found.amax(-1).squeeze(1).unflatten(0, occupancy.shape[:2]).transpose(1, 2)
+
+
+def ground(discs: Tensor, raster: Tensor, area: BevArea) -> Tensor:
+    """What is under the ego.
+
+    Args:
+        discs: [B, K, T, 3, 2].
+        raster: [B, R, rows, columns] probabilities.
+
+    Returns:
+        [B, K, T, R] means over the discs.
+    """
+    found = sample(raster, grid_of(discs, area).flatten(1, 2))
+    return found.mean(-1).transpose(1, 2).unflatten(1, discs.shape[1:3])
+
+
+def beyond_lines(arc_m: Tensor, gap_m: Tensor) -> Tensor:
+    """How far the front bumper is past each line, softly: [B, K, T, S] in [0, 1].
+
+    Args:
+        arc_m: [B, K, T] of the ego's centre.
+        gap_m: [B, S] from the ego's centre now to each line.
+    """
+    return torch.sigmoid(arc_m[..., None] + FRONT_M - gap_m[:, None, None])

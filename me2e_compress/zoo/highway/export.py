@@ -1,0 +1,37 @@
+"""The trained driver as one ONNX file."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.zoo.export import trace
+from me2e_compress.zoo.highway.stack import Highway
+from me2e_compress.zoo.stacks import find
+
+OPSET = 17
+
+
+def write(model: Highway, path: Path) -> Path:
+    """Write a model in evaluation mode, standard operators only, nothing folded.
+
+    Args:
+        model: the stack, its weights as they are to drive.
+        path: the ``.onnx``; replaced in one step.
+
+    Raises:
+        GraphError: the exporter wrote another opset.
+    """
+    spec = find("highway")
+    graph = trace(spec, model.eval().to(memory_format=torch.contiguous_format), OPSET)
+    for key, value in spec.metadata().items():
+        graph.metadata_props.add(key=key, value=value)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, graph.SerializeToString())
+    return path
+
+
+def parameters(model: Highway) -> int:
+    """How many numbers were trained."""
+    return int(np.sum([p.numel() for p in model.parameters()]))

@@ -1,0 +1,125 @@
+"""The whole stack."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.highway.backbone import Backbone, Neck
+from me2e_compress.zoo.highway.bev_encoder import BevEncoder
+from me2e_compress.zoo.highway.config import HighwayConfig
+from me2e_compress.zoo.highway.map import Map, RoadMap
+from me2e_compress.zoo.highway.motion import Futures, Motion
+from me2e_compress.zoo.highway.occ import Occ
+from me2e_compress.zoo.highway.planner import EgoState, Planner
+from me2e_compress.zoo.highway.track import Track, Tracks
+
+MEMORY = 2
+"""Of the ego: when it last looked (s), how lately it stood (1 now, 0 never)."""
+STANDING_MPS = 0.1
+STOOD_S = 5.0
+"""Time constant with which standing is forgotten."""
+
+
+@dataclass
+class Seen:
+    """Everything the modules say of one frame.
+
+    Attributes:
+        tracks: of the track module.
+        road: of the map module.
+        futures: of the motion module.
+        occupancy: [B, 6, 2 * rows, 2 * columns] logits of the occ module.
+    """
+
+    tracks: Tracks
+    road: RoadMap
+    futures: Futures
+    occupancy: Tensor
+
+
+class Highway(nn.Module):
+    """Six cameras to a plan."""
+
+    def __init__(self, config: HighwayConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or HighwayConfig()
+        self.backbone, self.neck = Backbone(config), Neck(config)
+        self.bev_encoder = BevEncoder(config)
+        self.track, self.map = Track(config), Map(config)
+        self.motion, self.occ = Motion(config), Occ(config)
+        self.planner = Planner(config)
+
+    def look(self, img: Tensor) -> tuple[Tensor, Tensor]:
+        """Images [B, 6, 3, H, W] to features [B * 6, C, h, w] of strides 4 and 8."""
+        fine, middle = self.neck(self.backbone(img.flatten(0, 1)))
+        return fine, middle
+
+    def understand(
+        self, bev: Tensor, tokens: Tensor, images: Tensor, hints: Tensor | None = None
+    ) -> Seen:
+        """Run the task modules.
+
+        Args:
+            bev: [B, C, rows, columns].
+            tokens: [B, N, C].
+            images: [B * 6, C, h, w], stride 8.
+            hints: see `Track`.
+        """
+        tracks = self.track(bev, tokens, hints)
+        road = self.map(bev, tokens, images)
+        return Seen(tracks, road, self.motion(tracks, road), self.occ(bev))
+
+    def forward(
+        self,
+        img: Tensor,
+        lidar2img: Tensor,
+        can_bus: Tensor,
+        command: Tensor,
+        timestamp: Tensor,
+        prev_bev: Tensor,
+        prev_memory: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """One decision, as it is exported.
+
+        Args:
+            img: [1, 6, 3, H, W], normalised.
+            lidar2img: [1, 6, 4, 4].
+            can_bus: [18], see the policy contract.
+            command: int64 [1].
+            timestamp: [1] seconds since the route began.
+            prev_bev: [1, N, C + 1], zeros at the start.
+            prev_memory: [1, 2], zeros at the start.
+
+        Returns:
+            plan [1, 6, 2], boxes [1, A, 8], scores [1, A], futures [1, A, M, 6, 2],
+            route [1, P, 2], occupancy [1, 6, 64, 48] (probabilities), prev_bev_out,
+            prev_memory_out.
+        """
+        bus, elapsed = can_bus[None], timestamp - prev_memory[:, 0]
+        fine, middle = self.look(img)
+        bev, tokens, kept = self.bev_encoder(fine, lidar2img, bus, elapsed, prev_bev)
+        seen = self.understand(bev, tokens, middle)
+        tracks, road, futures = seen.tracks, seen.road, seen.futures
+        ego = EgoState(bus, stood_lately(bus[:, 7], prev_memory[:, 1], elapsed))
+        plan, world = self.planner(
+            tracks, road, futures, seen.occupancy, ego, command
+        )
+        memory = torch.stack([timestamp, ego.stood], -1)
+        return (
+            plan,
+            tracks.boxes,
+            tracks.score,
+            futures.travel,
+            world.path,
+            world.occupancy,
+            kept,
+            memory,
+        )
+
+
+def stood_lately(speed: Tensor, before: Tensor, elapsed_s: Tensor) -> Tensor:
+    """[B] 1 while the ego stands, then forgotten with `STOOD_S`."""
+    faded = before * torch.exp(-elapsed_s / STOOD_S)
+    standing = (speed.abs() < STANDING_MPS).to(speed.dtype)
+    return torch.maximum(faded, standing)

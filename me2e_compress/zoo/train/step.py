@@ -1,0 +1,210 @@
+"""One training step: sequences in, losses out."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.highway.bev_encoder import motion_of
+from me2e_compress.zoo.highway.planner import Candidates, EgoState, World, world_of
+from me2e_compress.zoo.highway.stack import STOOD_S, Highway, Seen
+from me2e_compress.zoo.train.data import Array
+from me2e_compress.zoo.train.losses import (
+    LampHead,
+    map_losses,
+    motion_losses,
+    occ_losses,
+    plan_losses,
+    track_losses,
+)
+from me2e_compress.zoo.train.losses.track import match
+from me2e_compress.zoo.train.targets import Targets, targets_of
+
+MEAN, STD = 110.0, 60.0
+"""Grey levels: about the mean and spread of the rendered images."""
+
+WEIGHTS = {
+    "heat": 0.3,
+    "score": 1.0,
+    "box": 0.5,
+    "class": 0.3,
+    "travel": 0.3,
+    "mode": 0.2,
+    "path": 1.0,
+    "attributes": 0.3,
+    "raster": 1.0,
+    "signal": 1.0,
+    "line": 0.5,
+    "colour": 0.5,
+    "lamp": 0.2,
+    "occ": 2.0,
+    "choice": 1.0,
+    "bend": 1.0,
+    "place": 0.5,
+}
+"""Of the losses in their sum: each contributes between 0.1 and 1 after a while."""
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What is made harder in training.
+
+    Attributes:
+        light: spread of brightness and contrast.
+        speed_mps: noise of the measured speed.
+        blind: share of samples whose acceleration and yaw rate read 0, so that what
+            the ego does is not taken for what it should do (de Haan et al., 2019).
+        forget: share whose memory of standing is lost.
+        hints: share whose agents are certainly among the queries.
+        no_occ: share that plan on the mean occupancy, so that boxes are used too.
+    """
+
+    light: float = 0.12
+    speed_mps: float = 0.1
+    blind: float = 0.5
+    forget: float = 0.1
+    hints: float = 0.7
+    no_occ: float = 0.2
+
+
+NONE = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass
+class Outcome:
+    """What came of a batch.
+
+    Attributes:
+        losses: by name, not weighted.
+        seen: outputs of the modules.
+        world: what the planner read.
+        candidates: what it considered.
+        wanted: the labels.
+    """
+
+    losses: dict[str, Tensor]
+    seen: Seen
+    world: World
+    candidates: Candidates
+    wanted: Targets
+
+    def total(self) -> Tensor:
+        """Weighted sum of the losses."""
+        return torch.stack(
+            [WEIGHTS[name] * loss for name, loss in self.losses.items()]
+        ).sum()
+
+
+def run(
+    model: Highway,
+    lamps: LampHead,
+    images: Array,
+    batch: dict[str, Array],
+    lidar2img: Tensor,
+    rng: np.random.Generator,
+    how: Augmentation,
+) -> Outcome:
+    """Run sequences through the model.
+
+    Args:
+        model: the stack.
+        lamps: the extra head.
+        images: uint8 [B, L, 6, H, W, 3].
+        batch: arrays [B, L, ...] of `Episodes.batch`.
+        lidar2img: [6, 4, 4].
+        rng: for the augmentation.
+        how: what to make harder.
+    """
+    flat = {name: rows.reshape(-1, *rows.shape[2:]) for name, rows in batch.items()}
+    wanted = targets_of(flat, model.config.area)
+    count = len(wanted.command)
+    calibration = lidar2img.expand(count, -1, -1, -1)
+    with torch.autocast("cpu", torch.bfloat16):
+        fine, middle = model.look(_pixels(images, rng, how))
+        now = model.bev_encoder.look(fine, calibration)
+        bev = model.bev_encoder.fuse(_remember(model, now.float(), batch))
+        hints = _hints(wanted, model.config.area.cells, rng, how)
+        seen = model.understand(bev, model.bev_encoder.tokens(bev), middle, hints)
+        world = world_of(
+            seen.tracks, seen.road, seen.futures, seen.occupancy, wanted.command
+        )
+        world = _without_occ(world, rng, how)
+        ego = _ego(flat, rng, how)
+        candidates = model.planner.consider(_settled(world), ego, wanted.command)
+        lamp_loss = lamps(fine, calibration, wanted)
+    owner, mine = match(seen.tracks, wanted)
+    losses = {
+        **track_losses(seen.tracks, wanted, model.config.area, owner, mine),
+        **motion_losses(seen.futures, wanted, owner, mine),
+        **map_losses(seen.road, wanted),
+        **lamp_loss,
+        **occ_losses(seen.occupancy, wanted),
+        **plan_losses(candidates, model.planner.anchors, wanted),
+    }
+    return Outcome(losses, seen, world, candidates, wanted)
+
+
+def _settled(world: World) -> World:
+    """The planner bends its own plans, not the map under them."""
+    return replace(world, path=world.path.detach(), headings=world.headings.detach())
+
+
+def _pixels(images: Array, rng: np.random.Generator, how: Augmentation) -> Tensor:
+    count = images.shape[0] * images.shape[1]
+    pixels = torch.from_numpy(images).flatten(0, 1).permute(0, 1, 4, 2, 3)
+    spread = rng.normal(0, how.light, (2, count, 6, 1, 1, 1))
+    gain = torch.from_numpy((1 + spread[0]) / STD).float()
+    bias = torch.from_numpy(spread[1]).float() - MEAN * gain
+    return torch.addcmul(bias, pixels.float(), gain)
+
+
+def _remember(model: Highway, now: Tensor, batch: dict[str, Array]) -> Tensor:
+    """Feed the memory forward: [B * L, C, ...] to [B * L, 2 C + 1, ...]."""
+    encoder = model.bev_encoder
+    times = torch.from_numpy(batch["time_us"].astype(np.float64) / 1e6).float()
+    buses = torch.from_numpy(batch["can_bus"].astype(np.float32))
+    sequences, length = times.shape
+    looks = now.unflatten(0, (sequences, length))
+    memory = torch.zeros(sequences, encoder.area.cells, now.shape[1] + 1)
+    joined = []
+    for t in range(length):
+        elapsed = (
+            times[:, t] - times[:, t - 1] if t else torch.full_like(times[:, 0], 0.2)
+        )
+        recalled = encoder.recall(memory, motion_of(buses[:, t], elapsed))
+        both, memory = encoder.remember(looks[:, t], recalled, elapsed)
+        joined.append(both)
+    return torch.stack(joined, 1).flatten(0, 1)
+
+
+def _hints(
+    wanted: Targets, cells: int, rng: np.random.Generator, how: Augmentation
+) -> Tensor | None:
+    if not how.hints:
+        return None
+    told = torch.from_numpy(rng.random(len(wanted.there)) < how.hints)
+    hints = torch.zeros(len(wanted.there), cells)
+    return hints.scatter_add(1, wanted.cells, (wanted.there & told[:, None]).float())
+
+
+def _ego(flat: dict[str, Array], rng: np.random.Generator, how: Augmentation) -> Tensor:
+    bus = torch.from_numpy(flat["can_bus"].astype(np.float32)).clone()
+    stood = torch.exp(torch.from_numpy(flat["rest_s"].astype(np.float32)) / -STOOD_S)
+    count = len(bus)
+    bus[:, 7] += torch.from_numpy(rng.normal(0, 1, count)).float() * how.speed_mps
+    bus[torch.from_numpy(rng.random(count) < how.blind), 10:16] = 0
+    stood[torch.from_numpy(rng.random(count) < how.forget)] = 0
+    return EgoState(bus, stood).features()
+
+
+def _without_occ(world: World, rng: np.random.Generator, how: Augmentation) -> World:
+    gone = torch.from_numpy(rng.random(len(world.occupancy)) < how.no_occ)
+    mean = world.occupancy.mean(0, keepdim=True)
+    kept = torch.where(gone[:, None, None, None], mean, world.occupancy)
+    return replace(world, occupancy=kept)
+
+
+def parameters_of(*modules: nn.Module) -> list[nn.Parameter]:
+    """All parameters, in order."""
+    return [parameter for module in modules for parameter in module.parameters()]

@@ -1,0 +1,49 @@
+"""Processes on one machine that average tensors through shared memory."""
+
+from dataclasses import dataclass
+from multiprocessing.synchronize import Barrier
+from typing import Self
+
+import torch
+import torch.multiprocessing as mp
+from torch import Tensor
+
+from me2e_compress.zoo.highway.config import HighwayConfig
+from me2e_compress.zoo.highway.stack import Highway
+from me2e_compress.zoo.train.losses import LampHead
+
+PATIENCE_S = 900.0
+"""A process that keeps the others waiting longer has died or hangs."""
+
+
+@dataclass
+class Together:
+    """One row of shared memory a process, and a barrier.
+
+    Loopback sockets, which torch.distributed would use, cost more than the step on
+    machines that emulate them.
+
+    Attributes:
+        rows: float32 [processes, numbers].
+        barrier: all processes meet here.
+    """
+
+    rows: Tensor
+    barrier: Barrier
+
+    @classmethod
+    def of(cls, workers: int, config: HighwayConfig) -> Self:
+        """Make room for every parameter of the model and of the extra head."""
+        modules = (Highway(config), LampHead(config.channels))
+        size = sum(p.numel() for module in modules for p in module.parameters())
+        rows = torch.zeros(workers, size).share_memory_()
+        return cls(rows, mp.get_context("spawn").Barrier(workers))
+
+    def mean(self, rank: int, mine: Tensor) -> Tensor:
+        """Average one flat tensor over the processes; every process must call."""
+        count = mine.numel()
+        self.rows[rank, :count] = mine
+        self.barrier.wait(PATIENCE_S)
+        found = self.rows[:, :count].mean(0)
+        self.barrier.wait(PATIENCE_S)
+        return found
