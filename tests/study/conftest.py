@@ -1,0 +1,81 @@
+"""Small studies: two short routes, drivers that need no images."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.runner import drive
+from me2e_compress.evaluators.highway.worker import Driven, Job
+from me2e_compress.study import Condition, Outcome, Scheme, Study, Timing, run_study
+from tests.cli.conftest import write_frames
+from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
+
+ROUTES = (CROSSING, PARKED)
+IDEAL, SLOW = Condition("ideal", "none"), Condition("slow", "fps:2")
+BLIND = Scheme("blind", "blind:6")
+FASTER = "factor = Constant <value_float = 2.0> () plan = Mul (ahead, factor)"
+
+Make = Callable[..., Study]
+
+
+@dataclass
+class Here:
+    """Drives in this process, which need not start first, and writes down what."""
+
+    driven: list[tuple[str, str]] = field(default_factory=list)
+
+    def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
+        for route in routes:
+            self.driven.append((job.driver.name, route.id))
+            yield Driven(drive(route, job.driver.open(), job.conditions), 0.0, 0)
+
+
+@pytest.fixture(scope="session")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder: slow.onnx drives 4 m/s, fast.onnx 8 m/s, frames fit both."""
+    folder = tmp_path_factory.mktemp("models")
+    straight_on(folder / "slow.onnx")
+    straight_on(folder / "fast.onnx", body=FASTER)
+    write_frames(folder / "frames", command=np.array([3]))
+    return folder
+
+
+@pytest.fixture
+def make(models: Path) -> Make:
+    """Give a study of the slow model, its exact form and the fast one; change it."""
+
+    def made(**changes: object) -> Study:
+        return dataclasses.replace(asked(models), **changes)  # type: ignore[arg-type]
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def found(models: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """What the study finds; its folder is beside its first picture's."""
+    return run_study(
+        asked(models), tmp_path_factory.mktemp("found"), Here(), pictures=1
+    )
+
+
+def asked(models: Path) -> Study:
+    return Study(
+        "Slow & <fast>",
+        (
+            BLIND,
+            Scheme("slow", str(models / "slow.onnx")),
+            Scheme("again", str(models / "slow.onnx")),
+            Scheme("fast", str(models / "fast.onnx")),
+        ),
+        (IDEAL, SLOW),
+        "slow",
+        ROUTES,
+        220,
+        held_out=models / "frames",
+        timing=Timing(20, baseline_median_s=0.2),
+    )

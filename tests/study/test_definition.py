@@ -1,0 +1,71 @@
+from pathlib import Path
+
+import pytest
+
+from me2e_compress import recipe
+from me2e_compress.errors import EvaluationError, Me2eError, StudyError
+from me2e_compress.study import Condition, Scheme, Timing
+from tests.study.conftest import IDEAL, Make
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schemes": ()}, "the study has no scheme"),
+        ({"conditions": ()}, "the study has no condition"),
+        ({"conditions": (IDEAL, IDEAL)}, "2 conditions are named ideal"),
+        ({"baseline": "quick"}, "'quick' is no scheme; there are blind, slow, again"),
+        ({"routes": ()}, "no route to drive"),
+        (
+            {"conditions": (Condition("device", "trace"),), "held_out": None},
+            "condition device: the latency of slow is measured on held-out frames",
+        ),
+    ],
+)
+def test_a_study_that_could_not_be_finished(
+    make: Make, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(StudyError, match=message):
+        make(**changes)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../up", "a/b", ".hidden", "a.b"])
+def test_a_name_that_is_no_folder(name: str) -> None:
+    with pytest.raises(StudyError, match="a name is made of letters"):
+        Scheme(name, "expert")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"passes": recipe.load("exact")},
+        {"adapter": Path("a.toml")},
+        {"trace": Path("t.json")},
+        {"module_map": "vad"},
+    ],
+)
+def test_a_driver_that_is_no_model_takes_nothing(options: dict[str, object]) -> None:
+    with pytest.raises(StudyError, match="scheme e: expert is no model"):
+        Scheme("e", "expert", **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("latency", ["measured", "trace:t.json", "traces"])
+def test_a_latency_that_differs_from_scheme_to_scheme(latency: str) -> None:
+    with pytest.raises(StudyError, match="none, fps:F and trace"):
+        Condition("c", latency)
+
+
+@pytest.mark.parametrize("latency", ["fast", "fps:0", "fps:x"])
+def test_a_latency_nobody_knows(latency: str) -> None:
+    with pytest.raises(EvaluationError):
+        Condition("c", latency)
+
+
+@pytest.mark.parametrize(
+    "numbers", [(0, 1, None), (1, 0, None), (1, 1, 0.0), (1, 1, float("nan"))]
+)
+def test_a_timing_that_measures_nothing(
+    numbers: tuple[int, int, float | None],
+) -> None:
+    with pytest.raises(Me2eError, match="latency: "):
+        Timing(*numbers)

@@ -1,0 +1,141 @@
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import EvaluationError, GraphError, RecipeError, StudyError
+from me2e_compress.evaluators.highway.routes import load_routes, save_routes
+from me2e_compress.study import Condition, load_study
+from tests.evaluators.highway.drivers import CROSSING, PARKED
+
+GOOD = """
+title = "Try"
+baseline = "float"
+routes = 3
+held_out = "frames"
+
+[latency]
+samples = 50
+baseline_median_s = 0.43
+
+[[scheme]]
+name = "float"
+policy = "slow.onnx"
+
+[[scheme]]
+name = "small"
+policy = "slow.onnx"
+recipe = "exact"
+
+[[scheme]]
+name = "mine"
+policy = "slow.onnx"
+passes = "import-normalize,fold-constants"
+
+[[condition]]
+name = "ideal"
+latency = "none"
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "study.toml"
+    path.write_text(text)
+    return path
+
+
+def named(text: str) -> Path:
+    raise GraphError(f"{text}: no such file; models that ship: highway")
+
+
+def test_everything_that_a_file_says(models: Path) -> None:
+    study = load_study(write(models, GOOD))
+
+    assert (study.title, study.baseline, study.seed) == ("Try", "float", 0)
+    assert (len(study.routes), study.set_size) == (3, 220)
+    assert study.timing.baseline_median_s == 0.43
+    assert study.held_out == models / "frames"
+    assert [scheme.policy for scheme in study.schemes] == [
+        str(models / "slow.onnx")
+    ] * 3
+    assert [len(scheme.passes) for scheme in study.schemes] == [0, 4, 2]
+    assert study.conditions == (Condition("ideal", "none"),)
+
+
+def test_files_lie_beside_the_study(models: Path, tmp_path: Path) -> None:
+    save_routes((CROSSING, PARKED), tmp_path / "two.json")
+    (tmp_path / "my.toml").write_text('[[pass]]\nname = "fold-constants"\n')
+    (tmp_path / "slow.onnx").write_bytes((models / "slow.onnx").read_bytes())
+    text = GOOD.replace("routes = 3", 'routes = "two.json"')
+
+    study = load_study(write(tmp_path, text.replace('"exact"', '"my.toml"')))
+
+    assert (study.routes, study.set_size) == ((CROSSING, PARKED), 2)
+    assert [each.name for each in study.schemes[1].passes] == ["fold-constants"]
+
+
+def test_a_name_that_is_no_file_is_one_that_ships(models: Path) -> None:
+    text = GOOD.replace('"slow.onnx"', '"highway"')
+
+    study = load_study(write(models, text), lambda name: Path("/shipped") / name)
+
+    assert study.schemes[0].policy == "/shipped/highway"
+
+
+def test_routes_of_the_command_line_win(models: Path) -> None:
+    study = load_study(write(models, GOOD), routes="ParkedObstacle_0")
+
+    assert [route.id for route in study.routes] == ["ParkedObstacle_0"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error", "message"),
+    [
+        ("title =", "titel =", StudyError, r"title: Field required"),
+        ("[latency]", "[timing]", StudyError, r"timing: .*; there are title, basel"),
+        ("samples", "sample", StudyError, r"latency\.sample: .*there are samples, th"),
+        (
+            'name = "small"',
+            'name = "small"\nrecip = "exact"',
+            StudyError,
+            r"scheme\.1\.recip: .*there are name, policy, recipe",
+        ),
+        ("routes = 3", "routes = 1.5", StudyError, "routes"),
+        ("routes = 3", "routes = 0", EvaluationError, "0 routes were asked for"),
+        ("routes = 3", 'routes = "no"', EvaluationError, "no route 'no'"),
+        ('baseline = "float"', 'baseline = "flaot"', StudyError, "'flaot' is no schem"),
+        ('recipe = "exact"', 'recipe = "exakt"', RecipeError, "no recipe exakt"),
+        ("fold-constants", "fold-constant", RecipeError, "no pass 'fold-constant'"),
+        ("passes", 'recipe = "full"\npasses', StudyError, "a recipe or passes, not"),
+        ('"slow.onnx"\nrecipe', '"quick"\nrecipe', GraphError, "quick: no such file"),
+        ('latency = "none"', 'latency = "quick"', EvaluationError, "latency 'quick'"),
+        ("[latency]", "[latency", StudyError, "not TOML"),
+    ],
+)
+def test_what_is_wrong_is_one_line(
+    models: Path, old: str, new: str, error: type[Exception], message: str
+) -> None:
+    assert old in GOOD
+    path = write(models, GOOD.replace(old, new))
+
+    with pytest.raises(error, match=message) as caught:
+        load_study(path, named)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_routes_at_all(models: Path) -> None:
+    (models / "none.json").write_text("[]")
+    path = write(models, GOOD.replace("routes = 3", 'routes = "none.json"'))
+
+    with pytest.raises(StudyError, match="no route to drive"):
+        load_study(path)
+
+
+def test_no_such_file(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match=r"none\.toml: cannot be read: No such file"):
+        load_study(tmp_path / "none.toml")
+
+
+def test_all_routes_is_what_a_study_drives_if_it_says_nothing(models: Path) -> None:
+    study = load_study(write(models, GOOD.replace("routes = 3", "")))
+
+    assert study.routes == load_routes()

@@ -1,0 +1,240 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from me2e_compress.errors import EvaluationError, StudyError
+from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.metrics.scores import score
+from me2e_compress.study import (
+    Listener,
+    Outcome,
+    Scheme,
+    Timing,
+    load_study,
+    run_study,
+)
+from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here, Make
+
+KILLED = """
+import sys
+from pathlib import Path
+from me2e_compress.study import load_study, run_study
+from tests.study.conftest import Here
+
+run_study(load_study(Path(sys.argv[1])), Path(sys.argv[2]), Here(), pictures=0)
+"""
+STUDY = """
+title = "Killed"
+baseline = "blind"
+routes = 8
+
+[[scheme]]
+name = "blind"
+policy = "blind"
+
+[[scheme]]
+name = "faster"
+policy = "blind:12"
+
+[[condition]]
+name = "ideal"
+latency = "none"
+"""
+
+
+ROOT = Path(__file__).parents[2]
+ONE = {"schemes": (BLIND,), "baseline": "blind", "conditions": (IDEAL,)}
+
+
+def without_latency(record: dict[str, Any]) -> dict[str, Any]:
+    for table in (record, *record["schemes"]):
+        del table["latency"]
+    return record
+
+
+def test_every_scheme_under_every_condition(found: Outcome) -> None:
+    assert [(each.scheme, each.condition) for each in found.drives] == [
+        (scheme, condition)
+        for condition in ("ideal", "slow")
+        for scheme in ("blind", "slow", "again", "fast")
+    ]
+    assert all(len(each.routes) == 2 for each in found.drives)
+
+
+def test_the_scores_are_those_of_the_results(found: Outcome) -> None:
+    folder = found.contrasts[0].before.parents[1] / "results" / "fast.slow"
+    episodes = tuple(ResultsFolder.open(folder).episodes().values())
+
+    drive = found.under(SLOW)[-1]
+
+    assert drive.scores == score(episodes, 220)
+    assert drive.scores is not None
+    assert drive.scores.partial
+
+
+def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
+    found: Outcome,
+) -> None:
+    blind, slow, again, fast = (each.difference for each in found.under(IDEAL))
+
+    assert slow is None
+    assert again is not None
+    assert again.driving_score.value == again.driving_score.high == 0.0
+    assert fast is not None
+    assert blind is not None
+    assert fast.better + fast.worse > 0
+
+
+def test_a_model_has_size_and_latency_and_a_driver_has_none(found: Outcome) -> None:
+    blind, slow, again, fast = found.schemes
+
+    assert blind.size_mb.value is None
+    assert blind.size_mb.reason == "no model"
+    assert blind.latency_ms[50].value is None
+    assert slow.size_mb.value == Path(slow.contender.scheme.policy).stat().st_size / 1e6
+    assert slow.latency_ms[50].value == pytest.approx(200.0)
+    assert again.latency_ms[50].value is not None
+    assert fast.latency_ms[99].value is not None
+
+
+def test_fidelity_is_measured_against_the_baseline(found: Outcome) -> None:
+    blind, slow, again, fast = (each.fidelity for each in found.schemes)
+
+    assert blind.mean_m.reason == "blind is no model"
+    assert slow.mean_m.reason == "the baseline itself"
+    assert again.mean_m.value == 0.0
+    assert again.plan_sqnr_db.reason == "no noise: equal to the bit"
+    assert fast.mean_m.value == pytest.approx(sum(range(2, 14, 2)) / 6)
+    assert fast.max_m.value == pytest.approx(12.0)
+    assert fast.frames == 2
+
+
+def test_a_picture_shows_where_two_drives_part(found: Outcome) -> None:
+    [contrast] = found.contrasts
+
+    gaps = [
+        abs(one.driving_score - other.driving_score)
+        for drive in found.drives
+        for one, other in zip(
+            found.under(IDEAL if drive.condition == "ideal" else SLOW)[1].routes,
+            drive.routes,
+            strict=True,
+        )
+    ]
+    here = abs(contrast.route.driving_score - contrast.other.driving_score)
+    assert here == max(gaps)
+    assert contrast.before.read_bytes().startswith(b"\x89PNG")
+    assert contrast.after.read_bytes().startswith(b"\x89PNG")
+    longest = max(contrast.route.duration_us, contrast.other.duration_us)
+    assert 0 < contrast.time_us <= longest
+
+
+def test_the_same_seed_gives_the_same_bytes(
+    found: Outcome, make: Make, tmp_path: Path
+) -> None:
+    again = run_study(make(), tmp_path, Here(), pictures=0)
+
+    one, two = (
+        json.dumps(without_latency(outcome.to_json())) for outcome in (found, again)
+    )
+    assert one == two
+
+
+def test_what_is_there_is_not_made_again(make: Make, tmp_path: Path) -> None:
+    asked = make(**ONE, timing=Timing())
+    engine, again = Here(), Here()
+
+    one = run_study(asked, tmp_path, engine, pictures=0)
+    two = run_study(asked, tmp_path, again, pictures=0)
+
+    assert [route for _, route in engine.driven] != []
+    assert again.driven == []
+    assert one == two
+
+
+def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> None:
+    engine = Here()
+    faster = Scheme("faster", "blind:9")
+    first = make(**ONE, timing=Timing())
+    second = replace(first, schemes=(faster, BLIND))
+
+    run_study(first, tmp_path, Here(), pictures=0)
+    run_study(second, tmp_path, engine, pictures=0)
+
+    assert {name for name, _ in engine.driven} == {"blind:9"}
+
+
+def test_a_name_that_is_taken_by_another_driver(make: Make, tmp_path: Path) -> None:
+    asked = make(**ONE, timing=Timing())
+    run_study(asked, tmp_path, Here(), pictures=0)
+    other = replace(asked, schemes=(Scheme("blind", "blind:9"),))
+
+    with pytest.raises(EvaluationError, match=r"blind\.ideal: .* of another evaluatio"):
+        run_study(other, tmp_path, Here(), pictures=0)
+
+
+def test_a_missing_model_is_named_before_anything_drives(
+    make: Make, tmp_path: Path
+) -> None:
+    asked = make(schemes=(BLIND, Scheme("slow", "gone.onnx")))
+
+    with pytest.raises(StudyError, match=r"scheme slow: gone\.onnx: no such model"):
+        run_study(asked, tmp_path)
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
+    toml = tmp_path / "study.toml"
+    toml.write_text(STUDY)
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    words = [sys.executable, "-c", KILLED, str(toml), str(out)]
+    with subprocess.Popen(words, start_new_session=True, cwd=ROOT) as running:
+        limit = time.monotonic() + 60.0
+        while len(list(out.glob("results/*/routes/*.json"))) < 3:
+            assert running.poll() is None
+            assert time.monotonic() < limit
+            time.sleep(0.02)
+        os.killpg(running.pid, signal.SIGKILL)
+    done = {
+        (path.parts[-3].removesuffix(".ideal"), path.stem)
+        for path in out.glob("results/*/routes/*.json")
+    }
+    engine = Here()
+    names = {"blind": "blind", "blind:12": "faster"}
+
+    resumed = run_study(load_study(toml), out, engine, pictures=0)
+    driven = {(names[name], route) for name, route in engine.driven}
+
+    assert len(done) < 16
+    assert len(done) + len(engine.driven) == 16
+    assert not done & driven
+    assert resumed == run_study(load_study(toml), whole, Here(), pictures=0)
+
+
+def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:
+    heard = list[str]()
+    asked = make(schemes=make().schemes[1:3], conditions=(IDEAL,))
+
+    run_study(
+        asked,
+        tmp_path,
+        Here(),
+        Listener(lambda stage, *_: heard.append(stage)),
+        pictures=0,
+    )
+
+    assert list(dict.fromkeys(heard)) == [
+        "latency",
+        "fidelity of again",
+        "slow, ideal",
+        "again, ideal",
+    ]
+    assert heard.count("slow, ideal") == len(ROUTES) + 1
