@@ -2,6 +2,7 @@
 
     python -m benchmarks.bench_driver OUT [--only NAME ...] [--workers N] [--routes N]
                                           [--model M.onnx] [--frames F --held-out H]
+                                          [--target tensorrt|onnxruntime]
 
 Studies, one after the other: baselines (expert, blind, the driver), ablation (each
 module away, then pairs), schemes (float to int8, at no latency and at each model's own
@@ -25,6 +26,8 @@ from me2e_compress.cli.models import model_path
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
+from me2e_compress.passes import Pass
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.study import (
     Condition,
     Listener,
@@ -63,6 +66,7 @@ class Bench:
     set_size: int
     frames: Path
     held_out: Path
+    target: str | None = None
 
     @property
     def float(self) -> Scheme:
@@ -76,6 +80,19 @@ class Bench:
             "drop_outputs=true},eliminate-redundant,fuse-basic"
         )
         return Scheme(f"minus-{'-'.join(modules)}", self.model, recipe.parse(text))
+
+    def compressed(self, name: str) -> Scheme:
+        """Apply a recipe; its int8 is for the target, where one is chosen."""
+        passes = recipe.load(name)
+        if self.target is not None:
+            passes = tuple(self._aimed(each) for each in passes)
+        return Scheme(name, self.model, passes)
+
+    def _aimed(self, current: Pass) -> Pass:
+        if not isinstance(current, QuantizeInt8):
+            return current
+        options = {"scheme": current.scheme, "target": self.target}
+        return recipe.build(current.name, options)
 
     def study(
         self,
@@ -108,7 +125,7 @@ def ablation(bench: Bench) -> Study:
 
 
 def schemes(bench: Bench) -> Study:
-    made = [Scheme(name, bench.model, recipe.load(name)) for name in SCHEMES]
+    made = [bench.compressed(name) for name in SCHEMES]
     return bench.study("Schemes", (bench.float, *made), (IDEAL, DEVICE))
 
 
@@ -201,6 +218,7 @@ def main() -> None:
     parser.add_argument("--routes", default="all", help="all, a number or ids")
     parser.add_argument("--frames", type=Path, help="to calibrate on")
     parser.add_argument("--held-out", type=Path, help="for fidelity and latency")
+    parser.add_argument("--target", help="of int8: tensorrt or onnxruntime")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     shipped = load_routes()
@@ -214,6 +232,7 @@ def main() -> None:
             len(shipped),
             frames_of(given.frames, given.out / "frames", model, CALIBRATION),
             frames_of(given.held_out, held_out, model, HELD_OUT),
+            given.target,
         )
         for name in given.only or STUDIES:
             print(f"\n## {name}\n", flush=True)
