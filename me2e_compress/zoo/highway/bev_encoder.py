@@ -234,4 +234,6 @@ def motion_of(can_bus: Tensor, elapsed_s: Tensor) -> Motion:
     before = can_bus[:, 16] - turn
     cos, sin = before.cos(), before.sin()
     dx, dy = can_bus[:, 0], can_bus[:, 1]
-    return Motion(torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1), turn, elapsed_s)
+    return Motion(
+        torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1), turn, elapsed_s
+    )

@@ -123,7 +123,9 @@ class Map(nn.Module):
         found = sample(bev, grid_of(paths, self.area))
         return found.flatten(2).transpose(1, 2)
 
-    def _signals(self, tokens: Tensor, images: Tensor, batch: int) -> tuple[Tensor, Tensor]:
+    def _signals(
+        self, tokens: Tensor, images: Tensor, batch: int
+    ) -> tuple[Tensor, Tensor]:
         ahead = images.unflatten(0, (batch, CAMERAS))[:, :FORWARD_CAMERAS]
         pixels = ahead.permute(0, 1, 3, 4, 2).flatten(1, 3) + self.pixels
         query = self.kinds.expand(batch, -1, -1)

@@ -10,6 +10,7 @@ from me2e_compress.zoo.highway.config import (
     COMMANDS,
     PATH_STEP_M,
     RASTER_CHANNELS,
+    SIGNAL_KINDS,
     STEP_S,
     STEPS,
     HighwayConfig,
@@ -27,10 +28,13 @@ from me2e_compress.zoo.highway.map import GAP_SCALE_M, RoadMap
 from me2e_compress.zoo.highway.motion import Futures
 from me2e_compress.zoo.highway.track import Tracks
 
+SPEED_SCALE_MPS = 10.0
 EGO_FEATURES = 5
 """Speed, longitudinal and lateral acceleration, yaw rate, how lately it stood."""
-STOP_LIKELY, LINE_CHANNELS = 3, 1 + 2
-COSTS = 2 * 2 * STEPS + STEPS + RASTER_CHANNELS * STEPS + LINE_CHANNELS * STEPS + 4 * STEPS
+LIMITS = 4
+"""Too fast, too far left, too far right, left of the oncoming lanes."""
+COSTS = STEPS * (2 * 2 + 1 + RASTER_CHANNELS + SIGNAL_KINDS + LIMITS)
+"""Overlap and nearness at twelve instants, the rest at six."""
 
 
 @dataclass
@@ -48,7 +52,12 @@ class EgoState:
     def features(self) -> Tensor:
         """[B, 5], each about 1 in size: see `EGO_FEATURES`."""
         bus = self.can_bus
-        columns = [bus[:, 7] / 10, bus[:, 10] / 3, bus[:, 11] / 3, bus[:, 15] * 2]
+        columns = [
+            bus[:, 7] / SPEED_SCALE_MPS,
+            bus[:, 10] / 3,
+            bus[:, 11] / 3,
+            bus[:, 15] * 2,
+        ]
         return torch.stack([*columns, self.stood], -1)
 
 
@@ -62,7 +71,9 @@ class World:
         score: [B, A] of the track module.
         travel: [B, A, M, 6, 2] of the motion module.
         modes: [B, A, M] probabilities, of the motion module.
-        path: [B, P, 2] route of the command, of the map module.
+        lateral: [B] metres that the ego is left of the route of the command, of the
+            map module.
+        path: [B, P, 2] that route, of the map module.
         headings: [B, P] of it.
         attributes: [B, P, 4] of it.
         points: [B, P, C] its queries.
@@ -77,6 +88,7 @@ class World:
     score: Tensor
     travel: Tensor
     modes: Tensor
+    lateral: Tensor
     path: Tensor
     headings: Tensor
     attributes: Tensor
@@ -93,15 +105,16 @@ class Candidates:
 
     Attributes:
         plans: [B, K, 6, 2] metres in the ego frame.
-        arc_m: [B, K, 6] metres along the route.
-        offset_m: [B, K, 6] metres left of it.
+        moves: [B, K, 6, 2] metres along the route, and to the left of where the ego is
+            beside it.
+        anchors: [B, K, 6, 2] the same before the planner bends them.
         logits: [B, K].
         costs: [B, K, F] what the score was made of.
     """
 
     plans: Tensor
-    arc_m: Tensor
-    offset_m: Tensor
+    moves: Tensor
+    anchors: Tensor
     logits: Tensor
     costs: Tensor
 
@@ -132,6 +145,7 @@ def world_of(
         tracks.score,
         futures.travel,
         futures.logits.softmax(-1),
+        (road.lateral * chosen).sum(1),
         (road.paths * chosen[:, :, None, None]).sum(1),
         (road.headings * chosen[:, :, None]).sum(1),
         (road.attributes * chosen[:, :, None, None]).sum(1),
@@ -146,18 +160,24 @@ def world_of(
 class Planner(nn.Module):
     """Anchored candidates (VADv2's vocabulary, in the frame of the route) and costs.
 
+    An anchor is a departure from going on as now: metres more or less along the route,
+    metres to the left.
+
     The collision cost of a candidate is computed from predicted boxes, their futures
     and the predicted occupancy, the way it leaves the road from the predicted map: so
     that no module can be left out unnoticed.
     """
 
     anchors: Tensor
+    times: Tensor
 
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__()
         channels, heads = config.channels, config.heads
         self.area, self.end_m = config.area, (config.path_points - 1) * PATH_STEP_M
         self.register_buffer("anchors", torch.zeros(config.anchors, STEPS, 2))
+        times = STEP_S * torch.arange(1, STEPS + 1)
+        self.register_buffer("times", times, False)
         self.anchor = mlp(STEPS * 2, channels, channels)
         self.ego = mlp(EGO_FEATURES + COMMANDS, channels, channels)
         self.box = mlp(9, channels, channels)
@@ -206,18 +226,25 @@ class Planner(nn.Module):
             ego: [B, 5], see `EGO_FEATURES`.
             command: int64 [B].
         """
+        anchors = self._anchors(ego)
         query = self._query(world, ego, command)
-        moved = self.refine(query).float().unflatten(-1, (STEPS, 2)) * 2
-        arc = (self.anchors[..., 0] + moved[..., 0]).clamp(0, self.end_m)
-        offset = self.anchors[..., 1] + moved[..., 1]
+        moves = anchors + self.refine(query).float().unflatten(-1, (STEPS, 2))
+        arc = moves[..., 0].clamp(0, self.end_m)
+        offset = world.lateral[:, None, None] + moves[..., 1]
         plans, headings = along(arc, offset, world.path, world.headings)
         with torch.no_grad():
             costs, harm = self._costs(world, plans, headings, arc, offset)
         logits = self.score(torch.cat([query.float(), costs], -1)).squeeze(-1)
         weight = nn.functional.softplus(self.penalty(ego).float())
-        return Candidates(
-            plans, arc, offset, logits - (harm * weight[:, None]).sum(-1), costs
-        )
+        logits = logits - (harm * weight[:, None]).sum(-1)
+        return Candidates(plans, moves, anchors, logits, costs)
+
+    def _anchors(self, ego: Tensor) -> Tensor:
+        """[B, K, 6, 2]: going on at this speed, plus the anchors, never backwards."""
+        coasting = ego[:, 0, None, None] * (SPEED_SCALE_MPS * self.times)
+        arc = (coasting + self.anchors[..., 0]).clamp(min=0)
+        aside = self.anchors[..., 1].expand_as(arc)
+        return torch.stack([arc, aside], -1)
 
     def _query(self, world: World, ego: Tensor, command: Tensor) -> Tensor:
         """[B, K, C]: each anchor looks at agents, route, signals and occupancy."""
@@ -251,7 +278,14 @@ class Planner(nn.Module):
         under = ground(discs, world.raster, self.area)
         lines = self._lines(world, arc)
         limits = self._limits(world, arc, offset)
-        costs = [overlap, near, taken, under.flatten(2), lines.flatten(2), limits.flatten(2)]
+        costs = [
+            overlap,
+            near,
+            taken,
+            under.flatten(2),
+            lines.flatten(2),
+            limits.flatten(2),
+        ]
         harm = torch.stack(
             [
                 overlap.amax(-1),

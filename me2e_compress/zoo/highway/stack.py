@@ -102,9 +102,7 @@ class Highway(nn.Module):
         seen = self.understand(bev, tokens, middle)
         tracks, road, futures = seen.tracks, seen.road, seen.futures
         ego = EgoState(bus, stood_lately(bus[:, 7], prev_memory[:, 1], elapsed))
-        plan, world = self.planner(
-            tracks, road, futures, seen.occupancy, ego, command
-        )
+        plan, world = self.planner(tracks, road, futures, seen.occupancy, ego, command)
         memory = torch.stack([timestamp, ego.stood], -1)
         return (
             plan,

@@ -59,7 +59,9 @@ class Track(nn.Module):
         assert isinstance(last, nn.Conv2d) and last.bias is not None
         nn.init.constant_(last.bias, -3.0)
 
-    def forward(self, bev: Tensor, tokens: Tensor, hints: Tensor | None = None) -> Tracks:
+    def forward(
+        self, bev: Tensor, tokens: Tensor, hints: Tensor | None = None
+    ) -> Tracks:
         """Detect.
 
         Args:

@@ -17,12 +17,13 @@ from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.cameras import CameraRig
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.stack import Highway
+from me2e_compress.zoo.train.check import validate
 from me2e_compress.zoo.train.data import Episodes, Sequences
 from me2e_compress.zoo.train.frenet import anchors_of
 from me2e_compress.zoo.train.losses import LampHead
-from me2e_compress.zoo.train.losses.plan import displacement
+from me2e_compress.zoo.train.parent import end_with_parent
+from me2e_compress.zoo.train.step import Augmentation, run
 from me2e_compress.zoo.train.together import Together
-from me2e_compress.zoo.train.step import NONE, Augmentation, parameters_of, run
 
 CLIP = 5.0
 AVERAGED = 0.998
@@ -101,6 +102,7 @@ def train(
 
 
 def _process(rank: int, args: tuple, together: Together) -> None:  # type: ignore[type-arg]
+    end_with_parent()
     torch.set_num_threads(1)
     _Stage(rank, together, *args).run()
 
@@ -124,8 +126,9 @@ class _Stage:
         torch.manual_seed(what.seed)
         self.model = Highway(config)
         self.lamps = LampHead(config.channels)
-        self.episodes = Episodes(files[rank :: what.workers])
-        self.held_out = Episodes(held_out) if rank == 0 else None
+        size = config.image_size
+        self.episodes = Episodes(files[rank :: what.workers], size)
+        self.held_out = Episodes(held_out, size) if rank == 0 else None
         rig = CameraRig(*config.image_size)
         self.lidar2img = torch.from_numpy(rig.lidar2img)
         self.step, self.begun = 0, time.monotonic()
@@ -135,9 +138,8 @@ class _Stage:
         names = what.modules
         for name, child in self.model.named_children():
             child.requires_grad_(not names or name in names)
-        self.learning = [
-            p for p in parameters_of(self.model, self.lamps) if p.requires_grad
-        ]
+        everything = [*self.model.parameters(), *self.lamps.parameters()]
+        self.learning = [p for p in everything if p.requires_grad]
         self.optimizer = torch.optim.AdamW(
             self.learning, what.rate, weight_decay=WEIGHT_DECAY
         )
@@ -151,8 +153,10 @@ class _Stage:
             self.lamps.load_state_dict(found["lamps"])
             return
         anchors = self.model.planner.anchors
-        plans = self.episodes.frenet
-        mine = anchors_of(plans, len(anchors)) if self.rank == 0 else 0 * anchors.numpy()
+        plans = self.episodes.departures()
+        mine = (
+            anchors_of(plans, len(anchors)) if self.rank == 0 else 0 * anchors.numpy()
+        )
         everybody = self.together.mean(self.rank, torch.from_numpy(mine).flatten())
         anchors.copy_(everybody.view_as(anchors) * self.what.workers)
 
@@ -261,33 +265,3 @@ class _Stage:
                 draft,
             )
             os.replace(draft, self.folder / "last.pt")
-
-
-@torch.no_grad()
-def validate(
-    model: Highway,
-    lamps: LampHead,
-    episodes: Episodes,
-    lidar2img: Tensor,
-    count: int = 240,
-    batch: int = 10,
-) -> dict[str, float]:
-    """Mean losses and plan displacements (m) over a fixed draw of samples."""
-    rng = np.random.default_rng(0)
-    sums: dict[str, float] = {}
-    rows = list[Tensor]()
-    shifts = list[Tensor]()
-    for _ in range(count // batch):
-        picked = episodes.draw(rng, batch, Sequences())
-        images = episodes.images(picked.ravel())
-        images = images.reshape(*picked.shape, *images.shape[1:])
-        out = run(model, lamps, images, episodes.batch(picked), lidar2img, rng, NONE)
-        for name, loss in out.losses.items():
-            sums[name] = sums.get(name, 0.0) + float(loss)
-        rows.append(displacement(out.candidates.best(), out.wanted))
-        shifts.append(out.wanted.shift_m)
-    away, shift = torch.cat(rows), torch.cat(shifts)
-    found = {name: round(value / (count // batch), 4) for name, value in sums.items()}
-    found["plan_m"] = round(float(away.mean()), 4)
-    found["plan_decisive_m"] = round(float(away[shift > 0.5].mean()), 4)
-    return found

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from me2e_compress.zoo.highway.bev_encoder import motion_of
 from me2e_compress.zoo.highway.planner import Candidates, EgoState, World, world_of
@@ -31,7 +31,8 @@ WEIGHTS = {
     "class": 0.3,
     "travel": 0.3,
     "mode": 0.2,
-    "path": 1.0,
+    "path": 0.5,
+    "heading": 2.0,
     "attributes": 0.3,
     "raster": 1.0,
     "signal": 1.0,
@@ -140,14 +141,19 @@ def run(
         **map_losses(seen.road, wanted),
         **lamp_loss,
         **occ_losses(seen.occupancy, wanted),
-        **plan_losses(candidates, model.planner.anchors, wanted),
+        **plan_losses(candidates, wanted),
     }
     return Outcome(losses, seen, world, candidates, wanted)
 
 
 def _settled(world: World) -> World:
     """The planner bends its own plans, not the map under them."""
-    return replace(world, path=world.path.detach(), headings=world.headings.detach())
+    return replace(
+        world,
+        lateral=world.lateral.detach(),
+        path=world.path.detach(),
+        headings=world.headings.detach(),
+    )
 
 
 def _pixels(images: Array, rng: np.random.Generator, how: Augmentation) -> Tensor:
@@ -203,8 +209,3 @@ def _without_occ(world: World, rng: np.random.Generator, how: Augmentation) -> W
     mean = world.occupancy.mean(0, keepdim=True)
     kept = torch.where(gone[:, None, None, None], mean, world.occupancy)
     return replace(world, occupancy=kept)
-
-
-def parameters_of(*modules: nn.Module) -> list[nn.Parameter]:
-    """All parameters, in order."""
-    return [parameter for module in modules for parameter in module.parameters()]

@@ -32,7 +32,8 @@ class Targets:
         lamps: [B, S, 8] the signals as recorded.
         occupancy: [B, 6, H, W] 0 or 1.
         occupancy_known: [B, 6] bool.
-        frenet: [B, 6, 2] the expert's plan along the route.
+        moves: [B, 6, 2] the expert's plan: metres along the route, metres to the left
+            of where the ego is beside it.
         plan: [B, 6, 2] the same in the ego frame.
         shift_m: [B] how much the actors change it.
     """
@@ -50,7 +51,7 @@ class Targets:
     lamps: Tensor
     occupancy: Tensor
     occupancy_known: Tensor
-    frenet: Tensor
+    moves: Tensor
     plan: Tensor
     shift_m: Tensor
 
@@ -84,7 +85,7 @@ def targets_of(batch: dict[str, Array], area: BevArea) -> Targets:
         _tensor(batch["signals"]),
         torch.from_numpy(bits.reshape(shape)).float(),
         torch.arange(bits.shape[1])[None] < steps[:, None],
-        _tensor(batch["frenet"]),
+        _tensor(batch["moves"]),
         _tensor(batch["plan"]),
         _tensor(batch["shift_m"]),
     )

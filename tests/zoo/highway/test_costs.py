@@ -49,7 +49,9 @@ def test_places_beside_a_route_interpolate_its_points() -> None:
         path,
         torch.full((1, 9), math.pi / 2),
     )
-    assert places[0, 0].numpy() == pytest.approx(np.array([[-1, 3], [2, 7.5]]), abs=1e-5)
+    assert places[0, 0].numpy() == pytest.approx(
+        np.array([[-1, 3], [2, 7.5]]), abs=1e-5
+    )
     assert headings[0, 0].numpy() == pytest.approx(np.full(2, math.pi / 2))
 
 
@@ -59,7 +61,9 @@ def test_cells_and_grid_agree() -> None:
     columns = (2 * torch.arange(area.columns) + 1) / area.columns - 1
     rows = (2 * torch.arange(area.rows) + 1) / area.rows - 1
     assert torch.allclose(grid[..., 0], columns.expand(area.rows, -1), atol=1e-6)
-    assert torch.allclose(grid[..., 1], rows[:, None].expand(-1, area.columns), atol=1e-6)
+    assert torch.allclose(
+        grid[..., 1], rows[:, None].expand(-1, area.columns), atol=1e-6
+    )
 
 
 def test_between_starts_from_the_ego() -> None:
@@ -99,7 +103,10 @@ def test_agent_costs_match_float64(seed: int) -> None:
             gap = np.sqrt((out**2).sum(-1) + 1e-4).min()
             share = score[a] * modes[a, m]
             sums += share * np.array(
-                [1 / (1 + math.exp(-(RADIUS_M - gap) / SOFT_M)), math.exp(-gap / NEAR_M)]
+                [
+                    1 / (1 + math.exp(-(RADIUS_M - gap) / SOFT_M)),
+                    math.exp(-gap / NEAR_M),
+                ]
             )
         wanted[:, k, t] = np.maximum(wanted[:, k, t], sums)
     assert overlap[0].numpy() == pytest.approx(wanted[0], abs=2e-4)

@@ -51,7 +51,9 @@ def model() -> Highway:
 
 
 @pytest.fixture(scope="module")
-def exported(model: Highway, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def exported(
+    model: Highway, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Path]:
     yield write(model, tmp_path_factory.mktemp("highway") / "highway.onnx")
 
 

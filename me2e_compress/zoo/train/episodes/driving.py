@@ -1,14 +1,12 @@
 """Driving the routes of a collection, several at a time."""
 
 import io
-import os
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +25,7 @@ from me2e_compress.zoo.train.episodes.collection import (
     tasks_of,
 )
 from me2e_compress.zoo.train.episodes.recording import Recording
+from me2e_compress.zoo.train.parent import end_with_parent
 
 SUFFIX, SKIPPED = ".npz", ".skipped"
 SHORTEST_US = 2_000_000
@@ -120,7 +119,7 @@ def _driven(
             yield
         return
     context = get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _end_with_parent)
+    pool = ProcessPoolExecutor(workers, context, end_with_parent)
     try:
         jobs = [
             pool.submit(_collect_one, folder, what, student, task) for task in tasks
@@ -134,18 +133,6 @@ def _driven(
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """Leave no orphans: a pool's process would wait for ever for a killed parent."""
-    parent = parent_process()
-    if parent is not None:
-
-        def wait() -> None:
-            parent.join()
-            os._exit(1)
-
-        threading.Thread(target=wait, daemon=True).start()
 
 
 def _collect_one(

@@ -8,6 +8,7 @@ from me2e_compress.zoo.highway.map import GAP_SCALE_M, RoadMap
 from me2e_compress.zoo.train.targets import Targets
 
 ATTRIBUTE_SCALE = (4.0, 4.0, 4.0, 5.0)
+FAR_M = 5.0
 RARE = 4.0
 """Weight of occupied cells: few are."""
 
@@ -17,8 +18,8 @@ def map_losses(road: RoadMap, wanted: Targets) -> dict[str, Tensor]:
     rows = torch.arange(len(wanted.command))
     near = torch.linspace(2.0, 0.5, wanted.path.shape[1])[:, None]
     path = wanted.path
-    fine = (road.paths[rows, wanted.command] - path).abs() * near
-    rough = (road.rough[rows, wanted.command] - path).abs() * near
+    fine = _soft((road.paths[rows, wanted.command] - path).abs()) * near
+    rough = _soft((road.rough[rows, wanted.command] - path).abs()) * near
     scale = torch.tensor(ATTRIBUTE_SCALE)
     said = road.attributes[rows, wanted.command]
     there, gap, state = wanted.signals.unbind(-1)
@@ -30,7 +31,8 @@ def map_losses(road: RoadMap, wanted: Targets) -> dict[str, Tensor]:
         signals[:, 0, 2:][light], state[:, 0][light].long(), reduction="sum"
     )
     return {
-        "path": _capped(fine) + 0.3 * _capped(rough),
+        "path": fine.mean() + 0.3 * rough.mean(),
+        "heading": _turned(road.headings[rows, wanted.command], path),
         "attributes": ((said - wanted.attributes) / scale).abs().mean(),
         "raster": functional.binary_cross_entropy_with_logits(
             road.raster, wanted.raster
@@ -41,9 +43,18 @@ def map_losses(road: RoadMap, wanted: Targets) -> dict[str, Tensor]:
     }
 
 
-def _capped(error: Tensor) -> Tensor:
-    """A mean in which no point counts more than 10 m, lest junctions drown lanes."""
-    return error.clamp(max=10.0).mean()
+def _soft(error: Tensor) -> Tensor:
+    """Metres, growing slowly beyond `FAR_M`, lest junctions drown lanes."""
+    return FAR_M * torch.log1p(error / FAR_M)
+
+
+def _turned(headings: Tensor, path: Tensor) -> Tensor:
+    """Mean angle (rad) between a route [B, P] and the chords of a path [B, P, 2]."""
+    chords = path[:, 1:] - path[:, :-1]
+    wanted = torch.atan2(chords[..., 1], chords[..., 0])
+    said = (headings[:, 1:] + headings[:, :-1]) / 2
+    away = said - wanted
+    return torch.atan2(away.sin(), away.cos()).abs().mean()
 
 
 def occ_losses(occupancy: Tensor, wanted: Targets) -> dict[str, Tensor]:

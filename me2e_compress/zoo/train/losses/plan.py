@@ -11,35 +11,31 @@ NEAR_STEPS = (3.0, 2.0, 1.5, 1.0, 0.75, 0.75)
 """Weights of the waypoints: the controller acts on the first two."""
 ASIDE = 2.0
 """A metre to the side counts as two along the route."""
-SOFT_M = 0.35
+SOFT_M = 0.2
 """How much farther than the best a candidate may be and still count."""
 DECISIVE = 2.0
 """Extra weight of samples where the actors change the plan."""
 
 
-def plan_losses(
-    candidates: Candidates, anchors: Tensor, wanted: Targets
-) -> dict[str, Tensor]:
+def plan_losses(candidates: Candidates, wanted: Targets) -> dict[str, Tensor]:
     """Choice, and the distance of the right candidate.
 
     Args:
         candidates: of the planner.
-        anchors: [K, 6, 2] arc lengths and offsets.
         wanted: labels.
     """
     steps = torch.tensor(NEAR_STEPS) / sum(NEAR_STEPS)
     side = torch.tensor([1.0, ASIDE])
-    aim = wanted.frenet[:, None]
-    said = torch.stack([candidates.arc_m, candidates.offset_m], -1)
-    to_anchor = ((anchors[None] - aim).abs() * side).sum(-1) @ steps
-    to_plan = ((said.detach() - aim).abs() * side).sum(-1) @ steps
+    aim = wanted.moves[:, None]
+    to_anchor = ((candidates.anchors - aim).abs() * side).sum(-1) @ steps
+    to_plan = ((candidates.moves.detach() - aim).abs() * side).sum(-1) @ steps
     share = functional.softmax(-to_plan / SOFT_M, -1)
     weight = 1 + DECISIVE * (wanted.shift_m > 0.5).float()
     weight = weight / weight.mean()
     choice = -(share * candidates.logits.log_softmax(-1)).sum(-1)
     best = to_anchor.argmin(1)
     rows = torch.arange(len(best))
-    bend = ((said[rows, best] - wanted.frenet).abs() * side).sum(-1) @ steps
+    bend = ((candidates.moves[rows, best] - wanted.moves).abs() * side).sum(-1) @ steps
     place = (candidates.plans[rows, best] - wanted.plan).abs().sum(-1) @ steps
     return {
         "choice": (choice * weight).mean(),
