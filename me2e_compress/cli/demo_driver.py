@@ -20,6 +20,7 @@ from me2e_compress.cli.tables import (
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.routes import load_routes, pick_routes
 from me2e_compress.modules import Item, map_of
+from me2e_compress.passes import Pass
 from me2e_compress.study import Condition, Scheme, Study, Timing, run_study
 from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.write import write
@@ -39,11 +40,12 @@ def demo_driver(name: str, out: Path, scheme: str, routes: str, workers: int) ->
     """
     everything = load_routes()
     picked = pick_routes(everything, routes)
+    passes = recipe.load(scheme)
     source = shipped.copy(name, out / f"{name}.onnx")
     small = out / f"{name}.{scheme}.onnx"
     frames = _frames(source, out / "frames", CALIBRATION_FRAMES, CALIBRATION_SEED)
     held_out = _frames(source, out / "frames-held-out", HELD_OUT_FRAMES, HELD_OUT_SEED)
-    _compress(source, small, scheme, frames, out)
+    _compress(source, small, passes, frames)
     fidelity = judge(source, small, held_out)
     console.print(fidelity_table(fidelity))
     console.print(plan_line(fidelity))
@@ -77,9 +79,11 @@ def _frames(model: Path, folder: Path, count: int, seed: int) -> Path:
         )
 
 
-def _compress(source: Path, small: Path, scheme: str, frames: Path, out: Path) -> None:
+def _compress(
+    source: Path, small: Path, passes: tuple[Pass, ...], frames: Path
+) -> None:
     """Compress, write the file and its report, and say what each pass did."""
-    report = job.run(source, recipe.load(scheme), frames, None, 0, 2, out)
+    report = job.run(source, passes, frames, None, 0, 2, small.parent)
     job.write(report, source, small)
     console.print(steps_table(report.steps))
     console.print(notes(report.steps))

@@ -42,11 +42,7 @@ def load_study(path: Path, resolve: Resolve = Path, routes: str | None = None) -
     try:
         table = _Study.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(_keys_at(first["loc"]))
-        hint = f"; there are {known}" if first["type"] == "extra_forbidden" else ""
-        raise StudyError(f"{path}: {where}: {first['msg']}{hint}") from error
+        raise StudyError(f"{path}: {_complaint(error)}") from error
     return _Reader(path, resolve).study(table, routes)
 
 
@@ -94,10 +90,16 @@ _KINDS: dict[object, type[_Table]] = {
 }
 
 
-def _keys_at(where: tuple[int | str, ...]) -> list[str]:
-    """Name the keys that the table of a wrong key may have."""
-    kind = _KINDS.get(where[0], _Study) if len(where) > 1 else _Study
-    return list(kind.model_fields)
+def _complaint(error: ValidationError) -> str:
+    """Say what is wrong first: a key nobody knows explains one that is missing."""
+    found = error.errors(include_url=False)
+    unknown = [each for each in found if each["type"] == "extra_forbidden"]
+    first = (unknown or found)[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if not unknown:
+        return f"{where}: {first['msg']}"
+    kind = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study
+    return f"no key {where}; there are {', '.join(kind.model_fields)}"
 
 
 class _Reader:

@@ -90,15 +90,16 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "error", "message"),
     [
-        ("title =", "titel =", StudyError, r"title: Field required"),
-        ("[latency]", "[timing]", StudyError, r"timing: .*; there are title, basel"),
-        ("samples", "sample", StudyError, r"latency\.sample: .*there are samples, th"),
+        ("title =", "titel =", StudyError, r"no key titel; there are title, baseline"),
+        ("[latency]", "[timing]", StudyError, r"no key timing; there are title, b"),
+        ("samples", "sample", StudyError, r"no key latency\.sample; there are sam"),
         (
             'name = "small"',
             'name = "small"\nrecip = "exact"',
             StudyError,
-            r"scheme\.1\.recip: .*there are name, policy, recipe",
+            r"no key scheme\.1\.recip; there are name, policy, recipe",
         ),
+        ('baseline = "float"', "", StudyError, "baseline: Field required"),
         ("routes = 3", "routes = 1.5", StudyError, "routes"),
         ("routes = 3", "routes = 0", EvaluationError, "0 routes were asked for"),
         ("routes = 3", 'routes = "no"', EvaluationError, "no route 'no'"),

@@ -49,6 +49,8 @@ name = "ideal"
 latency = "none"
 """
 
+pytestmark = pytest.mark.xdist_group("study")
+
 
 ROOT = Path(__file__).parents[2]
 ONE = {"schemes": (BLIND,), "baseline": "blind", "conditions": (IDEAL,)}

@@ -1,0 +1,85 @@
+import importlib
+import json
+from pathlib import Path
+
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.cli import demo_driver
+from me2e_compress.zoo import shipped
+from tests.cli.conftest import Command
+from tests.stand_in import write_shipped
+from tests.study.conftest import Here
+
+ROUTE = "ParkedObstacle_0"
+
+
+@pytest.fixture(autouse=True)
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small driver in the place of the one that ships, few frames, no processes."""
+    write_shipped(tmp_path / "weights")
+    monkeypatch.setattr(shipped, "WEIGHTS", tmp_path / "weights")
+    monkeypatch.setattr(demo_driver, "CALIBRATION_FRAMES", 3)
+    monkeypatch.setattr(demo_driver, "HELD_OUT_FRAMES", 2)
+    monkeypatch.setattr(demo_driver, "LATENCY_SAMPLES", 5)
+    monkeypatch.setattr(demo_driver, "LocalEngine", lambda workers: Here())
+
+
+def test_the_demo_compresses_drives_and_reports(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+
+    assert command("demo", "--out", out, "--routes", ROUTE, "--scheme", "full") == 0
+
+    shown = capsys.readouterr().out
+    for title in (
+        "Pass by pass",
+        "Module by module",
+        "Fidelity over 2 f",
+        "Scoreboard",
+    ):
+        assert title in shown
+    record = json.loads((out / "study.json").read_text())
+    assert [each["name"] for each in record["schemes"]] == ["float", "full"]
+    assert record["schemes"][1]["model_sha256"] == graph.sha256_of(
+        out / "highway.full.onnx"
+    )
+    assert "quantize-int8" in record["schemes"][1]["pipeline"]
+    assert record["routes"] == {"driven": 1, "set": 220}
+    assert (out / "report.html").read_text().startswith("<!doctype html>")
+    assert "<svg" in (out / "demo.svg").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--routes", "0"), "0 routes were asked for"),
+        (("--scheme", "half"), "no recipe half"),
+    ],
+)
+def test_what_is_wrong_is_one_line(
+    command: Command,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, str],
+    message: str,
+) -> None:
+    assert command("demo", "--out", tmp_path / "out", *words) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_stack_nobody_knows_is_a_usage_error(command: Command) -> None:
+    assert command("demo", "--stack", "uniad") == 2
+
+
+def test_without_the_extra_the_demo_says_what_to_install(
+    command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+
+    assert command("demo", "--out", tmp_path / "out") == 1
+    assert "me2e-compress[highway]" in capsys.readouterr().err

@@ -1,0 +1,124 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.cli import evaluate, study
+from me2e_compress.evaluators.highway.routes import save_routes
+from tests.cli.conftest import Command, write_frames
+from tests.evaluators.highway.drivers import CROSSING, straight_on
+from tests.study.conftest import Here
+
+STUDY = """
+title = "Try"
+baseline = "float"
+routes = "routes.json"
+held_out = "frames"
+
+[latency]
+samples = 10
+baseline_median_s = 0.2
+
+[[scheme]]
+name = "float"
+policy = "m.onnx"
+
+[[scheme]]
+name = "exact"
+policy = "m.onnx"
+recipe = "exact"
+
+[[condition]]
+name = "device"
+latency = "trace"
+"""
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch) -> Here:
+    """Drive in this process."""
+    engine = Here()
+    monkeypatch.setattr(study, "engine_of", lambda *words: engine)
+    return engine
+
+
+@pytest.fixture
+def toml(tmp_path: Path) -> Path:
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    straight_on(tmp_path / "m.onnx")
+    save_routes((CROSSING,), tmp_path / "routes.json")
+    write_frames(tmp_path / "frames", command=np.array([3]))
+    return path
+
+
+def test_a_study_leaves_a_report_and_prints_its_tables(
+    command: Command, toml: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("study", toml, "-o", tmp_path / "out") == 0
+
+    shown = capsys.readouterr().out
+    assert "Scoreboard, device" in shown
+    assert "Difference to float" in shown
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert files >= {"study.json", "tables.md", "report.html", "results", "traces"}
+    text = (tmp_path / "out" / "report.html").read_text()
+    assert f"me2e-compress study {toml} -o" in text
+
+
+def test_json_is_the_file(
+    command: Command, toml: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert command("study", toml, "-o", out, "--json") == 0
+
+    shown = json.loads(capsys.readouterr().out)
+    assert shown == json.loads((out / "study.json").read_text())
+    assert [each["scheme"] for each in shown["drives"]] == ["float", "exact"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            '"m.onnx"\n\n',
+            '"uniad"\n\n',
+            "uniad: no such file; models that ship: highway",
+        ),
+        ('"exact"\npolicy', '"float"\npolicy', "2 schemes are named float"),
+        ('recipe = "exact"', 'recipe = "exakt"', "no recipe exakt"),
+        ('"frames"', '"nowhere"', "nowhere: no such folder"),
+        ("[[condition]]", "[[conditions]]", "no key conditions; there are title"),
+    ],
+)
+def test_what_is_wrong_is_one_line(
+    command: Command,
+    toml: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    old: str,
+    new: str,
+    message: str,
+) -> None:
+    assert old in STUDY
+    toml.write_text(STUDY.replace(old, new))
+
+    assert command("study", toml, "-o", tmp_path / "out") == 1
+
+    line = capsys.readouterr().err
+    assert message in line
+    assert line.count("\n") == 1
+
+
+def test_an_engine_nobody_knows(
+    command: Command,
+    toml: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(study, "engine_of", evaluate.engine_of)
+
+    assert command("study", toml, "-o", tmp_path / "out", "--engine", "cloud") == 1
+    assert "engine 'cloud'" in capsys.readouterr().err

@@ -1,0 +1,116 @@
+import json
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from me2e_compress.errors import StudyError
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.study import Outcome
+from me2e_compress.study.report import html
+from me2e_compress.study.report.figures import Point, forest, front, pareto
+from me2e_compress.study.report.findings import TIMES, findings
+from me2e_compress.study.write import write
+from tests.study.conftest import IDEAL
+
+pytestmark = pytest.mark.xdist_group("study")
+
+
+def point(cost: float, score: float) -> Point:
+    return Point("p", cost, Estimate(Measure(score, "%"), None, None, 1), False)
+
+
+POINTS = st.lists(
+    st.builds(point, st.floats(0, 10), st.floats(0, 100)), min_size=1, max_size=12
+)
+
+
+def beats(one: Point, other: Point) -> bool:
+    no_worse = one.cost <= other.cost and one.height >= other.height
+    return no_worse and (one.cost < other.cost or one.height > other.height)
+
+
+@given(POINTS)
+def test_a_front_is_what_no_other_beats(points: list[Point]) -> None:
+    kept = front(points)
+
+    assert kept
+    assert not any(beats(other, one) for one in kept for other in points)
+    for dropped in (each for each in points if each not in kept):
+        assert any(beats(one, dropped) for one in kept)
+
+
+@pytest.fixture(scope="module")
+def page(found: Outcome) -> str:
+    return html(found, ("me2e-compress", "study", "<s>.toml"))
+
+
+def test_the_page_needs_nothing_beside_it(page: str) -> None:
+    links = re.findall(r"""(?:src|href)=["']([^"']*)["']|url\(([^)]*)\)""", page)
+
+    outside = [
+        link
+        for link in (one or other for one, other in links)
+        if not link.startswith(("data:image/png;base64,", "#"))
+    ]
+    assert outside == []
+    assert page.count("data:image/png;base64,") == 2
+
+
+def test_what_users_wrote_is_escaped(page: str) -> None:
+    assert "<h1>Slow &amp; &lt;fast&gt;</h1>" in page
+    assert "&lt;s&gt;.toml" in page
+
+
+def test_every_section_is_there(page: str) -> None:
+    titles = re.findall(r"<h2>(.*?)</h2>", page)
+
+    assert titles == [
+        "Scoreboard",
+        "Paired differences",
+        "What a point of driving score costs",
+        "Abilities",
+        "Where they part",
+        "How it was made",
+    ]
+
+
+def test_the_same_study_gives_the_same_page(found: Outcome, page: str) -> None:
+    assert html(found, ("me2e-compress", "study", "<s>.toml")) == page
+
+
+def test_figures_name_every_scheme(found: Outcome) -> None:
+    costs, gaps = pareto(found, IDEAL), forest(found)
+
+    assert costs is not None
+    assert gaps is not None
+    assert all(f">{name}</text>" in costs for name in ("slow", "again", "fast"))
+    assert ">blind</text>" not in costs
+    assert ">fast, slow</text>" in gaps
+
+
+def test_findings_give_costs_and_what_is_sure(found: Outcome) -> None:
+    told = {each.scheme: each.text for each in findings(found)}
+
+    assert list(told) == ["blind", "again", "fast"]
+    assert told["again"].startswith(f"1.00 {TIMES} the size, ")
+    assert "ideal: driving score +0.0 points (+0.0 to +0.0), no differ" in told["again"]
+    assert "size" not in told["blind"]
+
+
+def test_files_are_written_beside_each_other(found: Outcome, tmp_path: Path) -> None:
+    written = write(found, tmp_path / "new" / "study")
+
+    assert json.loads(written.record.read_text()) == found.to_json()
+    assert written.tables.read_text().startswith("# Slow & <fast>\n\n**Scoreboard, ")
+    assert written.report.read_text().startswith("<!doctype html>")
+    assert len(list((tmp_path / "new" / "study").iterdir())) == 3
+
+
+def test_a_folder_that_cannot_be_written(found: Outcome, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(StudyError, match="file/study: cannot be written"):
+        write(found, tmp_path / "file" / "study")

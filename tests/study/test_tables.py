@@ -1,0 +1,130 @@
+import dataclasses
+
+import pytest
+
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.study import Outcome
+from me2e_compress.study.tables import (
+    INFINITE,
+    MINUS,
+    MISSING,
+    Cell,
+    Table,
+    abilities,
+    all_tables,
+    differences,
+    estimate_cell,
+    measure_cell,
+    number,
+    scoreboards,
+)
+from tests.study.conftest import IDEAL
+
+pytestmark = pytest.mark.xdist_group("study")
+
+
+def test_a_scoreboard_a_condition_and_a_row_a_scheme(found: Outcome) -> None:
+    ideal, slow = scoreboards(found)
+
+    assert ideal.title == "Scoreboard, ideal: decisions cost no time"
+    assert slow.title == "Scoreboard, slow: 2 decisions a second"
+    assert [row[0].text for row in ideal.rows] == ["blind", "slow", "again", "fast"]
+    assert all(len(row) == len(ideal.columns) for row in ideal.rows)
+    assert ideal.strong == "slow"
+    assert "2 of 220 routes" in ideal.note
+
+
+def test_the_numbers_are_those_of_the_drives(found: Outcome) -> None:
+    scores = found.under(IDEAL)[3].scores
+    assert scores is not None
+
+    row = scoreboards(found)[0].rows[3]
+
+    assert row[1] == estimate_cell(scores.driving_score)
+    assert row[6] == measure_cell(found.schemes[3].latency_ms[50], ".1f")
+    assert row[8].text == "7.000"
+
+
+def test_a_driver_without_a_model_has_reasons_not_numbers(found: Outcome) -> None:
+    row = scoreboards(found)[0].rows[0]
+
+    assert [cell.text for cell in row[5:]] == [MISSING] * 5
+    assert all(cell.reason for cell in row[5:])
+
+
+def test_no_noise_is_not_a_gap(found: Outcome) -> None:
+    assert scoreboards(found)[0].rows[2][9].text == INFINITE
+
+
+def test_the_baseline_is_not_compared_with_itself(found: Outcome) -> None:
+    table = differences(found)
+
+    assert [row[0].text for row in table.rows] == [
+        f"{scheme}, {condition}"
+        for condition in ("ideal", "slow")
+        for scheme in ("blind", "again", "fast")
+    ]
+    assert table.rows[1][1] == Cell("+0.0", "+0.0 to +0.0")
+
+
+def test_abilities_have_their_mean_last(found: Outcome) -> None:
+    table = abilities(found, IDEAL)
+
+    assert table.columns[1:] == (
+        *("Overtaking", "Merging", "Emergency Brake", "Give Way", "Traffic Signs"),
+        "mean",
+    )
+    assert table.rows[0][-1].reason.startswith("no route for Merging")
+
+
+def test_one_scheme_has_one_scoreboard_of_its_conditions(found: Outcome) -> None:
+    study = dataclasses.replace(
+        found.study, schemes=found.study.schemes[1:2], baseline="slow"
+    )
+    drives = tuple(each for each in found.drives if each.scheme == "slow")
+    alone = dataclasses.replace(
+        found, study=study, schemes=found.schemes[1:2], drives=drives
+    )
+
+    [table] = scoreboards(alone)
+
+    assert table.columns[0] == "condition"
+    assert [row[0].text for row in table.rows] == ["ideal", "slow"]
+    assert "Difference" not in "".join(each.title for each in all_tables(alone))
+
+
+def test_markdown() -> None:
+    table = Table(
+        "Costs",
+        ("scheme", "DS"),
+        (
+            (Cell("a|b"), Cell("1.0", "0.5 to 1.5")),
+            (Cell("c"), Cell(MISSING, reason="no")),
+        ),
+        "Note.",
+    )
+
+    assert table.markdown() == (
+        "**Costs**\n\n| scheme | DS |\n|---|---:|\n"
+        f"| a\\|b | 1.0 (0.5 to 1.5) |\n| c | {MISSING} |\n\nNote.\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "form", "text"),
+    [
+        (-0.04, ".1f", "0.0"),
+        (-0.04, "+.1f", "+0.0"),
+        (-0.4, "+.1f", f"{MINUS}0.4"),
+        (12.34, ".1f", "12.3"),
+        (-5.0, ".0f", f"{MINUS}5"),
+    ],
+)
+def test_numbers(value: float, form: str, text: str) -> None:
+    assert number(value, form) == text
+
+
+def test_what_was_not_measured_is_never_zero() -> None:
+    cell = estimate_cell(Estimate(Measure(None, "%", "no route"), None, None, 0))
+
+    assert cell == Cell(MISSING, reason="no route")
