@@ -13,7 +13,8 @@ from me2e_compress.cli.console import console, errors, print_json, progress, tab
 from me2e_compress.cli.evaluate import engine_of
 from me2e_compress.cli.models import model_path
 from me2e_compress.study import Listener, load_study, run_study
-from me2e_compress.study.tables import Cell, Table, all_tables
+from me2e_compress.study.cells import Cell, Table
+from me2e_compress.study.tables import all_tables
 from me2e_compress.study.write import write
 
 WIDE = 120

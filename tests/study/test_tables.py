@@ -4,20 +4,17 @@ import pytest
 
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import Outcome
-from me2e_compress.study.tables import (
+from me2e_compress.study.cells import (
     INFINITE,
     MINUS,
     MISSING,
     Cell,
     Table,
-    abilities,
-    all_tables,
-    differences,
     estimate_cell,
     measure_cell,
     number,
-    scoreboards,
 )
+from me2e_compress.study.tables import abilities, all_tables, differences, scoreboards
 from tests.study.conftest import IDEAL
 
 pytestmark = pytest.mark.xdist_group("study")
@@ -68,7 +65,7 @@ def test_the_baseline_is_not_compared_with_itself(found: Outcome) -> None:
 
 
 def test_abilities_have_their_mean_last(found: Outcome) -> None:
-    table = abilities(found, IDEAL)
+    table = abilities(found)[0]
 
     assert table.columns[1:] == (
         *("Overtaking", "Merging", "Emergency Brake", "Give Way", "Traffic Signs"),
@@ -87,8 +84,10 @@ def test_one_scheme_has_one_scoreboard_of_its_conditions(found: Outcome) -> None
     )
 
     [table] = scoreboards(alone)
+    [mastered] = abilities(alone)
 
-    assert table.columns[0] == "condition"
+    assert table.columns == ("condition", "DS", "SR %", "DE %", "DC")
+    assert [row[0].text for row in mastered.rows] == ["ideal", "slow"]
     assert [row[0].text for row in table.rows] == ["ideal", "slow"]
     assert "Difference" not in "".join(each.title for each in all_tables(alone))
 

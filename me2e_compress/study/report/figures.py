@@ -20,6 +20,8 @@ from me2e_compress.study.report.style import (
     svg,
 )
 
+CROWD = 6
+"""With more schemes than this, only the front and the baseline bear names and bars."""
 WIDTH_IN = 9.2
 """Of the page's column."""
 
@@ -78,7 +80,8 @@ def pareto(outcome: Outcome, condition: Condition) -> str | None:
         axes[0].set_ylabel("driving score")
         figure.canvas.draw_idle()
         for each, (points, _) in zip(axes, panels, strict=True):
-            place(figure, each, [(p.name, p.cost, p.height) for p in points])
+            named = [(p.name, p.cost, p.height) for p in _named(points)]
+            place(figure, each, named)
         return svg(figure)
 
 
@@ -116,6 +119,13 @@ def _points(outcome: Outcome, condition: Condition, kind: str) -> list[Point]:
     return found
 
 
+def _named(points: Sequence[Point]) -> Sequence[Point]:
+    if len(points) <= CROWD:
+        return points
+    best = front(points)
+    return [point for point in points if point.baseline or point in best]
+
+
 def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
     bare(axes)
     axes.grid(visible=True, axis="y")
@@ -129,18 +139,27 @@ def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
         linewidth=1.2,
         zorder=1,
     )
+    named = _named(points)
     for point in points:
         colour = BASELINE if point.baseline else ACCENT
-        if point.score.low is not None and point.score.high is not None:
+        low, high = point.score.low, point.score.high
+        if point in named and low is not None and high is not None:
             axes.plot(
                 [point.cost] * 2,
-                [point.score.low, point.score.high],
+                [low, high],
                 color=colour,
                 alpha=0.3,
                 linewidth=1.2,
                 zorder=2,
             )
-        axes.plot(point.cost, point.height, "o", color=colour, markersize=5, zorder=3)
+        shade = 1.0 if point in named else 0.35
+        axes.plot(
+            *(point.cost, point.height, "o"),
+            color=colour,
+            alpha=shade,
+            markersize=5,
+            zorder=3,
+        )
     axes.set_xlabel(words)
     axes.margins(x=0.12)
     axes.set_xlim(left=0.0)
@@ -157,3 +176,5 @@ def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
             axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
         axes.plot(estimate.value or 0.0, row, "o", color=colour, markersize=5)
     axes.margins(y=0.08 if len(found) > 3 else 0.3)
+    left, right = axes.get_xlim()
+    axes.set_xlim(min(left, -1.0), max(right, 1.0))

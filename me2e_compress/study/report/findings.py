@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.study.cells import number
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.outcome import Outcome, SchemeOutcome
-from me2e_compress.study.tables import number
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 

@@ -50,4 +50,5 @@ def place(
             color=INK,
             arrowprops={"arrowstyle": "-", "color": RULE} if moved else None,
             annotation_clip=False,
+            bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 0.5},
         )

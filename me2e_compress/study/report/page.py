@@ -9,13 +9,12 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.study.definition import Condition
 from me2e_compress.study.outcome import Outcome
 from me2e_compress.study.pictures import Contrast
 from me2e_compress.study.report.figures import forest, pareto
 from me2e_compress.study.report.findings import findings
 from me2e_compress.study.routes import RouteOutcome
-from me2e_compress.study.tables import Table, abilities, differences, scoreboards
+from me2e_compress.study.tables import abilities, differences, scoreboards
 
 TEMPLATE = "report.html"
 WORDS = {
@@ -78,7 +77,7 @@ def html(outcome: Outcome, command: Sequence[str] = ()) -> str:
             for each in study.conditions
             if (drawn := pareto(outcome, each)) is not None
         ],
-        abilities=_abilities(outcome, study.conditions),
+        abilities=abilities(outcome),
         contrasts=[_shown(each, study.baseline) for each in outcome.contrasts],
         made=_made(outcome, command),
         schemes=[_recipe(each.name, outcome) for each in outcome.schemes],
@@ -98,10 +97,6 @@ def _lede(outcome: Outcome) -> str:
 
 def _count(n: int, noun: str) -> str:
     return f"{n} {noun}{'' if n == 1 else 's'}"
-
-
-def _abilities(outcome: Outcome, conditions: Sequence[Condition]) -> tuple[Table, ...]:
-    return tuple(abilities(outcome, each) for each in conditions)
 
 
 def _shown(contrast: Contrast, baseline: str) -> Shown:
