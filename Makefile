@@ -6,7 +6,7 @@ JOBS ?= 2
 
 .PHONY: demo test check fix clean
 
-demo: $(VENV)/.demo  ## compress VAD-tiny and show what it did
+demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
 	$(BIN)/me2e-compress demo --out out
 
 test: check  ## lint, types, layers, tests
@@ -24,7 +24,7 @@ fix: $(VENV)/.test
 	$(BIN)/ruff format .
 
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo]'
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[highway]'
 	touch $@
 
 $(VENV)/.test: pyproject.toml constraints.txt | $(VENV)

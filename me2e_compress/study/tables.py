@@ -102,7 +102,7 @@ def _abilities(
         title,
         (heading, *(name.replace("_", " ") for name in ABILITIES), "mean"),
         tuple(rows),
-        "A route may test two abilities. Exact 95 % intervals, the mean's by bootstrap.",
+        "A route may test two abilities. Intervals are exact, the mean's by bootstrap.",
         strong,
     )
 

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import pytest
@@ -134,6 +135,16 @@ def test_no_routes_at_all(models: Path) -> None:
 def test_no_such_file(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match=r"none\.toml: cannot be read: No such file"):
         load_study(tmp_path / "none.toml")
+
+
+def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
+    page = Path(__file__).parents[2] / "docs" / "study.md"
+    (block,) = re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+
+    study = load_study(write(tmp_path, block), lambda name: Path("/shipped") / name)
+
+    assert [scheme.name for scheme in study.schemes] == ["expert", "float", "int8"]
+    assert study.conditions[1].traced
 
 
 def test_all_routes_is_what_a_study_drives_if_it_says_nothing(models: Path) -> None:
