@@ -56,7 +56,9 @@ class _Pair:
 
     @property
     def differs(self) -> bool:
-        return self.gap > 0.0 or (self.other.apart_m or 0.0) > MOVED_M
+        """A drive without frames hung or crashed: it has nothing to show."""
+        seen = bool(self.route.duration_us and self.other.duration_us)
+        return seen and (self.gap > 0.0 or (self.other.apart_m or 0.0) > MOVED_M)
 
     @property
     def rank(self) -> tuple[float, float]:

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -8,12 +9,13 @@ from hypothesis import strategies as st
 
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study import Outcome
+from me2e_compress.study import Condition, Outcome
 from me2e_compress.study.report import html
+from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
 from me2e_compress.study.report.findings import TIMES, findings
 from me2e_compress.study.write import write
-from tests.study.conftest import IDEAL
+from tests.study.conftest import IDEAL, SLOW
 
 pytestmark = pytest.mark.xdist_group("study")
 
@@ -89,6 +91,23 @@ def test_figures_name_every_scheme(found: Outcome) -> None:
     assert all(f">{name}</text>" in costs for name in ("slow", "again", "fast"))
     assert ">blind</text>" not in costs
     assert ">fast, slow</text>" in gaps
+
+
+def test_a_curve_needs_three_conditions(found: Outcome) -> None:
+    middle = Condition("middle", "fps:5")
+    drives = [
+        dataclasses.replace(each, condition="middle") for each in found.drives[:4]
+    ]
+    study = dataclasses.replace(found.study, conditions=(IDEAL, middle, SLOW))
+    three = dataclasses.replace(
+        found, study=study, drives=(*found.drives[:4], *drives, *found.drives[4:])
+    )
+
+    drawn = curves(three)
+
+    assert curves(found) is None
+    assert drawn is not None
+    assert all(drawn.count(f">{name}</text>") == 2 for name in ("middle", "fast"))
 
 
 def test_findings_give_costs_and_what_is_sure(found: Outcome) -> None:

@@ -42,7 +42,7 @@ def _sentence(outcome: Outcome, baseline: SchemeOutcome, scheme: SchemeOutcome) 
     several = len(outcome.study.conditions) > 1
     roads = [_road(each, several) for each in drives]
     parts = [", ".join(filter(None, costs)), *filter(None, roads)]
-    return "; ".join(filter(None, parts)) + "."
+    return ("; ".join(filter(None, parts)) or "nothing could be compared") + "."
 
 
 def _times(one: Measure, other: Measure, what: str) -> str:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.study.outcome import Outcome
 from me2e_compress.study.pictures import Contrast
+from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import forest, pareto
 from me2e_compress.study.report.findings import findings
 from me2e_compress.study.routes import RouteOutcome
@@ -70,6 +71,7 @@ def html(outcome: Outcome, command: Sequence[str] = ()) -> str:
         lede=_lede(outcome),
         findings=findings(outcome),
         scoreboards=scoreboards(outcome),
+        curves=_markup(curves(outcome)),
         differences=differences(outcome) if len(outcome.schemes) > 1 else None,
         forest=_markup(forest(outcome)),
         fronts=[

@@ -1,0 +1,79 @@
+"""How schemes drive from condition to condition."""
+
+from collections.abc import Callable, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.report.figures import WIDTH_IN
+from me2e_compress.study.report.style import ACCENT, BASELINE, MUTED, styled, svg
+
+ENOUGH = 3
+"""Conditions that make a curve; fewer are read off the tables."""
+
+Score = Callable[[Scores], Estimate]
+
+
+def curves(outcome: Outcome) -> str | None:
+    """Draw driving score and success rate over the conditions, in their order.
+
+    Returns:
+        SVG; None where there are fewer than three conditions.
+    """
+    if len(outcome.study.conditions) < ENOUGH:
+        return None
+    panels: tuple[tuple[str, Score], ...] = (
+        ("driving score", lambda scores: scores.driving_score),
+        ("success rate, %", lambda scores: scores.success_rate),
+    )
+    names = [condition.name for condition in outcome.study.conditions]
+    with styled():
+        figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
+        for axes, (title, pick) in zip(figure.subplots(1, 2), panels, strict=True):
+            for scheme in outcome.schemes:
+                _curve(axes, scheme.name, _found(outcome, scheme.name, pick), outcome)
+            axes.set_title(title, color=MUTED)
+            axes.set_xticks(range(len(names)), names)
+            axes.set_ylim(0.0, 102.0)
+            axes.grid(visible=True, axis="y")
+            axes.spines["left"].set_visible(False)
+        return svg(figure)
+
+
+def _found(outcome: Outcome, scheme: str, pick: Score) -> Sequence[Estimate | None]:
+    """Give one estimate a condition; None where the scheme was not driven."""
+    return [
+        None if drive.scores is None else pick(drive.scores)
+        for drive in outcome.drives
+        if drive.scheme == scheme
+    ]
+
+
+def _curve(
+    axes: Axes, name: str, found: Sequence[Estimate | None], outcome: Outcome
+) -> None:
+    colour = BASELINE if name == outcome.study.baseline else ACCENT
+    driven = [
+        (place, each.value, each.low, each.high)
+        for place, each in enumerate(found)
+        if each is not None and each.value is not None
+    ]
+    for place, _, low, high in driven:
+        if low is not None and high is not None:
+            axes.plot([place] * 2, [low, high], color=colour, alpha=0.3, linewidth=1.6)
+    axes.plot(
+        [place for place, *_ in driven],
+        [value for _, value, *_ in driven],
+        "o-",
+        color=colour,
+        linewidth=1.2,
+        markersize=5,
+    )
+    if driven and len(outcome.schemes) > 1:
+        place, value, *_ = driven[-1]
+        axes.annotate(
+            name, (place, value), xytext=(7, 0), textcoords="offset points", va="center"
+        )
