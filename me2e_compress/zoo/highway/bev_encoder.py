@@ -13,7 +13,7 @@ from me2e_compress.zoo.highway.layers import Residual, conv_block, mlp, sample
 NEAREST_M = 0.3
 """Nearer to the image plane than this a point is not seen."""
 VIEWS = 2
-"""No cell of the ground is in more than two cameras, up to overlaps of a few degrees."""
+"""Neighbouring views overlap: no cell of the ground is in more than two of six."""
 REACH = 0.2
 """How far an offset reaches, in half images."""
 SATURATION = 5.0
@@ -42,6 +42,9 @@ class SpatialCrossAttention(nn.Module):
     height, moved by an offset that the query asks for, and a mean is taken over the
     two cameras that see most of the pillar.
     """
+
+    size: Tensor
+    pillar: Tensor
 
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__()
@@ -110,7 +113,8 @@ class SpatialCrossAttention(nn.Module):
         found = sample(atlas, grid).unflatten(0, (-1, self.heads))
         mask = mask.transpose(2, 3).flatten(3)[:, :, None]
         mixed = (found * mask.to(found.dtype)).sum(-1).flatten(1, 2)
-        return self.output(mixed.transpose(1, 2))
+        cells: Tensor = self.output(mixed.transpose(1, 2))
+        return cells
 
     def _side_by_side(
         self, features: Tensor, where: Tensor, camera: Tensor
@@ -137,6 +141,8 @@ class SpatialCrossAttention(nn.Module):
 
 class BevEncoder(nn.Module):
     """Deformable look-up, memory of the frames before, convolutions."""
+
+    centres: Tensor
 
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__()
@@ -189,7 +195,9 @@ class BevEncoder(nn.Module):
         cells = self.cross(self.norms[0](self.queries), features, lidar2img)
         cells = self.queries + cells
         cells = cells + self.ffn(self.norms[1](cells))
-        return cells.transpose(1, 2).unflatten(2, (self.area.rows, self.area.columns))
+        shape = (self.area.rows, self.area.columns)
+        seen: Tensor = cells.transpose(1, 2).unflatten(2, shape)
+        return seen
 
     def recall(self, prev_bev: Tensor, motion: Motion) -> Tensor:
         """The memory [B, N, C + 1] as seen from here: [B, C + 1, rows, columns]."""
@@ -225,7 +233,8 @@ class BevEncoder(nn.Module):
 
     def fuse(self, joined: Tensor) -> Tensor:
         """[B, 2 C + 1, rows, columns] to [B, C, rows, columns]."""
-        return self.spatial(self.temporal(joined))
+        bev: Tensor = self.spatial(self.temporal(joined))
+        return bev
 
 
 def motion_of(can_bus: Tensor, elapsed_s: Tensor) -> Motion:

@@ -64,9 +64,11 @@ PATH_STEP_M = 2.0
 STEPS = 6
 """Waypoints of a plan and of a future, every `STEP_S`: the policy contract."""
 STEP_S = 0.5
+"""Between two waypoints."""
 COMMANDS = 6
 """Left, right, straight, follow, change left, change right."""
 CAMERAS = 6
+"""Front, front left, front right, back, back left, back right: the order of the rig."""
 AGENT_CLASSES = 4
 """Vehicle, bicycle, pedestrian, static."""
 SIGNAL_KINDS = 3

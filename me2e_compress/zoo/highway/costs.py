@@ -26,9 +26,28 @@ def discs_of(places: Tensor, headings: Tensor) -> Tensor:
 
 
 def between(steps: Tensor) -> Tensor:
-    """Insert the middle of every step, the first one from 0: [B, T, N] to [B, 2 T, N]."""
+    """Insert the middle of every step, the first from 0: [B, T, N] to [B, 2 T, N]."""
     before = torch.cat([torch.zeros_like(steps[:, :1]), steps[:, :-1]], 1)
     return torch.stack([(before + steps) / 2, steps], 2).flatten(1, 2)
+
+
+def between_travel(travel: Tensor) -> Tensor:
+    """[B, A, M, 6, 2] to every quarter of a second: [B, A, M, 12, 2]."""
+    shape = travel.shape[:3]
+    finer: Tensor = between(travel.flatten(0, 2)).unflatten(0, shape)
+    return finer
+
+
+def swept(plans: Tensor, headings: Tensor) -> Tensor:
+    """The ego's discs [B, K, 2 T, 3, 2] every quarter of a second.
+
+    Args:
+        plans: [B, K, T, 2].
+        headings: [B, K, T].
+    """
+    fine = between(plans.transpose(1, 2).flatten(2)).unflatten(2, (-1, 2))
+    turns = between(headings.transpose(1, 2)).transpose(1, 2)
+    return discs_of(fine.transpose(1, 2), turns)
 
 
 def agent_costs(
@@ -70,13 +89,16 @@ def occupied(discs: Tensor, occupancy: Tensor, area: BevArea) -> Tensor:
     Args:
         discs: [B, K, T, 3, 2].
         occupancy: [B, T, rows, columns] probabilities.
+        area: that they cover.
 
     Returns:
         [B, K, T].
     """
     grid = grid_of(discs, area).transpose(1, 2).flatten(0, 1)
     found = sample(occupancy.flatten(0, 1)[:, None], grid)
-    return found.amax(-1).squeeze(1).unflatten(0, occupancy.shape[:2]).transpose(1, 2)
+    worst = found.amax(-1).squeeze(1).unflatten(0, occupancy.shape[:2])
+    taken: Tensor = worst.transpose(1, 2)
+    return taken
 
 
 def ground(discs: Tensor, raster: Tensor, area: BevArea) -> Tensor:
@@ -85,12 +107,14 @@ def ground(discs: Tensor, raster: Tensor, area: BevArea) -> Tensor:
     Args:
         discs: [B, K, T, 3, 2].
         raster: [B, R, rows, columns] probabilities.
+        area: that they cover.
 
     Returns:
         [B, K, T, R] means over the discs.
     """
     found = sample(raster, grid_of(discs, area).flatten(1, 2))
-    return found.mean(-1).transpose(1, 2).unflatten(1, discs.shape[1:3])
+    under: Tensor = found.mean(-1).transpose(1, 2).unflatten(1, discs.shape[1:3])
+    return under
 
 
 def beyond_lines(arc_m: Tensor, gap_m: Tensor) -> Tensor:

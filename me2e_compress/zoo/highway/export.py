@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from me2e_compress.runtime.atomic import write_bytes
@@ -11,6 +10,7 @@ from me2e_compress.zoo.highway.stack import Highway
 from me2e_compress.zoo.stacks import find
 
 OPSET = 17
+"""LayerNormalization is one operator from here on."""
 
 
 def write(model: Highway, path: Path) -> Path:
@@ -24,7 +24,9 @@ def write(model: Highway, path: Path) -> Path:
         GraphError: the exporter wrote another opset.
     """
     spec = find("highway")
-    graph = trace(spec, model.eval().to(memory_format=torch.contiguous_format), OPSET)
+    # torch's stubs leave this form of `to` out
+    model.eval().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    graph = trace(spec, model, OPSET)
     for key, value in spec.metadata().items():
         graph.metadata_props.add(key=key, value=value)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -34,4 +36,4 @@ def write(model: Highway, path: Path) -> Path:
 
 def parameters(model: Highway) -> int:
     """How many numbers were trained."""
-    return int(np.sum([p.numel() for p in model.parameters()]))
+    return sum(p.numel() for p in model.parameters())

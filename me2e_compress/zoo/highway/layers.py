@@ -1,6 +1,7 @@
 """Building blocks: convolutions, attention, look-ups in feature maps."""
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -56,7 +57,8 @@ class MultiHeadAttention(nn.Module):
         )
         scores = torch.matmul(q / math.sqrt(self.depth), k.transpose(-1, -2))
         mixed = torch.matmul(scores.softmax(-1), v)
-        return self.output(mixed.transpose(1, 2).flatten(2))
+        answer: Tensor = self.output(mixed.transpose(1, 2).flatten(2))
+        return answer
 
 
 class DecoderLayer(nn.Module):
@@ -79,7 +81,8 @@ class DecoderLayer(nn.Module):
             own = self.norms[0](query)
             query = query + self.self_attn(own, own, own)
         query = query + self.cross_attn(self.norms[1](query), key, value)
-        return query + self.ffn(self.norms[2](query))
+        answer: Tensor = query + self.ffn(self.norms[2](query))
+        return answer
 
 
 class SelfLayer(nn.Module):
@@ -95,13 +98,14 @@ class SelfLayer(nn.Module):
         """[B, Q, C] looks at itself."""
         own = self.norms[0](query)
         query = query + self.attn(own, own, own)
-        return query + self.ffn(self.norms[1](query))
+        answer: Tensor = query + self.ffn(self.norms[1](query))
+        return answer
 
 
 def mlp(*widths: int) -> nn.Sequential:
     """Linear layers with ReLU between them."""
     layers: list[nn.Module] = []
-    for inputs, outputs in zip(widths, widths[1:], strict=False):
+    for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 

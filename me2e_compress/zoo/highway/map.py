@@ -19,10 +19,13 @@ from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp, samp
 FORWARD_CAMERAS = 3
 """The first three cameras look ahead, and to both sides of it."""
 BEND = 0.1
-"""Scale of curvatures, 1/m."""
+"""Scale of curvatures, 1/m: a junction is turned on a radius of about 10 m."""
 WIDTH_SCALE_M = 4.0
+"""Offsets and widths are predicted in units of a wide lane."""
 SPEED_SCALE_MPS = 10.0
+"""Speeds are predicted in these units, about 1 in size."""
 GAP_SCALE_M = 10.0
+"""Distances to stop lines are predicted in these units: the last 10 m matter."""
 
 
 @dataclass
@@ -106,7 +109,9 @@ class Map(nn.Module):
             lateral,
             headings,
             route_points(lateral, headings),
-            torch.cat([scale[..., :3] * WIDTH_SCALE_M, scale[..., 3:] * 10.0], -1),
+            torch.cat(
+                [scale[..., :3] * WIDTH_SCALE_M, scale[..., 3:] * SPEED_SCALE_MPS], -1
+            ),
             self.raster(bev).float(),
             signal_query,
             signals,

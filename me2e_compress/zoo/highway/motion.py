@@ -30,6 +30,8 @@ class Futures:
 class Motion(nn.Module):
     """Agents in several modes look at each other and at the routes (VAD)."""
 
+    times: Tensor
+
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__()
         channels = config.channels

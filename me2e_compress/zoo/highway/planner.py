@@ -1,7 +1,5 @@
 """The plan: candidates along the commanded route, scored by what they would meet."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
@@ -17,144 +15,34 @@ from me2e_compress.zoo.highway.config import (
 )
 from me2e_compress.zoo.highway.costs import (
     agent_costs,
-    between,
+    between_travel,
     beyond_lines,
     discs_of,
     ground,
     occupied,
+    swept,
 )
 from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
 from me2e_compress.zoo.highway.map import GAP_SCALE_M, RoadMap
 from me2e_compress.zoo.highway.motion import Futures
 from me2e_compress.zoo.highway.track import Tracks
+from me2e_compress.zoo.highway.world import (
+    EGO_FEATURES,
+    SPEED_SCALE_MPS,
+    Candidates,
+    EgoState,
+    World,
+    world_of,
+)
 
-SPEED_SCALE_MPS = 10.0
-EGO_FEATURES = 5
-"""Speed, longitudinal and lateral acceleration, yaw rate, how lately it stood."""
 LIMITS = 4
 """Too fast, too far left, too far right, left of the oncoming lanes."""
 COSTS = STEPS * (2 * 2 + 1 + RASTER_CHANNELS + SIGNAL_KINDS + LIMITS)
 """Overlap and nearness at twelve instants, the rest at six."""
 
 
-@dataclass
-class EgoState:
-    """What the ego does.
-
-    Attributes:
-        can_bus: [B, 18], see the policy contract.
-        stood: [B] 1 while it stands, then forgotten.
-    """
-
-    can_bus: Tensor
-    stood: Tensor
-
-    def features(self) -> Tensor:
-        """[B, 5], each about 1 in size: see `EGO_FEATURES`."""
-        bus = self.can_bus
-        columns = [
-            bus[:, 7] / SPEED_SCALE_MPS,
-            bus[:, 10] / 3,
-            bus[:, 11] / 3,
-            bus[:, 15] * 2,
-        ]
-        return torch.stack([*columns, self.stood], -1)
-
-
-@dataclass
-class World:
-    """What the planner reads: the outputs of the other modules, and nothing else.
-
-    Attributes:
-        agents: [B, A, C] queries of the motion module.
-        boxes: [B, A, 8] of the track module.
-        score: [B, A] of the track module.
-        travel: [B, A, M, 6, 2] of the motion module.
-        modes: [B, A, M] probabilities, of the motion module.
-        lateral: [B] metres that the ego is left of the route of the command, of the
-            map module.
-        path: [B, P, 2] that route, of the map module.
-        headings: [B, P] of it.
-        attributes: [B, P, 4] of it.
-        points: [B, P, C] its queries.
-        raster: [B, 4, H, W] probabilities, of the map module.
-        signal_query: [B, 3, C] of the map module.
-        signals: [B, 3, 5] of the map module.
-        occupancy: [B, 6, H, W] probabilities, of the occ module.
-    """
-
-    agents: Tensor
-    boxes: Tensor
-    score: Tensor
-    travel: Tensor
-    modes: Tensor
-    lateral: Tensor
-    path: Tensor
-    headings: Tensor
-    attributes: Tensor
-    points: Tensor
-    raster: Tensor
-    signal_query: Tensor
-    signals: Tensor
-    occupancy: Tensor
-
-
-@dataclass
-class Candidates:
-    """What the planner considered.
-
-    Attributes:
-        plans: [B, K, 6, 2] metres in the ego frame.
-        moves: [B, K, 6, 2] metres along the route, and to the left of where the ego is
-            beside it.
-        anchors: [B, K, 6, 2] the same before the planner bends them.
-        logits: [B, K].
-        costs: [B, K, F] what the score was made of.
-    """
-
-    plans: Tensor
-    moves: Tensor
-    anchors: Tensor
-    logits: Tensor
-    costs: Tensor
-
-    def best(self) -> Tensor:
-        """The plan with the highest score: [B, 6, 2]."""
-        first = self.logits.argmax(1)[:, None, None, None]
-        return self.plans.gather(1, first.expand(-1, -1, STEPS, 2)).squeeze(1)
-
-
-def world_of(
-    tracks: Tracks, road: RoadMap, futures: Futures, occupancy: Tensor, command: Tensor
-) -> World:
-    """Gather what the planner reads; the command picks the route.
-
-    Args:
-        tracks: of the track module.
-        road: of the map module.
-        futures: of the motion module.
-        occupancy: [B, 6, H, W] logits of the occ module.
-        command: int64 [B].
-    """
-    pick = command[:, None] == torch.arange(COMMANDS, device=command.device)
-    chosen = pick.to(road.paths.dtype)
-    queries = road.query.unflatten(1, (COMMANDS, -1))
-    return World(
-        futures.query,
-        tracks.boxes,
-        tracks.score,
-        futures.travel,
-        futures.logits.softmax(-1),
-        (road.lateral * chosen).sum(1),
-        (road.paths * chosen[:, :, None, None]).sum(1),
-        (road.headings * chosen[:, :, None]).sum(1),
-        (road.attributes * chosen[:, :, None, None]).sum(1),
-        (queries * chosen[:, :, None, None].to(queries.dtype)).sum(1),
-        road.raster.sigmoid(),
-        road.signal_query,
-        road.signals,
-        occupancy.sigmoid(),
-    )
+CAUTION = 4.0
+"""What a certain collision costs before training, in units of the logits."""
 
 
 class Planner(nn.Module):
@@ -185,13 +73,16 @@ class Planner(nn.Module):
         self.grid = nn.Sequential(
             conv_block(STEPS, 32, 3, 4), conv_block(32, channels, 3, 2)
         )
-        self.cells = nn.Parameter(torch.randn(1, 48, channels) * 0.1)
+        # the occupancy has two cells a cell, and is read in steps of eight
+        places = (2 * self.area.rows // 8) * (2 * self.area.columns // 8)
+        self.cells = nn.Parameter(torch.randn(1, places, channels) * 0.1)
         self.agent_layer = DecoderLayer(channels, heads)
         self.road_layer = DecoderLayer(channels, heads, selfish=False)
         self.grid_layer = DecoderLayer(channels, heads, selfish=False)
         self.refine = mlp(channels, channels, STEPS * 2)
         self.score = mlp(channels + COSTS, 128, 64, 1)
         self.penalty = mlp(EGO_FEATURES, 16, 4)
+        nn.init.constant_(self.penalty[-1].bias, CAUTION)
 
     def forward(
         self,
@@ -223,7 +114,7 @@ class Planner(nn.Module):
 
         Args:
             world: what the modules say.
-            ego: [B, 5], see `EGO_FEATURES`.
+            ego: [B, 2], see `EGO_FEATURES`.
             command: int64 [B].
         """
         anchors = self._anchors(ego)
@@ -237,7 +128,7 @@ class Planner(nn.Module):
         logits = self.score(torch.cat([query.float(), costs], -1)).squeeze(-1)
         weight = nn.functional.softplus(self.penalty(ego).float())
         logits = logits - (harm * weight[:, None]).sum(-1)
-        return Candidates(plans, moves, anchors, logits, costs)
+        return Candidates(plans, moves, anchors, headings, logits, costs)
 
     def _anchors(self, ego: Tensor) -> Tensor:
         """[B, K, 6, 2]: going on at this speed, plus the anchors, never backwards."""
@@ -258,16 +149,15 @@ class Planner(nn.Module):
         road = torch.cat([world.points + self.road(route), world.signal_query], 1)
         query = self.road_layer(query, road, road)
         taken = self.grid(world.occupancy).flatten(2).transpose(1, 2) + self.cells
-        return self.grid_layer(query, taken, taken)
+        answer: Tensor = self.grid_layer(query, taken, taken)
+        return answer
 
     def _costs(
         self, world: World, plans: Tensor, headings: Tensor, arc: Tensor, offset: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Everything [B, K, F], and what is plain harm [B, K, 4]."""
-        fine = between(plans.transpose(1, 2).flatten(2)).unflatten(2, (-1, 2))
-        turns = between(headings.transpose(1, 2)).transpose(1, 2)
         overlap, near = agent_costs(
-            discs_of(fine.transpose(1, 2), turns),
+            swept(plans, headings),
             world.boxes,
             world.score,
             between_travel(world.travel),
@@ -298,7 +188,7 @@ class Planner(nn.Module):
         return torch.cat(costs, -1), harm
 
     def _lines(self, world: World, arc: Tensor) -> Tensor:
-        """[B, K, 6, 3] beyond the line of a closed light, a stop sign, a give-way sign."""
+        """[B, K, 6, 3] beyond the line of a closed light, a stop, a give-way sign."""
         there = world.signals[..., 0].sigmoid()
         closed = 1 - world.signals[:, 0, 2:].softmax(-1)[:, 2]
         asked = torch.cat([(there[:, 0] * closed)[:, None], there[:, 1:]], 1)
@@ -320,12 +210,3 @@ class Planner(nn.Module):
             ],
             -1,
         )
-
-
-def between_travel(travel: Tensor) -> Tensor:
-    """[B, A, M, 6, 2] to every quarter of a second: [B, A, M, 12, 2]."""
-    shape = travel.shape[:3]
-    return between(travel.flatten(0, 2)).unflatten(0, shape)
-
-
-__all__ = ["SIGNAL_KINDS", "Candidates", "Planner", "World", "world_of"]

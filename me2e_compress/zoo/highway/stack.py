@@ -11,8 +11,9 @@ from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.map import Map, RoadMap
 from me2e_compress.zoo.highway.motion import Futures, Motion
 from me2e_compress.zoo.highway.occ import Occ
-from me2e_compress.zoo.highway.planner import EgoState, Planner
+from me2e_compress.zoo.highway.planner import Planner
 from me2e_compress.zoo.highway.track import Track, Tracks
+from me2e_compress.zoo.highway.world import EgoState
 
 MEMORY = 2
 """Of the ego: when it last looked (s), how lately it stood (1 now, 0 never)."""

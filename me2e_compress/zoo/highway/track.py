@@ -11,8 +11,12 @@ from me2e_compress.zoo.highway.geometry import cell_centres
 from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
 
 SPEED_SCALE_MPS = 10.0
+"""Velocities are predicted in these units, about 1 in size."""
 SIZE_SCALE_M = 2.0
 """Boxes are e^x times this long and wide."""
+RARE = -3.0
+"""First logit of the detection map: nearly every cell is empty, and a map that begins
+undecided spends the first steps on that (Lin et al., RetinaNet, 2017, section 4.1)."""
 
 
 @dataclass
@@ -42,22 +46,21 @@ class Tracks:
 class Track(nn.Module):
     """Detection map, its strongest peaks, one decoder layer."""
 
+    centres: Tensor
+
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__()
         channels, self.area = config.channels, config.area
         self.agents = config.agents
-        self.heat = nn.Sequential(
-            conv_block(channels, channels), nn.Conv2d(channels, 1, 1)
-        )
+        body, last = conv_block(channels, channels), nn.Conv2d(channels, 1, 1)
+        nn.init.constant_(last.get_parameter("bias"), RARE)
+        self.heat = nn.Sequential(body, last)
         self.place = mlp(2, channels, channels)
         self.layer = DecoderLayer(channels, config.heads)
         self.box = mlp(channels, channels, 8)
         self.kind = nn.Linear(channels, AGENT_CLASSES)
         self.score = mlp(channels, channels, 1)
         self.register_buffer("centres", cell_centres(self.area), False)
-        last = self.heat[-1]
-        assert isinstance(last, nn.Conv2d) and last.bias is not None
-        nn.init.constant_(last.bias, -3.0)
 
     def forward(
         self, bev: Tensor, tokens: Tensor, hints: Tensor | None = None

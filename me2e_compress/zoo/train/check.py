@@ -5,13 +5,10 @@ import torch
 from torch import Tensor
 
 from me2e_compress.zoo.highway.stack import Highway
-from me2e_compress.zoo.train.data import Episodes, Sequences
+from me2e_compress.zoo.train.data import DECISIVE_M, Episodes, Sequences
 from me2e_compress.zoo.train.losses import LampHead
 from me2e_compress.zoo.train.losses.plan import displacement
 from me2e_compress.zoo.train.step import NONE, run
-
-DECISIVE_M = 0.5
-"""A plan that the actors change by more than this is decided by them."""
 
 
 @torch.no_grad()

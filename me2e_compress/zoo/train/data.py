@@ -10,32 +10,23 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import TrainingError
-from me2e_compress.zoo.highway.config import CAMERAS
+from me2e_compress.zoo.highway.config import STEP_S
 from me2e_compress.zoo.train.episodes import decode
 from me2e_compress.zoo.train.frenet import project
+from me2e_compress.zoo.train.stored import KEPT, Array, Bytes, read
 
-Array = npt.NDArray[np.generic]
 Floats = npt.NDArray[np.floating]
+Indices = npt.NDArray[np.int64]
 
-KEPT = (
-    "time_us",
-    "pose",
-    "can_bus",
-    "command",
-    "rest_s",
-    "plan",
-    "plan_alone",
-    "path",
-    "path_attributes",
-    "lateral_m",
-    "agents",
-    "futures",
-    "signals",
-    "ground",
-    "occupancy",
-    "known_steps",
-)
-"""Arrays of an episode that training reads, one row a sample."""
+DECISIVE_M = 0.5
+"""A plan that the actors change by more than this, on average over its waypoints, is
+decided by them: half a second at walking speed, or half a car's width aside."""
+VERY_DECISIVE_M = 2.0
+"""Half a car's length: braking for somebody, or going around."""
+LINE_NEAR_M = 25.0
+"""A stop line this near decides: braking at 2 m/s^2 from 10 m/s takes 25 m."""
+FOLLOW = 3
+"""The command to follow the lane; turns come before it, lane changes behind it."""
 
 
 @dataclass(frozen=True)
@@ -65,41 +56,22 @@ class Episodes:
             TrainingError: there is none, one is not an episode, or its cameras are
                 laid out otherwise.
         """
-        self.image_size = image_size
-        tables: dict[str, list[Array]] = {name: [] for name in KEPT}
-        self.pictures: list[npt.NDArray[np.uint8]] = []
-        lengths = list[int]()
-        for file in files:
-            lengths.append(self._read(file, tables))
-        if not lengths:
+        if not files:
             raise TrainingError("there is no episode to learn from")
-        self.tables = {name: np.concatenate(rows) for name, rows in tables.items()}
+        episodes = [read(file, image_size) for file in files]
+        self.pictures = [one for each in episodes for one in each.pictures]
+        self.tables: dict[str, Array] = {
+            name: np.concatenate([each.arrays[name] for each in episodes])
+            for name in KEPT
+        }
+        lengths = [len(each.pictures) for each in episodes]
         ends = np.cumsum(lengths)
+        self.first = np.repeat(ends - lengths, lengths)
         self.last = np.repeat(ends - 1, lengths)
         self.moves = project(self.tables["plan"], self.tables["path"])
         self.moves[..., 1] -= self.tables["lateral_m"][:, None]
         shift = np.linalg.norm(self.tables["plan"] - self.tables["plan_alone"], axis=-1)
-        self.shift_m = shift.mean(-1)
-
-    def _read(self, file: Path, tables: dict[str, list[Array]]) -> int:
-        try:
-            with np.load(file) as content:
-                for name in KEPT:
-                    tables[name].append(content[name])
-                offsets, data = content["jpeg_offsets"], content["jpeg"]
-        except (OSError, ValueError, KeyError) as error:
-            raise TrainingError(f"{file}: not an episode: {error}") from error
-        cuts = zip(offsets, offsets[1:], strict=False)
-        pictures = [data[begin:end].copy() for begin, end in cuts]
-        found = decode(pictures[0]).shape
-        if found != (CAMERAS, *self.image_size, 3):
-            wanted = "x".join(map(str, self.image_size))
-            raise TrainingError(
-                f"{file}: its cameras have {found[1]}x{found[2]} pixels, the model "
-                f"sees {wanted}: collect again"
-            )
-        self.pictures += pictures
-        return len(pictures)
+        self.shift_m: Floats = shift.mean(-1)
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -107,25 +79,23 @@ class Episodes:
 
     def departures(self) -> Floats:
         """[N, 6, 2] the expert's plans less going on at the speed of now."""
-        times = 0.5 * np.arange(1, self.moves.shape[1] + 1)
+        times = STEP_S * np.arange(1, self.moves.shape[1] + 1)
         speed = self.tables["can_bus"][:, 7, None]
         coasting = np.stack([speed * times, np.zeros_like(speed * times)], -1)
-        return self.moves - coasting
+        return np.asarray(self.moves - coasting)
 
     @cached_property
     def weights(self) -> Floats:
-        """How often a sample is drawn: more where the actors or a signal decide."""
-        command = self.tables["command"]
-        signals = self.tables["signals"]
-        line = (signals[..., 0] >= 0) & (np.abs(signals[..., 6]) < 25)
-        weight = 1.0 + 2.0 * (self.shift_m > 0.5) + 1.0 * (self.shift_m > 2.0)
-        weight += 1.0 * (command < 3) + 1.0 * (command > 3) + 1.0 * line.any(1)
+        """How often each sample is drawn: more where actors, turns or lines decide."""
+        command, signals = self.tables["command"], self.tables["signals"]
+        line = (signals[..., 0] >= 0) & (np.abs(signals[..., 6]) < LINE_NEAR_M)
+        weight = 1.0 + 2.0 * (self.shift_m > DECISIVE_M)
+        weight += 1.0 * (self.shift_m > VERY_DECISIVE_M)
+        weight += 1.0 * (command != FOLLOW) + 1.0 * line.any(1)
         return np.asarray(weight / weight.sum())
 
-    def draw(
-        self, rng: np.random.Generator, count: int, how: Sequences
-    ) -> npt.NDArray[np.int64]:
-        """[count, length] samples that follow each other."""
+    def draw(self, rng: np.random.Generator, count: int, how: Sequences) -> Indices:
+        """[count, length] samples of one episode each, in order."""
         stride = rng.choice(how.strides, count)
         last = rng.choice(len(self), count, p=self.weights)
         steps = np.arange(how.length) - (how.length - 1)
@@ -134,22 +104,23 @@ class Episodes:
         picked += np.maximum(self.first[last] - picked[:, 0], 0)[:, None]
         return np.asarray(np.minimum(picked, self.last[last][:, None]))
 
-    @cached_property
-    def first(self) -> npt.NDArray[np.int64]:
-        """First sample of the episode of every sample."""
-        ends = np.unique(self.last)
-        starts = np.concatenate([[0], ends[:-1] + 1])
-        return np.asarray(starts[np.searchsorted(ends, self.last)])
-
-    def images(self, picked: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+    def images(self, picked: Indices) -> Bytes:
         """[n] samples to uint8 [n, 6, H, W, 3]."""
         return np.stack([decode(self.pictures[i]) for i in picked])
 
-    def batch(self, picked: npt.NDArray[np.int64]) -> dict[str, Array]:
-        """Rows of [B, L] samples as [B, L, ...], the CAN bus completed."""
-        batch = {name: table[picked] for name, table in self.tables.items()}
-        batch["moves"] = self.moves[picked]
-        batch["shift_m"] = self.shift_m[picked]
+    def rows(self, picked: npt.NDArray[np.int64]) -> dict[str, Array]:
+        """Rows of [B] samples as [B, ...]."""
+        rows = {name: table[picked] for name, table in self.tables.items()}
+        return {**rows, "moves": self.moves[picked], "shift_m": self.shift_m[picked]}
+
+    def batch(self, picked: Indices) -> dict[str, Array]:
+        """Rows of [B, L] samples as [B, L, ...].
+
+        Besides `KEPT`: ``moves``, the expert's plan as metres along the route and to
+        the left of where the ego is beside it; ``shift_m``, how much the actors change
+        it. The CAN bus tells the way from the sample before in the sequence.
+        """
+        batch = self.rows(picked)
         batch["can_bus"] = _moved(batch["can_bus"], batch["pose"])
         return batch
 

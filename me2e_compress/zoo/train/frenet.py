@@ -3,10 +3,12 @@
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.zoo.highway.config import PATH_STEP_M
+
 Floats = npt.NDArray[np.floating]
 
-SPACING_M = 2.0
-"""Of the route's points."""
+ASIDE = 2.0
+"""A metre to the side counts as two along the route, as in the loss of the plan."""
 
 
 def project(points: Floats, path: Floats) -> Floats:
@@ -14,7 +16,7 @@ def project(points: Floats, path: Floats) -> Floats:
 
     Args:
         points: [N, T, 2] metres.
-        path: [N, P, 2] metres, `SPACING_M` apart.
+        path: [N, P, 2] metres, `PATH_STEP_M` apart.
 
     Returns:
         float32 [N, T, 2]: metres along the route, metres left of it.
@@ -25,7 +27,7 @@ def project(points: Floats, path: Floats) -> Floats:
     miss = away - share[..., None] * step
     distance = np.hypot(miss[..., 0], miss[..., 1])
     nearest = distance.argmin(-1)[..., None]
-    arc = (np.take_along_axis(share, nearest, -1) + nearest)[..., 0] * SPACING_M
+    arc = (np.take_along_axis(share, nearest, -1) + nearest)[..., 0] * PATH_STEP_M
     side = step[..., 0] * away[..., 1] - step[..., 1] * away[..., 0]
     sign = np.sign(
         np.take_along_axis(np.broadcast_to(side, distance.shape), nearest, -1)
@@ -45,7 +47,7 @@ def anchors_of(plans: Floats, count: int, rounds: int = 15) -> Floats:
     Returns:
         float32 [count, T, 2].
     """
-    scale = np.array([1.0, 2.0])
+    scale = np.array([1.0, ASIDE])
     rows = (plans * scale).reshape(len(plans), -1)
     chosen = [rows.mean(0)]
     nearest = ((rows - chosen[0]) ** 2).sum(1)
@@ -58,4 +60,4 @@ def anchors_of(plans: Floats, count: int, rounds: int = 15) -> Floats:
         owner = square.argmin(1)
         for k in np.unique(owner):
             centres[k] = rows[owner == k].mean(0)
-    return (centres.reshape(count, -1, 2) / scale).astype(np.float32)
+    return np.asarray(centres.reshape(count, -1, 2) / scale, np.float32)
