@@ -17,12 +17,13 @@ from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.cameras import CameraRig
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.stack import Highway
+from me2e_compress.zoo.train.cache import Cache
 from me2e_compress.zoo.train.check import validate
 from me2e_compress.zoo.train.data import Episodes, Sequences
 from me2e_compress.zoo.train.frenet import anchors_of
 from me2e_compress.zoo.train.losses import LampHead
 from me2e_compress.zoo.train.parent import end_with_parent
-from me2e_compress.zoo.train.step import Augmentation, run
+from me2e_compress.zoo.train.step import Augmentation, run, run_planner, total
 from me2e_compress.zoo.train.together import Together
 
 CLIP = 5.0
@@ -30,6 +31,8 @@ AVERAGED = 0.998
 """Decay of the running mean of the weights, which is what drives."""
 WEIGHT_DECAY = 1e-3
 WARM_UP = 100
+CACHED = 4
+"""The planner alone learns from so many times more samples a step."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,8 @@ class Training:
         seed: of everything random.
         save_every: steps between checkpoints.
         check_every: steps between looks at held-out samples.
-        modules: which learn; empty: all.
+        modules: which learn; empty: all. The planner alone learns from what the others
+            said once.
         sequences: how sequences are drawn.
         augmentation: what is made harder.
     """
@@ -145,6 +149,10 @@ class _Stage:
         )
         self.mean = {k: v.clone() for k, v in self.model.state_dict().items()}
         self._resume()
+        self.cache = None
+        if names == ("planner",) and self.step < what.steps:
+            self.model.eval()
+            self.cache = Cache.of(self.model, self.episodes, self.lidar2img)
 
     def _begin(self, start: Path | None) -> None:
         if start is not None:
@@ -191,21 +199,35 @@ class _Stage:
     def _learn(self) -> None:
         rng = np.random.default_rng([self.what.seed, self.step, self.rank])
         torch.manual_seed(int(rng.integers(2**31)))
+        losses = self._planner(rng) if self.cache else self._everything(rng)
+        self.optimizer.zero_grad()
+        total(losses).backward()
+        self._average_gradients()
+        torch.nn.utils.clip_grad_norm_(self.learning, CLIP)
+        self.optimizer.step()
+        self._note(losses)
+        if self.rank == 0:
+            self._follow()
+
+    def _everything(self, rng: np.random.Generator) -> dict[str, Tensor]:
+        """Losses of all modules on sequences."""
         picked = self.episodes.draw(rng, self.what.batch, self.what.sequences)
         images = self.episodes.images(picked.ravel())
         images = images.reshape(*picked.shape, *images.shape[1:])
         batch = self.episodes.batch(picked)
-        self.model.train()
         how = self.what.augmentation
+        self.model.train()
         outcome = run(self.model, self.lamps, images, batch, self.lidar2img, rng, how)
-        self.optimizer.zero_grad()
-        outcome.total().backward()
-        self._average_gradients()
-        torch.nn.utils.clip_grad_norm_(self.learning, CLIP)
-        self.optimizer.step()
-        self._note(outcome.losses)
-        if self.rank == 0:
-            self._follow()
+        return outcome.losses
+
+    def _planner(self, rng: np.random.Generator) -> dict[str, Tensor]:
+        """Losses of the planner on what the frozen modules once said."""
+        count = self.what.batch * self.what.sequences.length * CACHED
+        picked = self.episodes.draw(rng, count, Sequences(length=1))[:, 0]
+        batch = self.episodes.rows(picked)
+        self.model.eval().planner.train()
+        world = self.cache.world(picked)
+        return run_planner(self.model, world, batch, rng, self.what.augmentation)
 
     def _average_gradients(self) -> None:
         grads = [

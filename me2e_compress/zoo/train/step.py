@@ -1,5 +1,6 @@
 """One training step: sequences in, losses out."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,8 +8,8 @@ import torch
 from torch import Tensor
 
 from me2e_compress.zoo.highway.bev_encoder import motion_of
-from me2e_compress.zoo.highway.planner import Candidates, EgoState, World, world_of
 from me2e_compress.zoo.highway.stack import STOOD_S, Highway, Seen
+from me2e_compress.zoo.highway.world import Candidates, EgoState, World, world_of
 from me2e_compress.zoo.train.data import Array
 from me2e_compress.zoo.train.losses import (
     LampHead,
@@ -43,6 +44,7 @@ WEIGHTS = {
     "choice": 1.0,
     "bend": 1.0,
     "place": 0.5,
+    "safe": 3.0,
 }
 """Of the losses in their sum: each contributes between 0.1 and 1 after a while."""
 
@@ -54,8 +56,6 @@ class Augmentation:
     Attributes:
         light: spread of brightness and contrast.
         speed_mps: noise of the measured speed.
-        blind: share of samples whose acceleration and yaw rate read 0, so that what
-            the ego does is not taken for what it should do (de Haan et al., 2019).
         forget: share whose memory of standing is lost.
         hints: share whose agents are certainly among the queries.
         no_occ: share that plan on the mean occupancy, so that boxes are used too.
@@ -63,13 +63,12 @@ class Augmentation:
 
     light: float = 0.12
     speed_mps: float = 0.1
-    blind: float = 0.5
     forget: float = 0.1
     hints: float = 0.7
     no_occ: float = 0.2
 
 
-NONE = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NONE = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass
@@ -90,11 +89,34 @@ class Outcome:
     candidates: Candidates
     wanted: Targets
 
-    def total(self) -> Tensor:
-        """Weighted sum of the losses."""
-        return torch.stack(
-            [WEIGHTS[name] * loss for name, loss in self.losses.items()]
-        ).sum()
+
+def run_planner(
+    model: Highway,
+    world: World,
+    batch: dict[str, Array],
+    rng: np.random.Generator,
+    how: Augmentation,
+) -> dict[str, Tensor]:
+    """Run the planner alone on what the other modules said, and return its losses.
+
+    Args:
+        model: the stack.
+        world: of B samples.
+        batch: arrays [B, ...].
+        rng: for the augmentation.
+        how: what to make harder.
+    """
+    wanted = targets_of(batch, model.config.area)
+    with torch.autocast("cpu", torch.bfloat16):
+        ego = _ego(batch, rng, how)
+        damaged = _without_occ(world, rng, how)
+        candidates = model.planner.consider(damaged, ego, wanted.command)
+    return plan_losses(candidates, wanted, model.config.area)
+
+
+def total(losses: Mapping[str, Tensor]) -> Tensor:
+    """Weighted sum of losses."""
+    return torch.stack([WEIGHTS[name] * loss for name, loss in losses.items()]).sum()
 
 
 def run(
@@ -122,9 +144,9 @@ def run(
     count = len(wanted.command)
     calibration = lidar2img.expand(count, -1, -1, -1)
     with torch.autocast("cpu", torch.bfloat16):
-        fine, middle = model.look(_pixels(images, rng, how))
+        fine, middle = model.look(pixels_of(images, rng, how))
         now = model.bev_encoder.look(fine, calibration)
-        bev = model.bev_encoder.fuse(_remember(model, now.float(), batch))
+        bev = model.bev_encoder.fuse(remember(model, now.float(), batch))
         hints = _hints(wanted, model.config.area.cells, rng, how)
         seen = model.understand(bev, model.bev_encoder.tokens(bev), middle, hints)
         world = world_of(
@@ -141,7 +163,7 @@ def run(
         **map_losses(seen.road, wanted),
         **lamp_loss,
         **occ_losses(seen.occupancy, wanted),
-        **plan_losses(candidates, wanted),
+        **plan_losses(candidates, wanted, model.config.area),
     }
     return Outcome(losses, seen, world, candidates, wanted)
 
@@ -156,7 +178,8 @@ def _settled(world: World) -> World:
     )
 
 
-def _pixels(images: Array, rng: np.random.Generator, how: Augmentation) -> Tensor:
+def pixels_of(images: Array, rng: np.random.Generator, how: Augmentation) -> Tensor:
+    """uint8 [B, L, 6, H, W, 3] to the model's input [B * L, 6, 3, H, W]."""
     count = images.shape[0] * images.shape[1]
     pixels = torch.from_numpy(images).flatten(0, 1).permute(0, 1, 4, 2, 3)
     spread = rng.normal(0, how.light, (2, count, 6, 1, 1, 1))
@@ -165,7 +188,7 @@ def _pixels(images: Array, rng: np.random.Generator, how: Augmentation) -> Tenso
     return torch.addcmul(bias, pixels.float(), gain)
 
 
-def _remember(model: Highway, now: Tensor, batch: dict[str, Array]) -> Tensor:
+def remember(model: Highway, now: Tensor, batch: dict[str, Array]) -> Tensor:
     """Feed the memory forward: [B * L, C, ...] to [B * L, 2 C + 1, ...]."""
     encoder = model.bev_encoder
     times = torch.from_numpy(batch["time_us"].astype(np.float64) / 1e6).float()
@@ -199,7 +222,6 @@ def _ego(flat: dict[str, Array], rng: np.random.Generator, how: Augmentation) ->
     stood = torch.exp(torch.from_numpy(flat["rest_s"].astype(np.float32)) / -STOOD_S)
     count = len(bus)
     bus[:, 7] += torch.from_numpy(rng.normal(0, 1, count)).float() * how.speed_mps
-    bus[torch.from_numpy(rng.random(count) < how.blind), 10:16] = 0
     stood[torch.from_numpy(rng.random(count) < how.forget)] = 0
     return EgoState(bus, stood).features()
 

@@ -4,7 +4,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from me2e_compress.zoo.highway.planner import Candidates
+from me2e_compress.zoo.highway.config import STEP_S, STEPS, BevArea
+from me2e_compress.zoo.highway.costs import (
+    agent_costs,
+    between_travel,
+    beyond_lines,
+    discs_of,
+    ground,
+    swept,
+)
+from me2e_compress.zoo.highway.world import Candidates
 from me2e_compress.zoo.train.targets import Targets
 
 NEAR_STEPS = (3.0, 2.0, 1.5, 1.0, 0.75, 0.75)
@@ -17,12 +26,15 @@ DECISIVE = 2.0
 """Extra weight of samples where the actors change the plan."""
 
 
-def plan_losses(candidates: Candidates, wanted: Targets) -> dict[str, Tensor]:
-    """Choice, and the distance of the right candidate.
+def plan_losses(
+    candidates: Candidates, wanted: Targets, area: BevArea
+) -> dict[str, Tensor]:
+    """Choice, the distance of the right candidate, and what the choice would hit.
 
     Args:
         candidates: of the planner.
         wanted: labels.
+        area: of the bird's-eye view.
     """
     steps = torch.tensor(NEAR_STEPS) / sum(NEAR_STEPS)
     side = torch.tensor([1.0, ASIDE])
@@ -37,13 +49,49 @@ def plan_losses(candidates: Candidates, wanted: Targets) -> dict[str, Tensor]:
     rows = torch.arange(len(best))
     bend = ((candidates.moves[rows, best] - wanted.moves).abs() * side).sum(-1) @ steps
     place = (candidates.plans[rows, best] - wanted.plan).abs().sum(-1) @ steps
+    harm = true_harm(candidates, wanted, area)
+    more = (harm - harm[rows, best][:, None]).clamp(min=0)
     return {
         "choice": (choice * weight).mean(),
         "bend": (bend * weight).mean(),
         "place": (place * weight).mean(),
+        "safe": (candidates.logits.softmax(-1) * more).sum(-1).mean(),
     }
+
+
+@torch.no_grad()
+def true_harm(candidates: Candidates, wanted: Targets, area: BevArea) -> Tensor:
+    """[B, K] what each candidate would have met (rules as targets: Hydra-MDP, 2024).
+
+    Overlap with where everybody really was, ground that is no road, lines of lights
+    that are not green.
+
+    Args:
+        candidates: of the planner.
+        wanted: labels.
+        area: of the bird's-eye view.
+    """
+    plans, headings = candidates.plans.detach(), candidates.headings.detach()
+    agents = wanted.agents
+    columns = [1, 2, 5, 6, 3, 4, 7, 8]
+    drift = agents[:, :, None, 7:9] * STEP_S * torch.arange(1, 1 + STEPS)[:, None]
+    travel = torch.where(wanted.travel_known[..., None], wanted.travel, drift)
+    overlap, _ = agent_costs(
+        swept(plans, headings),
+        agents[..., columns],
+        wanted.there.float(),
+        between_travel(travel[:, :, None]),
+        torch.ones_like(agents[..., :1]),
+    )
+    under = ground(discs_of(plans, headings), wanted.raster, area)
+    beside = (1 - under[..., 0] - under[..., 1]).clamp(min=0).amax(-1)
+    there, gap, state = wanted.signals[:, 0].unbind(-1)
+    closed = there * ((state == 0) | (state == 1))
+    past = beyond_lines(candidates.moves[..., 0].detach(), gap[:, None]).amax(2)[..., 0]
+    return overlap.amax(-1) + beside + past * closed[:, None]
 
 
 def displacement(plans: Tensor, wanted: Targets) -> Tensor:
     """[B] mean distance of plans [B, 6, 2] from the expert's, metres."""
-    return (plans - wanted.plan).norm(dim=-1).mean(-1)
+    away: Tensor = (plans - wanted.plan).norm(dim=-1)
+    return away.mean(-1)
