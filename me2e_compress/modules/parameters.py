@@ -50,6 +50,7 @@ def by_parameter(
             if value is not None
             and (module := _claim(value, claims, modules, by_scope)) is not None
         ]
+        votes = _copied(node, modules, constant) or votes
         if votes:
             placed[node] = votes[0]
         if node in constant:
@@ -60,6 +61,20 @@ def by_parameter(
             if module is not None:
                 placed[node] = module
     return placed
+
+
+def _copied(
+    node: ir.Node, modules: ModuleMap, constant: Collection[ir.Node]
+) -> list[str]:
+    """Name the module of a parameter that is stored as a copy of an equal one.
+
+    TorchScript's exporter writes parameters of equal numbers once, and the others as
+    an Identity of it that has their name.
+    """
+    if node.op_type != "Identity" or node not in constant:
+        return []
+    module = modules.match(parameter_path(node.outputs[0].name))
+    return [] if module is None else [module]
 
 
 def _claim(

@@ -10,6 +10,7 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Substitute
 from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.glue import hand_over
 from me2e_compress.passes.means import means_of
 from me2e_compress.passes.stand_ins import (
     constant_like,
@@ -34,8 +35,9 @@ class AblateModules:
     one scope takes the place of another's (without the map, the ego query keeps what it
     knew of the agents). Whatever else leaves a dropped module is then zeros of its
     shape; with ``fill="means"``, what it is on average over the context's frames, so
-    that the others read nothing that they never saw. Everything that became dead is
-    swept, in other modules too.
+    that the others read nothing that they never saw. What only lays out anew a value of
+    a module that stays (a cast that two modules share) is handed to its readers.
+    Everything that became dead is swept, in other modules too.
 
     Attributes:
         drop: the modules to remove.
@@ -77,6 +79,7 @@ class AblateModules:
             result_of(model, pattern)
         graph.infer_shapes(model)
         before = graph.node_count(model)
+        hand_over(model, self._goes)
         gone = self._cut_outputs(model)
         notes = [f"output removed: {name}" for name in gone]
         if self.fill == "substitute":

@@ -201,3 +201,18 @@ def test_a_graph_without_any_name_is_one_module() -> None:
     )
     placed = assign(model, ModuleMap.whole())
     assert [placed.module_of(node) for node in model.graph] == ["model", "model"]
+
+
+def test_a_copy_of_an_equal_parameter_goes_by_its_own_name() -> None:
+    """What the exporter writes where a norm of ``det`` has the numbers of ``neck``."""
+    model = read(
+        "(float[2] x) => (float[2] y) <float[2] neck__scale = {1.0, 1.0}>",
+        '["Identity_7"] det__scale = Identity(neck__scale)'
+        ' ["/neck/Mul"] n = Mul(x, neck__scale) ["/det/Mul"] y = Mul(n, det__scale)',
+    )
+    model.graph[0].outputs[0].name = "det.scale"
+    assert placed(assign(model, MAP)) == {
+        "det.scale": ("det", "parameter"),
+        "n": ("neck", "parameter"),
+        "y": ("det", "parameter"),
+    }

@@ -316,3 +316,30 @@ def test_shapes_have_no_mean(recording: CalibrationSet) -> None:
 
     with pytest.raises(PreconditionError, match="size is arithmetic on shapes"):
         chosen.run(net(text, {}), replace(context(), frames=recording))
+
+
+SHARED = STACK.replace(
+    '["/map/Neg"] m = Neg(f)',
+    '["/map/Cast"] c = Cast <to = 1> (f)\n["/map/Flatten"] g = Flatten(c)\n'
+    '["/map/Neg"] m = Neg(g)',
+).replace("met = Sqrt(agents)", "met = Add(agents, g)")
+
+
+def test_a_cast_that_another_module_shares_stays() -> None:
+    """The planner reads features through a cast and a reshape in the map's scope."""
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    result = chosen.run(net(SHARED, {}), context())
+
+    assert plan_of(result.model) == [1, 1, 9, 19]
+    assert {provenance.module_of(node) for node in result.model.graph} == {
+        *("backbone", "agents", "planner")
+    }
+    assert [note for note in result.notes if "g reads" in note] == []
+
+
+def test_a_layout_of_its_own_results_goes(stack: ir.Model) -> None:
+    """``lanes`` is a reshape too, of what the map itself made."""
+    chosen = AblateModules(drop=("map",), drop_outputs=True)
+
+    assert "lanes reads as zeros" in chosen.run(stack, context()).notes
