@@ -6,11 +6,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from me2e_compress.evaluators.highway.cameras import PixelClass
 from me2e_compress.zoo.highway.config import SIGNAL_KINDS, BevArea
-from me2e_compress.zoo.train.data import Array
+from me2e_compress.zoo.train.stored import Array
 
 SIGNAL_SEEN_M = (-3.0, 40.0)
-"""A signal is there if its line is this far from the ego's centre."""
+"""A signal is there if its line is this far from the ego's centre: a lamp farther than
+that is under two pixels wide, and behind the front axle nobody stops for it."""
+WIDEST_M = 12.0
+"""More free road to a side than three lanes is as good as three lanes."""
+ROAD = (
+    PixelClass.DRIVABLE,
+    PixelClass.LANE_MARKING,
+    PixelClass.STOP_LINE,
+    PixelClass.CROSSWALK,
+)
+"""What a lane is made of."""
 
 
 @dataclass
@@ -70,7 +81,7 @@ def targets_of(batch: dict[str, Array], area: BevArea) -> Targets:
     shape = (*bits.shape[:2], 2 * area.rows, 2 * area.columns)
     steps = torch.from_numpy(np.asarray(batch["known_steps"], np.int64))
     attributes = _tensor(batch["path_attributes"])
-    attributes[..., :3].clamp_(max=12.0)
+    attributes[..., :3].clamp_(max=WIDEST_M)
     return Targets(
         agents,
         agents[..., 0] >= 0,
@@ -93,8 +104,12 @@ def targets_of(batch: dict[str, Array], area: BevArea) -> Targets:
 
 def raster_of(ground: Tensor) -> Tensor:
     """Classes [B, H, W] of `PixelClass` to road, shoulder, marking, stop line."""
-    road = (ground >= 3) & (ground <= 6)
-    layers = [road, ground == 2, ground == 4, ground == 5]
+    layers = [
+        torch.isin(ground, torch.tensor(ROAD)),
+        ground == PixelClass.SHOULDER,
+        ground == PixelClass.LANE_MARKING,
+        ground == PixelClass.STOP_LINE,
+    ]
     return torch.stack(layers, 1).float()
 
 

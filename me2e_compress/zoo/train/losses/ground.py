@@ -8,7 +8,14 @@ from me2e_compress.zoo.highway.map import GAP_SCALE_M, RoadMap
 from me2e_compress.zoo.train.targets import Targets
 
 ATTRIBUTE_SCALE = (4.0, 4.0, 4.0, 5.0)
+"""What each attribute's error is measured in: three widths in wide lanes (m), the
+speed in steps of 5 m/s."""
 FAR_M = 5.0
+"""Beyond this a point of a route is far off, and farther is hardly worse."""
+NEAR_WEIGHT, FAR_WEIGHT = 2.0, 0.5
+"""Of the first and the last point of a route: the next plan drives on the first."""
+ROUGH = 0.3
+"""Share of the route before it is refined."""
 RARE = 4.0
 """Weight of occupied cells: few are."""
 
@@ -16,7 +23,7 @@ RARE = 4.0
 def map_losses(road: RoadMap, wanted: Targets) -> dict[str, Tensor]:
     """The commanded route, its attributes, the raster, the signals."""
     rows = torch.arange(len(wanted.command))
-    near = torch.linspace(2.0, 0.5, wanted.path.shape[1])[:, None]
+    near = torch.linspace(NEAR_WEIGHT, FAR_WEIGHT, wanted.path.shape[1])[:, None]
     path = wanted.path
     fine = _soft((road.paths[rows, wanted.command] - path).abs()) * near
     rough = _soft((road.rough[rows, wanted.command] - path).abs()) * near
@@ -31,7 +38,7 @@ def map_losses(road: RoadMap, wanted: Targets) -> dict[str, Tensor]:
         signals[:, 0, 2:][light], state[:, 0][light].long(), reduction="sum"
     )
     return {
-        "path": fine.mean() + 0.3 * rough.mean(),
+        "path": fine.mean() + ROUGH * rough.mean(),
         "heading": _turned(road.headings[rows, wanted.command], path),
         "attributes": ((said - wanted.attributes) / scale).abs().mean(),
         "raster": functional.binary_cross_entropy_with_logits(

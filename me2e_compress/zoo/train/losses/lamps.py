@@ -12,8 +12,14 @@ KINDS = 5
 """Red, yellow, green lamp, stop sign, give-way sign."""
 HEIGHT_M = 2.15
 """Middle of a lamp's housing and of a sign."""
-FARTHEST_M = 45.0
+NEAREST_M, FARTHEST_M = 1.0, 45.0
+"""Nearer a lamp is above the image, farther it is less than two pixels wide."""
 STRIDE = 4
+"""Of the features, in pixels."""
+RARE = -4.0
+"""First logit: nearly every cell shows none (Lin et al., RetinaNet, 2017)."""
+HALO = 0.8
+"""How far the eight cells around a lamp are forgiven."""
 
 
 class LampHead(nn.Module):
@@ -22,8 +28,7 @@ class LampHead(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.head = nn.Conv2d(channels, KINDS, 1)
-        assert self.head.bias is not None
-        nn.init.constant_(self.head.bias, -4.0)
+        nn.init.constant_(self.head.get_parameter("bias"), RARE)
 
     def forward(
         self, features: Tensor, lidar2img: Tensor, wanted: Targets
@@ -37,7 +42,7 @@ class LampHead(nn.Module):
         """
         logits = self.head(features).float()
         peaks = _peaks(lidar2img, wanted.lamps, logits.shape)
-        halo = functional.max_pool2d(peaks, 3, 1, 1) * 0.8
+        halo = functional.max_pool2d(peaks, 3, 1, 1) * HALO
         return {"lamp": focal(logits, peaks, halo)}
 
 
@@ -54,7 +59,7 @@ def _peaks(lidar2img: Tensor, lamps: Tensor, shape: torch.Size) -> Tensor:
     depth = seen[..., 2]
     column = (seen[..., 0] / depth.clamp(min=0.3) / STRIDE).floor().long()
     row = (seen[..., 1] / depth.clamp(min=0.3) / STRIDE).floor().long()
-    ok = (kind >= 0)[:, None] & (depth > 1.0) & (depth < FARTHEST_M)
+    ok = (kind >= 0)[:, None] & (depth > NEAREST_M) & (depth < FARTHEST_M)
     # a lamp faces the traffic that must obey: from behind it shows nothing
     ok &= (lamps[..., 4] > 0)[:, None]
     ok &= (column >= 0) & (column < columns) & (row >= 0) & (row < rows)

@@ -11,6 +11,9 @@ from me2e_compress.zoo.train.losses.focal import focal
 from me2e_compress.zoo.train.targets import Targets
 
 HALO = 0.7
+"""How far the eight cells around an agent's are forgiven."""
+SPEED_STEP_MPS = 5.0
+"""An error of the velocity counts in steps of this, beside metres of the place."""
 NEAR_M = 4.0
 """A query this far from an agent cannot be its."""
 
@@ -50,12 +53,19 @@ def track_losses(
     aims = torch.stack(
         [
             *(picked[:, 1], picked[:, 2], picked[:, 5].log(), picked[:, 6].log()),
-            *(picked[:, 3], picked[:, 4], picked[:, 7] / 5, picked[:, 8] / 5),
+            *(picked[:, 3], picked[:, 4]),
+            *(picked[:, 7] / SPEED_STEP_MPS, picked[:, 8] / SPEED_STEP_MPS),
         ],
         -1,
     )
     said = torch.cat(
-        [boxes[:, :2], boxes[:, 2:4].log(), boxes[:, 4:6], boxes[:, 6:8] / 5], -1
+        [
+            boxes[:, :2],
+            boxes[:, 2:4].log(),
+            boxes[:, 4:6],
+            boxes[:, 6:8] / SPEED_STEP_MPS,
+        ],
+        -1,
     )
     count = mine.sum().clamp(min=1)
     return {
