@@ -1,9 +1,10 @@
 """The file that drives: given, or made by passes once and kept."""
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic import BaseModel, ValidationError
 
 from me2e_compress import __version__, graph
 from me2e_compress.calibration.dataset import CalibrationSet
@@ -26,7 +27,8 @@ class Contender:
         scheme: Which.
         driver: What drives.
         model: The ONNX file; None for a driver without one.
-        pipeline: What made it of the source, as text; empty if nothing did.
+        source: Name of the file that passes were applied to.
+        pipeline: The passes, as text; empty if the model is its own source.
         sha256: Of the model.
         size_bytes: Of the model with its weights.
     """
@@ -34,6 +36,7 @@ class Contender:
     scheme: Scheme
     driver: Driver
     model: Path | None = None
+    source: str = ""
     pipeline: str = ""
     sha256: str | None = None
     size_bytes: int | None = None
@@ -61,21 +64,32 @@ def contend(
     driver = Driver(str(model), scheme.adapter)
     driver.open()
     sha256 = graph.sha256_of(model)
-    pipeline = to_text(scheme.passes) or _told_beside(model, sha256)
-    return Contender(scheme, driver, model, pipeline, sha256, graph.file_bytes(model))
+    origin = source.name, to_text(scheme.passes)
+    if not scheme.passes:
+        origin = _told_beside(model, sha256) or origin
+    return Contender(scheme, driver, model, *origin, sha256, graph.file_bytes(model))
 
 
-def _told_beside(model: Path, sha256: str) -> str:
-    """Read what made a file from the report beside it, if it is of this very file."""
+def _told_beside(model: Path, sha256: str) -> tuple[str, str] | None:
+    """Read source and passes from the report beside a file, if it is of this file."""
     path = model.with_name(f"{model.stem}.report.json")
     try:
-        report = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return ""
-    if not isinstance(report, dict) or not isinstance(report.get("output"), dict):
-        return ""
-    same = report["output"].get("sha256") == sha256
-    return str(report.get("pipeline", "")) if same else ""
+        report = _Report.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError):
+        return None
+    same = report.output.sha256 == sha256
+    return (report.source.file, report.pipeline) if same else None
+
+
+class _File(BaseModel):
+    file: str
+    sha256: str
+
+
+class _Report(BaseModel):
+    source: _File
+    output: _File
+    pipeline: str
 
 
 def _compressed(

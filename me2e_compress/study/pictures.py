@@ -15,8 +15,8 @@ from me2e_compress.study.drives import Drive, Road
 from me2e_compress.study.models import Contender
 from me2e_compress.study.routes import RouteOutcome
 
-MOVED_M = 0.5
-"""Two drives of one score that were never farther apart look the same."""
+SCORED, MOVED_M = 1.0, 0.5
+"""Two drives whose scores are closer, and that were never farther apart, look alike."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class _Pair:
     def differs(self) -> bool:
         """A drive without frames hung or crashed: it has nothing to show."""
         seen = bool(self.route.duration_us and self.other.duration_us)
-        return seen and (self.gap > 0.0 or (self.other.apart_m or 0.0) > MOVED_M)
+        return seen and (self.gap >= SCORED or (self.other.apart_m or 0.0) > MOVED_M)
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -67,7 +67,7 @@ class _Pair:
     @property
     def moment_us(self) -> int:
         """When the worse one did what the other did not; else when they were apart."""
-        if not self.gap and self.other.apart_us is not None:
+        if self.gap < SCORED and self.other.apart_us is not None:
             return self.other.apart_us
         worse, better = self.route, self.other
         if worse.driving_score > better.driving_score:

@@ -116,6 +116,8 @@ def test_what_made_a_file_is_read_from_the_report_beside_it(
     assert first.model is not None
     plain = dataclasses.replace(study, schemes=(Scheme("minus-occ", str(first.model)),))
 
-    assert made(plain, tmp_path).pipeline == first.pipeline
+    found = made(plain, tmp_path)
+
+    assert (found.source, found.pipeline) == ("m.onnx", first.pipeline)
     write_model(first.model, seed=3)
     assert made(plain, tmp_path).pipeline == ""

@@ -13,7 +13,7 @@ from me2e_compress.study import Condition, Outcome
 from me2e_compress.study.report import html
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
-from me2e_compress.study.report.findings import TIMES, findings
+from me2e_compress.study.report.findings import TIMES, findings, sure
 from me2e_compress.study.write import write
 from tests.study.conftest import IDEAL, SLOW
 
@@ -117,6 +117,16 @@ def test_findings_give_costs_and_what_is_sure(found: Outcome) -> None:
     assert told["again"].startswith(f"1.00 {TIMES} the size, ")
     assert "ideal: driving score +0.0 points (+0.0 to +0.0), no differ" in told["again"]
     assert "size" not in told["blind"]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "sign"),
+    [(0.2, 3.0, 1), (-3.0, -0.2, -1), (-1.0, 1.0, 0), (-0.04, -0.01, 0), (0.0, 0.0, 0)],
+)
+def test_what_is_shown_as_zero_is_no_difference(
+    low: float, high: float, sign: int
+) -> None:
+    assert sure(Estimate(Measure(low, "points"), low, high, 9)) == sign
 
 
 def test_files_are_written_beside_each_other(found: Outcome, tmp_path: Path) -> None:

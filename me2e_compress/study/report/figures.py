@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.report.findings import sure
 from me2e_compress.study.report.labels import place
 from me2e_compress.study.report.style import (
     ACCENT,
@@ -170,8 +171,7 @@ def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
     axes.axvline(0.0, color=INK, linewidth=0.8)
     for row, estimate in enumerate(found):
         low, high = estimate.low, estimate.high
-        sure = low is not None and high is not None and (low > 0.0 or high < 0.0)
-        colour = ACCENT if sure else MUTED
+        colour = ACCENT if sure(estimate) else MUTED
         if low is not None and high is not None:
             axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
         axes.plot(estimate.value or 0.0, row, "o", color=colour, markersize=5)

@@ -63,9 +63,17 @@ def _road(drive: Drive, several: bool) -> str:
     return f"{where}driving score {value} points ({low} to {high}), {_verdict(found)}"
 
 
+def sure(found: Estimate) -> int:
+    """Give the sign of a difference that is sure, 0 where none is.
+
+    Judged as it is shown, to a tenth of a point: what rounds to zero is no difference.
+    """
+    if found.low is not None and round(found.low, 1) > 0.0:
+        return 1
+    if found.high is not None and round(found.high, 1) < 0.0:
+        return -1
+    return 0
+
+
 def _verdict(found: Estimate) -> str:
-    if found.low is not None and found.low > 0.0:
-        return "better"
-    if found.high is not None and found.high < 0.0:
-        return "worse"
-    return "no difference shown"
+    return {1: "better", -1: "worse", 0: "no difference shown"}[sure(found)]

@@ -119,14 +119,12 @@ def _fate(route: RouteOutcome) -> str:
 
 
 def _recipe(name: str, outcome: Outcome) -> tuple[str, str, str]:
+    """Give name, what it was made of, and the first digits of its digest."""
     contender = outcome.scheme(name).contender
-    source = Path(contender.scheme.policy).name
-    digest = (contender.sha256 or "")[:12]
-    return (
-        name,
-        f"{source} → {contender.pipeline}" if contender.pipeline else source,
-        (digest),
-    )
+    made_of = contender.source or contender.scheme.policy
+    if contender.pipeline:
+        made_of = f"{made_of} → {contender.pipeline}"
+    return name, made_of, (contender.sha256 or "")[:12]
 
 
 def _made(outcome: Outcome, command: Sequence[str]) -> list[tuple[str, str]]:
