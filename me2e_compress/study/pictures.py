@@ -55,10 +55,13 @@ class _Pair:
         return abs(self.route.driving_score - self.other.driving_score)
 
     @property
-    def differs(self) -> bool:
+    def seen(self) -> bool:
         """A drive without frames hung or crashed: it has nothing to show."""
-        seen = bool(self.route.duration_us and self.other.duration_us)
-        return seen and (self.gap >= SCORED or (self.other.apart_m or 0.0) > MOVED_M)
+        return bool(self.route.duration_us and self.other.duration_us)
+
+    @property
+    def differs(self) -> bool:
+        return self.gap >= SCORED or (self.other.apart_m or 0.0) > MOVED_M
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -128,7 +131,9 @@ def _chosen(baseline: str, drives: Sequence[Drive], limit: int) -> list[_Pair]:
             references[drive.condition].routes, drive.routes, strict=True
         )
     ]
-    ranked = sorted((pair for pair in pairs if pair.differs), key=lambda p: p.rank)
+    ranked = sorted((pair for pair in pairs if pair.seen), key=lambda p: p.rank)
+    # Where all look alike, one picture shows just that.
+    ranked = [pair for pair in ranked if pair.differs] or ranked[:1]
     chosen = list[_Pair]()
     for others_only in (True, False):
         for pair in ranked:

@@ -105,7 +105,8 @@ def _shown(contrast: Contrast, baseline: str) -> Shown:
     route = contrast.route
     return Shown(
         f"{route.scenario}, {contrast.condition}, "
-        f"{contrast.time_us / 1e6:.1f} s into the route {route.route}",
+        f"{contrast.time_us / 1e6:.1f} s into the route {route.route}; "
+        f"at most {contrast.other.apart_m or 0.0:.1f} m apart",
         (f"{baseline}: {_fate(route)}", _data_uri(contrast.before)),
         (f"{contrast.scheme}: {_fate(contrast.other)}", _data_uri(contrast.after)),
     )
