@@ -15,7 +15,7 @@ COUNTED = (aten.convolution, aten.mm, aten.addmm, aten.bmm, aten.baddbmm)
 FLOPS_PER_MAC = 2
 
 
-class MacCounter(TorchDispatchMode):  # type: ignore[no-untyped-call]
+class MacCounter(TorchDispatchMode):
     """Tell a function the multiply-accumulates of every product that runs inside."""
 
     def __init__(self, add: Callable[[int], None]) -> None:

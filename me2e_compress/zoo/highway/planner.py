@@ -82,7 +82,7 @@ class Planner(nn.Module):
         self.refine = mlp(channels, channels, STEPS * 2)
         self.score = mlp(channels + COSTS, 128, 64, 1)
         self.penalty = mlp(EGO_FEATURES, 16, 4)
-        nn.init.constant_(self.penalty[-1].bias, CAUTION)
+        nn.init.constant_(self.penalty.get_parameter("2.bias"), CAUTION)
 
     def forward(
         self,

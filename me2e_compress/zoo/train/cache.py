@@ -9,7 +9,7 @@ from torch import Tensor
 
 from me2e_compress.zoo.highway.stack import Highway
 from me2e_compress.zoo.highway.world import World, world_of
-from me2e_compress.zoo.train.data import Episodes
+from me2e_compress.zoo.train.data import Episodes, Indices
 from me2e_compress.zoo.train.step import NONE, pixels_of, remember
 
 GRIDS = ("raster", "occupancy")
@@ -37,14 +37,17 @@ class Cache:
             episodes: all samples.
             lidar2img: [6, 4, 4].
         """
-        parts: dict[str, list[Tensor]] = {}
+        rows: dict[str, Tensor] = {}
         for last in np.unique(episodes.last):
             picked = np.nonzero(episodes.last == last)[0]
-            for name, row in _episode(model, episodes, picked, lidar2img).items():
-                parts.setdefault(name, []).append(row)
-        return cls({name: torch.cat(rows) for name, rows in parts.items()})
+            for name, part in _episode(model, episodes, picked, lidar2img).items():
+                if name not in rows:
+                    shape = (len(episodes), *part.shape[1:])
+                    rows[name] = torch.empty(shape, dtype=part.dtype)
+                rows[name][torch.from_numpy(picked)] = part
+        return cls(rows)
 
-    def world(self, picked: np.ndarray) -> World:  # type: ignore[type-arg]
+    def world(self, picked: Indices) -> World:
         """The worlds of [B] samples."""
         index = torch.from_numpy(picked)
         found = {}
@@ -58,7 +61,7 @@ class Cache:
 def _episode(
     model: Highway,
     episodes: Episodes,
-    picked: np.ndarray,  # type: ignore[type-arg]
+    picked: Indices,
     lidar2img: Tensor,
 ) -> dict[str, Tensor]:
     batch = episodes.batch(picked[None])

@@ -10,7 +10,6 @@ from torch import Tensor
 from me2e_compress.zoo.highway.bev_encoder import motion_of
 from me2e_compress.zoo.highway.stack import STOOD_S, Highway, Seen
 from me2e_compress.zoo.highway.world import Candidates, EgoState, World, world_of
-from me2e_compress.zoo.train.data import Array
 from me2e_compress.zoo.train.losses import (
     LampHead,
     map_losses,
@@ -20,6 +19,7 @@ from me2e_compress.zoo.train.losses import (
     track_losses,
 )
 from me2e_compress.zoo.train.losses.track import match
+from me2e_compress.zoo.train.stored import Array
 from me2e_compress.zoo.train.targets import Targets, targets_of
 
 MEAN, STD = 110.0, 60.0

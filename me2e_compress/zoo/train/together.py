@@ -18,7 +18,7 @@ PATIENCE_S = 900.0
 
 @dataclass
 class Together:
-    """One row of shared memory a process, and a barrier.
+    """One row of shared memory a process, a barrier, and how far they are.
 
     Loopback sockets, which torch.distributed would use, cost more than the step on
     machines that emulate them.
@@ -26,10 +26,12 @@ class Together:
     Attributes:
         rows: float32 [processes, numbers].
         barrier: all processes meet here.
+        steps: int64 [1], what the first of them has told.
     """
 
     rows: Tensor
     barrier: Barrier
+    steps: Tensor
 
     @classmethod
     def of(cls, workers: int, config: HighwayConfig) -> Self:
@@ -37,7 +39,8 @@ class Together:
         modules = (Highway(config), LampHead(config.channels))
         size = sum(p.numel() for module in modules for p in module.parameters())
         rows = torch.zeros(workers, size).share_memory_()
-        return cls(rows, mp.get_context("spawn").Barrier(workers))
+        steps = torch.zeros(1, dtype=torch.int64).share_memory_()
+        return cls(rows, mp.get_context("spawn").Barrier(workers), steps)
 
     def mean(self, rank: int, mine: Tensor) -> Tensor:
         """Average one flat tensor over the processes; every process must call."""
@@ -47,3 +50,11 @@ class Together:
         found = self.rows[:, :count].mean(0)
         self.barrier.wait(PATIENCE_S)
         return found
+
+    def tell(self, step: int) -> None:
+        """Let the process that started the others know how many steps are done."""
+        self.steps[0] = step
+
+    def told(self) -> int:
+        """How many steps are done."""
+        return int(self.steps[0])

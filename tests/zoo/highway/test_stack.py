@@ -1,6 +1,5 @@
 """The driver's network: what it exports is what it computes."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -51,10 +50,8 @@ def model() -> Highway:
 
 
 @pytest.fixture(scope="module")
-def exported(
-    model: Highway, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Path]:
-    yield write(model, tmp_path_factory.mktemp("highway") / "highway.onnx")
+def exported(model: Highway, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(model, tmp_path_factory.mktemp("highway") / "highway.onnx")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -90,14 +87,14 @@ def test_memory_is_by_time_and_not_by_frames(model: Highway) -> None:
     encoder = model.bev_encoder
     now = torch.randn(1, 64, 32, 24)
     still = motion_of(torch.zeros(1, 18), torch.zeros(1))
-    memories = []
+    memories = list[torch.Tensor]()
     for count in (4, 8):
         memory = torch.zeros(1, 768, 65)
         for _ in range(count):
             recalled = encoder.recall(memory, still)
             _, memory = encoder.remember(now, recalled, torch.tensor([0.8 / count]))
         memories.append(memory)
-    assert torch.allclose(*memories, atol=1e-5)
+    assert torch.allclose(memories[0], memories[1], atol=1e-5)
 
 
 def test_memory_follows_the_ground_when_the_ego_moves(model: Highway) -> None:

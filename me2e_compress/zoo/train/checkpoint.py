@@ -1,0 +1,96 @@
+"""What training has come to, in one file."""
+
+import os
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.errors import TrainingError
+
+Weights = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Everything that going on needs.
+
+    Attributes:
+        model: weights and buffers that learn.
+        mean: their running mean, which drives.
+        lamps: of the extra head.
+        optimizer: its state.
+        step: optimizer steps taken.
+        what: the `Training` as JSON.
+    """
+
+    model: Weights
+    mean: Weights
+    lamps: Weights
+    optimizer: dict[str, Any]
+    step: int
+    what: str
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a checkpoint.
+
+        Raises:
+            TrainingError: it is none.
+        """
+        try:
+            found = torch.load(path, weights_only=True)
+            return cls(**{field.name: found[field.name] for field in fields(cls)})
+        except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
+            first = str(error).splitlines()[0] if str(error) else "it is empty"
+            raise TrainingError(f"{path}: not a checkpoint: {first}") from error
+        except (KeyError, IndexError, TypeError) as error:
+            raise TrainingError(
+                f"{path}: not a checkpoint of training: it lacks {error}"
+            ) from error
+
+    def save(self, path: Path) -> None:
+        """Write it in one step.
+
+        Raises:
+            TrainingError: it cannot be written.
+        """
+        draft = path.with_name(f".{path.name}")
+        try:
+            torch.save(
+                {field.name: getattr(self, field.name) for field in fields(self)}, draft
+            )
+            os.replace(draft, path)
+        except (OSError, RuntimeError) as error:
+            first = str(error).splitlines()[0]
+            raise TrainingError(f"{path}: cannot be written: {first}") from error
+
+
+def fit(module: nn.Module, weights: Weights, path: Path) -> None:
+    """Give a module the weights of a checkpoint.
+
+    Args:
+        module: that takes them.
+        weights: by the names of its state.
+        path: of the checkpoint, for the message.
+
+    Raises:
+        TrainingError: they are of another model.
+    """
+    wanted = module.state_dict()
+    for name in sorted({*wanted, *weights}):
+        there = [
+            None if name not in state else list(state[name].shape)
+            for state in (weights, wanted)
+        ]
+        if there[0] != there[1]:
+            found, own = ("missing" if one is None else str(one) for one in there)
+            raise TrainingError(
+                f"{path}: a checkpoint of another model: {name} is {found} in it, "
+                f"{own} in this one"
+            )
+    module.load_state_dict(weights)
