@@ -14,7 +14,7 @@ from me2e_compress.calibration.rules import paper_rules
 from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.passes.base import Context, PassResult
-from me2e_compress.targets.tensorrt import place_qdq
+from me2e_compress.targets.tensorrt import place
 
 QUANTIZED_OPS = frozenset(
     {
@@ -70,7 +70,7 @@ class QuantizeInt8:
         if not tensors:
             return PassResult(model, 0, ("nothing to quantize", *_notes(plan)))
         ranges = self._ranges(model, tensors, context)
-        placed = place_qdq(model, plan, ranges)
+        placed = place(model, plan, ranges)
         notes = (*_notes(plan), *_findings(ranges))
         return PassResult(placed, len(plan.chosen), notes)
 

@@ -14,7 +14,7 @@ from me2e_compress.calibration.weights import quantize_weight
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.runtime.session import run_once
-from me2e_compress.targets.tensorrt import place_qdq
+from me2e_compress.targets.tensorrt import place
 from tests.nets import MODULES, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)
@@ -47,7 +47,7 @@ def layers(seed: int = 0, opset: int = 17) -> ir.Model:
 def placed(model: ir.Model, reach: float = 3.0) -> ir.Model:
     plan = make_plan(model, FULL)
     tensors = dict.fromkeys(tensors_of(plan, model), (-reach, reach / 2))
-    return place_qdq(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+    return place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 
 
 def test_weights_are_stored_as_int8_along_their_channels() -> None:
