@@ -44,14 +44,18 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     left, right = static_shape(node.inputs[0]), static_shape(node.inputs[1])
     if node.op_type == "Gemm":
         return _gemm(node, left, right)
-    columns = None if right is None else (right[-1] if len(right) > 1 else 1)
-    depth = right[-2 if len(right) > 1 else -1] if right else None
-    if left is None:
+    columns, depth = (None, None) if right is None else _sides(right)
+    if not left:
         return Extent(None, columns, depth)
     shared = weight and right is not None and math.prod(right[:-2]) == 1
     if shared or len(left) < 2:
         return Extent(math.prod(left[:-1]), columns, left[-1])
     return Extent(left[-2], columns, left[-1])
+
+
+def _sides(right: tuple[int, ...]) -> tuple[int, int]:
+    """Give N and K of a right operand; a vector is one column."""
+    return (right[-1], right[-2]) if len(right) > 1 else (1, math.prod(right))
 
 
 def _gemm(

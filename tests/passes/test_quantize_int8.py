@@ -6,6 +6,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.plan import plan_of
 from me2e_compress.errors import (
     FramesError,
     ModuleMapError,
@@ -78,8 +79,47 @@ def test_without_frames_there_is_no_calibration() -> None:
 def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
     once = QuantizeInt8().run(conv_attention(), context).model
 
-    with pytest.raises(PreconditionError, match="quantized already: QuantizeLinear"):
+    with pytest.raises(PreconditionError) as caught:
         QuantizeInt8().run(once, context)
+
+    assert "quantized already: 7 DequantizeLinear, 5 QuantizeLinear" in str(
+        caught.value
+    )
+    assert "int8 with zero points 0; it carries the plan it was made by" in str(
+        caught.value
+    )
+
+
+def test_the_graph_carries_its_plan(context: Context) -> None:
+    plan = plan_of(QuantizeInt8(rules="tensorrt").run(conv_attention(), context).model)
+
+    assert plan is not None
+    assert plan.rules == "tensorrt"
+    assert len(plan.decisions) == 10
+
+
+def test_rules_of_tensorrt_keep_small_layers_in_float(context: Context) -> None:
+    notes = QuantizeInt8(rules="tensorrt").run(conv_attention(), context).notes
+
+    assert "1 of 10 nodes int8; by rule: layer 1, small-product 3" in notes
+
+
+def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> None:
+    path = tmp_path / "overrides.toml"
+    path.write_text('[[override]]\nmodule = "head"\ndtype = "float"\n')
+
+    notes = QuantizeInt8(overrides=str(path)).run(conv_attention(), context).notes
+
+    assert "1 of 10 nodes int8; by rule: layer 1, override 3" in notes
+
+
+def test_close_decisions_are_noted(context: Context) -> None:
+    notes = QuantizeInt8(attention_limit=60).run(conv_attention(), context).notes
+
+    assert (
+        "close decisions: /head/QK: 64 queries, 64 keys: close to the limit of 60;"
+        " /head/AV: 64 queries, 64 keys: close to the limit of 60"
+    ) in notes
 
 
 @pytest.mark.parametrize(
@@ -87,7 +127,10 @@ def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
     [
         ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
         ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
-        ({"method": "entropy"}, RecipeError, "no calibration method entropy"),
+        ({"rules": "int4"}, RecipeError, "no rule set int4; there are paper, tensorrt"),
+        ({"target": "qnn"}, RecipeError, "no target qnn; there are tensorrt"),
+        ({"overrides": "none.toml"}, RecipeError, "none.toml: no such file of over"),
+        ({"method": "median"}, RecipeError, "no calibration method median"),
     ],
 )
 def test_what_is_not_there_is_named(
