@@ -48,9 +48,8 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     if not left:
         return Extent(None, columns, depth)
     shared = weight and right is not None and math.prod(right[:-2]) == 1
-    if shared or len(left) < 2:
-        return Extent(math.prod(left[:-1]), columns, left[-1])
-    return Extent(left[-2], columns, left[-1])
+    rows = math.prod(left[:-1]) if shared or len(left) == 1 else left[-2]
+    return Extent(rows, columns, left[-1])
 
 
 def _sides(right: tuple[int, ...]) -> tuple[int, int]:
