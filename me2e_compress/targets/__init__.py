@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.plan import QuantPlan
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import RecipeError
-from me2e_compress.targets import tensorrt
+from me2e_compress.targets import onnxruntime, tensorrt
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +27,11 @@ class Target:
 
 
 TARGETS: dict[str, Target] = {
-    each.name: each for each in (Target("tensorrt", tensorrt.tensors, tensorrt.place),)
+    each.name: each
+    for each in (
+        Target("tensorrt", tensorrt.tensors, tensorrt.place),
+        Target("onnxruntime", onnxruntime.tensors, onnxruntime.place),
+    )
 }
 
 
