@@ -7,7 +7,6 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.plan import (
     INT8,
     Overrides,
@@ -19,8 +18,9 @@ from me2e_compress.calibration.plan import (
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.rules import rules_named
 from me2e_compress.calibration.scheme import QuantScheme
-from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.measured import measured_ranges
 from me2e_compress.targets import target_named
 from me2e_compress.targets.quantized import describe_quantized
 
@@ -77,7 +77,8 @@ class QuantizeInt8:
         if found := describe_quantized(model):
             raise PreconditionError(
                 f"the graph is quantized already: {found}; int8 is not put on int8,"
-                " give the float graph that it was made of"
+                " give the float graph that it was made of, or let lower-int8 rewrite"
+                " this one for onnxruntime"
             )
         target = target_named(self.target)
         graph.infer_shapes(model)
@@ -85,7 +86,14 @@ class QuantizeInt8:
         tensors = target.tensors(plan, model)
         if not tensors:
             return PassResult(model, 0, ("nothing to quantize", *_notes(plan)))
-        ranges = self._ranges(model, tensors, context)
+        ranges = measured_ranges(
+            self.name,
+            model,
+            tensors,
+            context,
+            method=self.method,
+            saved=self.ranges,
+        )
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
         notes = (*_notes(plan), *_findings(plan, ranges))
@@ -103,26 +111,6 @@ class QuantizeInt8:
         if self.modules:
             return QuantScheme.of(self.modules, context.modules)
         return QuantScheme.named(self.scheme, context.modules)
-
-    def _ranges(
-        self, model: ir.Model, tensors: tuple[str, ...], context: Context
-    ) -> Ranges:
-        frames = context.frames
-        if self.ranges is not None:
-            saved = Ranges.load(Path(self.ranges))
-            saved.check(
-                model=graph.digest(model),
-                tensors=tensors,
-                method=self.method,
-                source=None if frames is None else frames.fingerprint,
-            )
-            return saved
-        if frames is None:
-            raise FramesError(
-                f"{self.name} needs recorded frames (--frames) or saved ranges"
-                " (--ranges): int8 ranges are never made up"
-            )
-        return Calibrator(self.method).run(model, tensors, frames)
 
 
 def _notes(plan: QuantPlan) -> tuple[str, ...]:
