@@ -12,6 +12,7 @@ from me2e_compress.cli.export import export
 from me2e_compress.cli.extras import closed_loop
 from me2e_compress.cli.frames import frames
 from me2e_compress.cli.inspect import inspect
+from me2e_compress.cli.lint import lint
 from me2e_compress.cli.plan import plan
 from me2e_compress.cli.profile import profile
 from me2e_compress.errors import Me2eError
@@ -24,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    demo, doctor, export, inspect, frames, plan, compress, compare, profile,
+    demo, doctor, export, inspect, frames, plan, compress, lint, compare, profile,
 ):  # fmt: skip
     app.command()(command)
 closed_loop(app)

@@ -36,7 +36,8 @@ def compress(
         str | None, typer.Option(help="of the int8 plan: paper or tensorrt")
     ] = None,
     target: Annotated[
-        str | None, typer.Option(help="who runs the int8 graph: tensorrt")
+        str | None,
+        typer.Option(help="who runs the int8 graph: tensorrt or onnxruntime"),
     ] = None,
     overrides: Annotated[
         Path | None, typer.Option(help="TOML file of exceptions to the int8 plan")
