@@ -46,7 +46,8 @@ def test_findings_for_programs(
     assert command("lint", twisted, "--json") == 1
 
     found = json.loads(capsys.readouterr().out)
-    assert [each["rule"] for each in found] == ["plugin"] * 3
+    assert [each["rule"] for each in found["findings"]] == ["plugin"] * 3
+    assert found["tensorrt_rtx"] is None
 
 
 def test_no_such_target(
@@ -54,3 +55,24 @@ def test_no_such_target(
 ) -> None:
     assert command("lint", twisted, "--target", "npu") == 1
     assert "no rules for target npu; there are tensorrt" in capsys.readouterr().err
+
+
+def test_trt_check_says_what_was_asked_and_of_whom(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tensorrt_rtx")
+
+    assert command("lint", dense / "dense.onnx", "--trt-check") == 0
+
+    said = capsys.readouterr().out
+    assert "TensorRT-RTX 1" in said
+    assert "parsed, built for SM86" in said
+
+
+def test_trt_check_is_not_for_other_targets(
+    command: Command, twisted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--target", "onnxruntime", "--trt-check")
+
+    assert command("lint", twisted, *words) == 1
+    assert "--trt-check is for tensorrt, not for onnx" in capsys.readouterr().err

@@ -228,6 +228,15 @@ def test_a_pair_between_a_convolution_and_its_add_is_a_warning() -> None:
     assert "residual-branch" in [each[1] for each in found(text)]
 
 
+def test_a_rounded_projection_is_a_residual_branch() -> None:
+    text = """m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y)
+    <float s = {0.5}, int8 z = {0}>
+    { c = Conv(x, w) p = Conv(x, w) q = QuantizeLinear(p, s, z)
+      d = DequantizeLinear(q, s, z) y = Add(c, d) }"""
+
+    assert "residual-branch" not in [each[1] for each in found(text)]
+
+
 def test_graphs_of_other_quantizers_are_judged_the_same() -> None:
     """A pair on every input and on a weight that stays float, as AddQDQPairToWeight."""
     text = """

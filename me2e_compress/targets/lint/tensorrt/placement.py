@@ -88,7 +88,8 @@ def branches(model: ir.Model) -> Iterator[Finding]:
     for node in nodes_of(model):
         if node.op_type != "Add" or not is_standard(node):
             continue
-        if any(_rounds_convolution(value) for value in node.inputs):
+        rounded = [_rounds_convolution(value) for value in node.inputs]
+        if any(rounded) and not any(_is_convolution(value) for value in node.inputs):
             yield warning(
                 "residual-branch",
                 node,
@@ -143,10 +144,9 @@ def _rounds_convolution(value: ir.Value | None) -> bool:
     node = value.producer()
     quantize = node.inputs[0].producer() if node and node.inputs[0] else None
     source = quantize.inputs[0] if quantize is not None else None
-    made = source.producer() if source is not None else None
-    return (
-        source is not None
-        and made is not None
-        and made.op_type in CONVOLUTIONS
-        and len(source.uses()) == 1
-    )
+    return _is_convolution(source) and source is not None and len(source.uses()) == 1
+
+
+def _is_convolution(value: ir.Value | None) -> bool:
+    node = None if value is None else value.producer()
+    return node is not None and node.op_type in CONVOLUTIONS
