@@ -46,6 +46,7 @@ class QuantizeInt8:
         modules: module names instead of a scheme.
         rules: ``paper``, its two stages alone; ``tensorrt``, with what its kernels
             and coordinates need besides.
+        without: ids of rules that are switched off, e.g. ``gemv``.
         target: who will run the graph.
         attention_limit: longest attention that becomes int8, in tokens.
         overrides: TOML file of exceptions to the plan.
@@ -59,6 +60,7 @@ class QuantizeInt8:
     scheme: str = "full"
     modules: tuple[str, ...] = ()
     rules: str = "paper"
+    without: tuple[str, ...] = ()
     target: str = "tensorrt"
     attention_limit: int = 512
     overrides: str | None = None
@@ -104,7 +106,7 @@ class QuantizeInt8:
         overrides = Overrides()
         if self.overrides is not None:
             overrides = Overrides.load(Path(self.overrides))
-        rules = rules_named(self.rules, self.attention_limit)
+        rules = rules_named(self.rules, self.attention_limit).without(self.without)
         return make_plan(model, self._scheme(context), rules, overrides)
 
     def _scheme(self, context: Context) -> QuantScheme:

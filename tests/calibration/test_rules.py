@@ -27,6 +27,21 @@ def test_no_such_rule_set() -> None:
         rules_named("nvidia")
 
 
+def test_rules_can_be_switched_off_one_by_one() -> None:
+    left = tensorrt_rules().without(("gemv", "coordinates"))
+
+    assert [rule.id for rule in left.rules] == [
+        "operator", "module", "weight", "attention-length", "small-product",
+        "narrow-convolution",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["weight", "speed"])
+def test_other_rules_cannot(name: str) -> None:
+    with pytest.raises(RecipeError, match=f"rule {name} cannot be switched off; of pa"):
+        rules_named("paper").without((name,))
+
+
 @pytest.mark.parametrize(
     ("shape", "rule"),
     [((16, 16), "layer"), ((15, 64), "small-product"), ((64, 15), "small-product")],

@@ -104,6 +104,14 @@ def test_rules_of_tensorrt_keep_small_layers_in_float(context: Context) -> None:
     assert "1 of 10 nodes int8; by rule: layer 1, small-product 3" in notes
 
 
+def test_a_rule_that_is_switched_off_objects_to_nothing(context: Context) -> None:
+    options = QuantizeInt8(rules="tensorrt", without=("small-product",))
+
+    notes = options.run(conv_attention(), context).notes
+
+    assert "4 of 10 nodes int8; by rule: attention 2, layer 2" in notes
+
+
 def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> None:
     path = tmp_path / "overrides.toml"
     path.write_text('[[override]]\nmodule = "head"\ndtype = "float"\n')
@@ -127,6 +135,7 @@ def test_close_decisions_are_noted(context: Context) -> None:
     [
         ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
         ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
+        ({"without": ("speed",)}, RecipeError, "rule speed cannot be switched off"),
         ({"rules": "int4"}, RecipeError, "no rule set int4; there are paper, tensorrt"),
         ({"target": "qnn"}, RecipeError, "no target qnn; there are tensorrt"),
         ({"overrides": "none.toml"}, RecipeError, "none.toml: no such file of over"),

@@ -4,6 +4,8 @@ A rule set is a name and a tuple of rules: leave one out to switch it off.
 """
 
 import dataclasses
+from collections.abc import Collection
+from typing import Self
 
 from me2e_compress.calibration.rules.base import (
     CONVOLUTIONS,
@@ -54,6 +56,22 @@ class RuleSet:
     name: str
     rules: tuple[Rule, ...]
     share_concat: bool = False
+
+    def without(self, names: Collection[str]) -> Self:
+        """Switch some rules off.
+
+        Raises:
+            RecipeError: it has no such rule, or none that can be switched off.
+        """
+        loose = [rule.id for rule in self.rules if not rule.firm]
+        for name in names:
+            if name not in loose:
+                raise RecipeError(
+                    f"rule {name} cannot be switched off; of {self.name} can"
+                    f" {', '.join(loose)}"
+                )
+        kept = tuple(rule for rule in self.rules if rule.id not in names)
+        return dataclasses.replace(self, rules=kept)
 
 
 def paper_rules(attention_limit: int = 512) -> RuleSet:

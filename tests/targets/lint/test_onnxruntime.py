@@ -1,7 +1,12 @@
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.calibration.plan import make_plan
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.scheme import QuantScheme
+from me2e_compress.targets import target_named
 from me2e_compress.targets.lint import lint
+from tests.nets import MODULES, conv_attention
 
 LAYER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -63,3 +68,14 @@ def test_opsets_nobody_has_released() -> None:
         "m (float[2] x) => (float[2] y) { y = Relu(x) }"
     )
     assert "opset" in [each.rule for each in lint(model, "onnxruntime")]
+
+
+def test_what_we_place_for_it_has_no_findings() -> None:
+    model = conv_attention()
+    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    target = target_named("onnxruntime")
+    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
+
+    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+
+    assert lint(placed, "onnxruntime") == ()
