@@ -21,6 +21,8 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
+from me2e_compress.targets.lint import lint
+from me2e_compress.targets.rtx import check
 from me2e_compress.zoo.frames import frames as drive
 from me2e_compress.zoo.stacks import VAD_TINY
 from tests.frames import record
@@ -111,6 +113,40 @@ def test_schemes_shrink_the_file_and_keep_the_plan(
     int8 = [n for n in result.model.graph if n.op_type == "DequantizeLinear"]
     assert len(int8) >= layers
     assert graph.size(result.model).weight_bytes / 1e6 < WEIGHT_MB - saved
+    assert lint(result.model, "tensorrt") == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["feature-ext", "prediction", "full"])
+def test_schemes_are_built_with_int8_kernels(
+    scheme: str, folded: ir.Model, context: Context, ranges: str
+) -> None:
+    pytest.importorskip("tensorrt_rtx")
+    result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
+
+    found = check(result.model)
+
+    assert found.passed, found.errors or found.missing
+    assert (found.cut, found.missing) == ((), ())
+
+
+def test_close_layers_are_decided_as_they_should(
+    folded: ir.Model, context: Context
+) -> None:
+    """The traps of this stack: long attention, one ego query, sampling offsets."""
+    options = QuantizeInt8(rules="tensorrt")
+    plan = options.plan(folded, context)
+    rules = {each.node.removeprefix("/pts_bbox_head/"): each for each in plan.decisions}
+
+    motion = "motion_decoder/layers.0/attentions.0/attn/MatMul_3"
+    assert rules[motion].rule == "attention-length"
+    assert "1800 queries and 1800 keys" in rules[motion].reason
+    ego = "ego_fut_decoder/ego_fut_decoder.0/MatMul"
+    assert rules[ego].rule == "gemv"
+    offsets = "transformer/encoder/layers.0/attentions.0/sampling_offsets/MatMul"
+    assert rules[offsets].rule == "coordinates"
+    residual = [each for each in plan.chosen if each.rule == "residual"]
+    assert len(residual) == 16
 
 
 @pytest.mark.parametrize(
