@@ -22,6 +22,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, PassResult
 from me2e_compress.passes.measured import measured_ranges
 from me2e_compress.targets import target_named
+from me2e_compress.targets.lint import lint
 from me2e_compress.targets.quantized import describe_quantized
 
 _SHOWN = 5
@@ -98,7 +99,7 @@ class QuantizeInt8:
         )
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
-        notes = (*_notes(plan), *_findings(plan, ranges))
+        notes = (*_notes(plan), *_findings(plan, ranges), _lint(placed, self.target))
         return PassResult(placed, len(plan.chosen), notes)
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
@@ -139,6 +140,17 @@ def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
         *_first(list(ranges.dead), "always zero"),
         *_first(_outliers(ranges), "a few elements make the range"),
         *_first(shared, "scales shared by what a Concat joins"),
+    )
+
+
+def _lint(model: ir.Model, target: str) -> str:
+    found = lint(model, target)
+    if not found:
+        return f"lint for {target}: nothing found"
+    first = found[0]
+    return (
+        f"lint for {target}: {len(found)} findings, first {first.severity}"
+        f" {first.rule} {first.node!r}: {first.message}"
     )
 
 

@@ -13,7 +13,6 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.plan import INT8, QuantPlan, plan_of
-from me2e_compress.calibration.rules import CONVOLUTIONS
 from me2e_compress.errors import GraphError, MissingExtraError, RecipeError
 from me2e_compress.targets.rtx.cut import cut
 from me2e_compress.targets.rtx.kernels import Kernel, read_kernels, without_int8
@@ -36,8 +35,10 @@ class Verdict:
         layers: of the parsed network.
         errors: what parser and builder objected to.
         kernels: convolutions and products of the built plan.
-        missing: convolutions that the graph's quantization plan makes int8 and that no
-            int8 kernel computes; None if the graph carries no plan, or was not built.
+        missing: convolutions (Conv) that the graph's quantization plan makes int8 and
+            that no int8 kernel computes; None if the graph carries no plan, or was not
+            built. What becomes of products and deconvolutions is for the builder to
+            choose.
     """
 
     version: str
@@ -126,8 +127,8 @@ def _missing(
     if plan is None:
         return None
     wanted = [
-        each.node
+        each.node or f"node_of_{each.output}"  # what the parser calls it
         for each in plan.decisions
-        if each.dtype == INT8 and each.op in CONVOLUTIONS
+        if each.dtype == INT8 and each.op == "Conv"
     ]
     return without_int8(wanted, kernels)

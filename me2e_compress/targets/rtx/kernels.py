@@ -10,12 +10,16 @@ import re
 from collections.abc import Iterable
 
 _KERNEL = re.compile(
-    r"(corrltn|fully_connected)=\{ name=\"([^\"]+)\" output=\{([^}]*)\}"
+    r"(corrltn|deconvolution|fully_connected)=\{ name=\"([^\"]+)\" output=\{([^}]*)\}"
     r" input=\{([^}]*)\}"
 )
 _TENSOR = re.compile(r'name="([^"]+)"[^}]*?(?:\{[^}]*\}[^}]*?)*type=(\w+) \}')
 _WORD = re.compile(r'"([^"]+)"')
-_KINDS = {"corrltn": "convolution", "fully_connected": "product"}
+_KINDS = {
+    "corrltn": "convolution",
+    "deconvolution": "deconvolution",
+    "fully_connected": "product",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +27,7 @@ class Kernel:
     """One convolution or matrix product of a built plan.
 
     Attributes:
-        kind: ``convolution`` or ``product``.
+        kind: ``convolution``, ``deconvolution`` or ``product``.
         nodes: names of the ONNX nodes that it computes; merged ones together.
         operands: element types of its first two operands, ``?`` if not said.
     """

@@ -2,6 +2,7 @@
 
 import importlib.util
 
+import numpy as np
 import onnx_ir as ir
 import pytest
 
@@ -11,15 +12,15 @@ from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.errors import MissingExtraError, RecipeError
 from me2e_compress.targets import tensorrt
 from me2e_compress.targets.rtx import check
-from tests.nets import MODULES, conv_attention
+from tests.nets import MODULES, conv_attention, net
+from tests.targets.test_tensorrt import layers
 
 RTX = pytest.mark.skipif(
     importlib.util.find_spec("tensorrt_rtx") is None, reason="extra trt-check"
 )
 
 
-def quantized() -> ir.Model:
-    model = conv_attention()
+def quantized(model: ir.Model) -> ir.Model:
     plan = make_plan(model, QuantScheme.named("full", MODULES))
     ranges = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
     placed = tensorrt.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
@@ -29,12 +30,33 @@ def quantized() -> ir.Model:
 
 @RTX
 def test_what_we_place_is_built_with_int8_kernels() -> None:
-    found = check(quantized())
+    found = check(quantized(conv_attention()))
 
     assert found.passed
     assert (found.parsed, found.built, found.missing) == (True, True, ())
     convolutions = [each for each in found.kernels if each.kind == "convolution"]
     assert [each.is_int8 for each in convolutions] == [True]
+
+
+@RTX
+def test_every_kind_of_layer_is_taken_with_its_channels() -> None:
+    """Conv, grouped ConvTranspose, MatMul, turned Gemm, a residual Add; no names."""
+    for model in (layers(), residual()):
+        found = check(quantized(model))
+        assert (found.passed, found.missing) == (True, ())
+
+
+def residual() -> ir.Model:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    block (float[1,4,5,5] x, float[4,4,3,3] w) => (float[1,4,5,5] y) {
+        r = Relu(x)
+        a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(r, w)
+        s = Add(a, r)
+        y = Relu(s)
+    }
+    """
+    return net(text, {"w": np.ones((4, 4, 3, 3))})
 
 
 @RTX
