@@ -17,6 +17,9 @@ OUTLIER_CREST = 64
 reported: its int8 step then exceeds half its root mean square, so that most elements
 round to 0, 1 or 2 steps."""
 
+IMPORTED = "imported"
+"""Method of ranges that another tool measured; on which frames, is not known."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Ranges:
@@ -98,6 +101,7 @@ class Ranges:
             tensors: what it needs a range of.
             method: what was asked for.
             source: fingerprint of the frames at hand; None if there are none.
+                Imported ranges fit any method and frames.
 
         Raises:
             FramesError: says what is stale, and what to do.
@@ -110,11 +114,12 @@ class Ranges:
                 f" {again}"
             )
         asked = observer(method).text
-        if self.method != asked:
+        if self.method not in (asked, IMPORTED):
             raise FramesError(f"ranges are of method {self.method}, asked for {asked}")
-        if source is not None and self.source != source:
+        wanted = self.source if source is None else source
+        if self.method != IMPORTED and self.source != wanted:
             raise FramesError(
-                f"ranges are stale: of frames {self.source[:12]}, not {source[:12]};"
+                f"ranges are stale: of frames {self.source[:12]}, not {wanted[:12]};"
                 f" {again}"
             )
         if missing := [name for name in tensors if name not in self.tensors]:

@@ -3,6 +3,7 @@
 import typer
 from rich.markup import escape
 
+from me2e_compress.cli.calibrate import calibrate
 from me2e_compress.cli.compare import compare
 from me2e_compress.cli.compress import compress
 from me2e_compress.cli.console import errors
@@ -25,7 +26,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    demo, doctor, export, inspect, frames, plan, compress, lint, compare, profile,
+    demo, doctor, export, inspect, frames, calibrate, plan, compress, lint, compare,
+    profile,
 ):  # fmt: skip
     app.command()(command)
 closed_loop(app)
