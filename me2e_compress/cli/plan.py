@@ -6,6 +6,7 @@ from typing import Annotated
 import onnx_ir as ir
 import typer
 from rich.markup import escape
+from rich.table import Table
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.plan import (
@@ -105,11 +106,21 @@ def _show(found: QuantPlan, *, every: bool) -> None:
                 escape(each.reason + close),
             )
     console.print(shown)
+    if every and found.groups:
+        console.print(_groups(found))
     counts = ", ".join(f"{rule} {count}" for rule, count in found.counts().items())
     console.print(
         f"scheme {found.scheme.name}, rules {found.rules}: {len(found.chosen)} of"
         f" {len(found.decisions)} nodes int8; {counts}"
     )
+
+
+def _groups(found: QuantPlan) -> Table:
+    shown = table("Decided together", "kind", "name", "tensors", "read by", left=4)
+    for group in found.groups:
+        tensors, nodes = ", ".join(group.tensors), ", ".join(group.nodes)
+        shown.add_row(group.kind, escape(group.name), escape(tensors), escape(nodes))
+    return shown
 
 
 def _compare(old: QuantPlan, new: QuantPlan) -> None:

@@ -39,6 +39,13 @@ def test_nodes_are_kept_in_float_by_glob_module_and_operator(matcher: str) -> No
     assert [each.reason for each in said] == ["loses 3 dB"] * 2
 
 
+def test_all_readers_of_a_tensor_are_one_group() -> None:
+    plan = planned('[[override]]\nreads = "q"\ndtype = "float"')
+
+    # the product of queries and keys reads it, and so does that with the values
+    assert chosen(plan) == ["/backbone/Conv", "/head/Linear"]
+
+
 def test_an_override_beats_the_scheme() -> None:
     text = '[[override]]\nmodule = "head"\ndtype = "int8"'
 
@@ -82,7 +89,7 @@ def test_names_of_the_source_file_match_too() -> None:
             '[[override]]\nop = "Softmax"\ndtype = "int8"',
             "override op 'Softmax': /head/Softmax cannot be int8: Softmax in|is no",
         ),
-        ('[[override]]\ndtype = "float"', "names no nodes, module or op"),
+        ('[[override]]\ndtype = "float"', "names no nodes, module, op or reads"),
         ('[[override]]\nop = "Conv"\ndtype = "fp8"', "dtype fp8: int8 and float are"),
         ('[[override]]\nop = "Conv"\ndtype = "int4"', "dtype int4: int8 and float"),
         ('[[overide]]\nop = "Conv"\ndtype = "int8"', "overide: Extra inputs"),

@@ -1,11 +1,13 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.calibration.plan import load_plan, plan_of
-from me2e_compress.graph import load
 from tests.cli.conftest import Command
+from tests.nets import net
 
 
 def compressed(command: Command, dense: Path, *more: str | Path) -> Path:
@@ -22,7 +24,7 @@ def test_a_quantized_file_has_its_plan_beside_it_and_inside(
     output = compressed(command, dense)
 
     saved = load_plan(dense / "out.plan.json")
-    assert saved == plan_of(load(output))
+    assert saved == plan_of(graph.load(output))
     assert [each.node for each in saved.chosen] == ["/plan_head/MatMul"]
 
 
@@ -64,6 +66,26 @@ def test_a_plan_is_shown_with_reasons(
     said = capsys.readouterr().out
     assert "0 of 2 nodes int8; module 1" in said
     assert "/backbone/Relu" in said
+
+
+def test_what_is_decided_together_is_listed(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = net(
+        '<ir_version: 9, opset_import: ["" : 17]>'
+        "two (float[4,32] x, float[32,32] v, float[32,32] w)"
+        " => (float[4,32] k, float[4,32] q) { k = MatMul(x, v) q = MatMul(x, w) }",
+        {"v": np.eye(32), "w": np.ones((32, 32))},
+    )
+    graph.save(model, tmp_path / "two.onnx")
+    (tmp_path / "map.toml").write_text(
+        '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
+    )
+    words = ("--map", tmp_path / "map.toml", "--all")
+
+    assert command("plan", tmp_path / "two.onnx", *words) == 0
+
+    assert "shared-input" in capsys.readouterr().out
 
 
 def test_options_of_int8_reach_the_pass(

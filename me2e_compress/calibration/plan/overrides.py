@@ -6,6 +6,7 @@ TOML::
     nodes = "/head/decoder/*"     # glob over node names; * also crosses a slash
     module = "planner"            # all that are given must hold
     op = "MatMul"
+    reads = "/neck/out"           # glob over the tensors that they read: a whole group
     dtype = "float"               # or "int8"
     reason = "costs 3 dB"         # may be left out
 
@@ -45,14 +46,15 @@ class Override(_Strict):
     nodes: str | None = None
     module: str | None = None
     op: str | None = None
+    reads: str | None = None
     reason: str = ""
 
     @pydantic.model_validator(mode="after")
     def _is_whole(self) -> Self:
         if self.dtype not in (INT8, FLOAT):
             raise ValueError(f"dtype {self.dtype}: {_UNSUPPORTED}")
-        if (self.nodes, self.module, self.op) == (None, None, None):
-            raise ValueError("it names no nodes, module or op")
+        if not self._given():
+            raise ValueError("it names no nodes, module, op or reads")
         return self
 
     def matches(self, node: ir.Node) -> bool:
@@ -61,12 +63,21 @@ class Override(_Strict):
             (self.op is None or node.op_type == self.op)
             and (self.module is None or provenance.module_of(node) == self.module)
             and (self.nodes is None or _named(node, self.nodes))
+            and (self.reads is None or _reads(node, self.reads))
         )
 
     def __str__(self) -> str:
         """Show what it matches by."""
-        given = {"nodes": self.nodes, "module": self.module, "op": self.op}
-        return ", ".join(f"{key} {value!r}" for key, value in given.items() if value)
+        return ", ".join(f"{key} {value!r}" for key, value in self._given().items())
+
+    def _given(self) -> dict[str, str]:
+        matchers = {
+            "nodes": self.nodes,
+            "module": self.module,
+            "op": self.op,
+            "reads": self.reads,
+        }
+        return {key: value for key, value in matchers.items() if value is not None}
 
 
 class ConcatScale(_Strict):
@@ -183,6 +194,11 @@ class Pins:
 def _named(node: ir.Node, glob: str) -> bool:
     past = provenance.read(node)
     names = (node.name or "", *(past.origins if past is not None else ()))
+    return any(fnmatch.fnmatchcase(name, glob) for name in names)
+
+
+def _reads(node: ir.Node, glob: str) -> bool:
+    names = (str(value.name) for value in node.inputs if value is not None)
     return any(fnmatch.fnmatchcase(name, glob) for name in names)
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, Self
 
 import onnx_ir as ir
 
@@ -33,7 +33,7 @@ class Facts:
     coordinates: Mapping[ir.Node, str] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(cls, model: ir.Model, modules: Collection[str]) -> "Facts":
+    def of(cls, model: ir.Model, modules: Collection[str]) -> Self:
         """Look at a graph: a few sweeps, each linear in its nodes."""
         constants = constant_values(model)
         return cls(
