@@ -8,6 +8,7 @@ from me2e_compress.calibration.plan import make_plan
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
+from me2e_compress.targets.lint import lint
 from me2e_compress.targets.onnxruntime import place, tensors
 from tests.nets import conv_attention
 from tests.targets.onnxruntime.lowered import (
@@ -108,6 +109,11 @@ def test_the_result_is_a_valid_graph_and_the_source_untouched() -> None:
     onnx.checker.check_model(ir.to_proto(result), full_check=True)
     assert graph.digest(model) == before
     assert [port.name for port in result.graph.outputs] == ["y", "pooled"]
+
+
+def test_the_lint_of_the_target_finds_nothing() -> None:
+    for model in (block(), linear(), conv_attention()):
+        assert lint(lowered(model), "onnxruntime") == ()
 
 
 def test_the_same_plan_gives_the_same_graph() -> None:
