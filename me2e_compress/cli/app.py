@@ -16,6 +16,7 @@ from me2e_compress.cli.inspect import inspect
 from me2e_compress.cli.lint import lint
 from me2e_compress.cli.plan import plan
 from me2e_compress.cli.profile import profile
+from me2e_compress.cli.sensitivity import search, sensitivity
 from me2e_compress.errors import Me2eError
 
 app = typer.Typer(
@@ -27,7 +28,7 @@ app = typer.Typer(
 )
 for command in (
     demo, doctor, export, inspect, frames, calibrate, plan, compress, lint, compare,
-    profile,
+    profile, sensitivity, search,
 ):  # fmt: skip
     app.command()(command)
 closed_loop(app)
