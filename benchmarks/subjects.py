@@ -7,7 +7,6 @@
 The model in the folder is what ``quantize-int8`` sees: the exact passes are done.
 """
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import bev_head, resnet50
+from benchmarks.subject import Subject, at
 from me2e_compress import graph, recipe
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap
@@ -22,52 +22,11 @@ from me2e_compress.passes import Context
 from me2e_compress.zoo.export import export
 from me2e_compress.zoo.frames import write_frames
 
+__all__ = ["SUBJECTS", "Subject", "at", "make"]
+
 SUBJECTS = ("resnet50", "bev-head", "vad-tiny")
 SCENE = 4
 """Frames a scene, where frames follow each other."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Subject:
-    """One model to measure on.
-
-    Attributes:
-        name: one of :data:`SUBJECTS`.
-        folder: holds everything of it.
-    """
-
-    name: str
-    folder: Path
-
-    @property
-    def source(self) -> Path:
-        """The model as it was exported."""
-        return self.folder / "source.onnx"
-
-    @property
-    def model(self) -> Path:
-        """The model after the exact passes."""
-        return self.folder / "model.onnx"
-
-    @property
-    def frames(self) -> Path:
-        """Frames to calibrate on."""
-        return self.folder / "frames"
-
-    @property
-    def held_out(self) -> Path:
-        """Frames of another seed, to compare on."""
-        return self.folder / "held-out"
-
-    @property
-    def map(self) -> Path:
-        """The module map."""
-        return self.folder / "map.toml"
-
-
-def at(folder: Path) -> Subject:
-    """Find what :func:`make` wrote."""
-    return Subject(folder.name, folder)
 
 
 def make(name: str, out: Path, frames: int) -> Subject:
