@@ -115,8 +115,17 @@ def files(subject: subjects.Subject, chosen: argparse.Namespace) -> list[str]:
         if not path.is_file():
             print(f"  {name}: {written(subject, name, chosen)}", flush=True)
         if path.is_file():
+            keep_metadata(subject.model, path)
             done.append(name)
     return done
+
+
+def keep_metadata(source: Path, path: Path) -> None:
+    """Say in a file what its source says: ModelOpt drops which inputs are a state."""
+    said, model = graph.load(source).metadata_props, graph.load(path)
+    if any(key not in model.metadata_props for key in said):
+        model.metadata_props.update(said)
+        graph.save(model, path)
 
 
 def written(subject: subjects.Subject, name: str, chosen: argparse.Namespace) -> str:
