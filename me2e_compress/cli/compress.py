@@ -46,6 +46,9 @@ def compress(
     ranges: Annotated[
         Path | None, typer.Option(help="saved RANGES.json instead of frames")
     ] = None,
+    method: Annotated[
+        str | None, typer.Option(help="of calibration: max-min, percentile:99.9, ...")
+    ] = None,
     module_map: Annotated[
         str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
     ] = None,
@@ -57,7 +60,7 @@ def compress(
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report."""
     check_output(model, output)
-    int8 = Int8Options(scheme, rules, target, overrides, ranges)
+    int8 = Int8Options(scheme, rules, target, overrides, ranges, method)
     chosen = choose(recipe_name, passes, int8)
     report = run(model, chosen, frames, module_map, seed, verify_frames, output.parent)
     report_path = write(report, model, output)

@@ -18,6 +18,7 @@ class Int8Options:
         target: who will run the graph.
         overrides: TOML file of exceptions.
         ranges: file of saved ranges.
+        method: how ranges are read from frames, or were for ``ranges``.
     """
 
     scheme: str | None = None
@@ -25,6 +26,7 @@ class Int8Options:
     target: str | None = None
     overrides: Path | None = None
     ranges: Path | None = None
+    method: str | None = None
 
     def apply(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
         """Put them into the quantization of a pipeline; add one for a scheme.
@@ -55,4 +57,5 @@ class Int8Options:
             target=self.target or given.target,
             overrides=str(self.overrides) if self.overrides else given.overrides,
             ranges=str(self.ranges) if self.ranges else given.ranges,
+            method=self.method or given.method,
         )

@@ -51,7 +51,8 @@ class QuantizeInt8:
         target: who will run the graph.
         attention_limit: longest attention that becomes int8, in tokens.
         overrides: TOML file of exceptions to the plan.
-        method: how ranges are read from the frames: ``max-min``.
+        method: how ranges are read from the frames: ``max-min``,
+            ``moving-average:W``, ``percentile:P``, ``mse`` or ``entropy``.
         ranges: file of saved ranges instead of frames.
     """
 

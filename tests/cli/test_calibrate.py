@@ -30,14 +30,16 @@ def ranges(command: Command, folder: Path, name: str, *words: str | Path) -> obj
     return json.loads((folder / name).read_text()) if name.endswith("json") else None
 
 
+@pytest.mark.parametrize("method", ["max-min", "mse"])
 def test_saved_ranges_make_the_file_that_frames_make(
-    command: Command, folder: Path
+    command: Command, folder: Path, method: str
 ) -> None:
-    ranges(command, folder, "r.json", folder / "scenes")
+    ranges(command, folder, "r.json", folder / "scenes", "--method", method)
     for name, source in (("a", "--ranges"), ("b", "--frames")):
         where = folder / ("r.json" if source == "--ranges" else "scenes")
         done = command(
             *("compress", folder / "dense.onnx", "--scheme", "prediction"),
+            *("--method", method),
             *(source, where, "--map", folder / "map.toml"),
             *("-o", folder / f"{name}.onnx"),
         )
