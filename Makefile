@@ -28,7 +28,7 @@ $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)
 	touch $@
 
 $(VENV)/.test: pyproject.toml constraints.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,bench,ray,test]'
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,bench,ray,trt-check,test]'
 	touch $@ $(VENV)/.demo
 
 $(VENV):

@@ -1,119 +1,216 @@
-"""Calibration against plain inference: CPU time and peak memory, a process each.
+"""Calibration against plain inference and against other tools, each in its process.
 
-    python benchmarks/bench_calibration.py MODEL.onnx FRAMES/ --map vad [--frames 8]
+    python -m benchmarks.bench_calibration OUT [--subjects resnet50,bev-head,vad-tiny]
+        [--peer-python PYTHON] [--frames N]
 
-The model is imported and folded first (the graph that quantize-int8 calibrates), then
-run over the same frames, each time in a fresh process: plain, and with the gauges of
-scheme "full", at the same optimization level.
+For each model, after the exact passes, over the same frames on the same threads: plain
+inference and our calibration, with onnxruntime's optimizations and without; our second
+pass of histograms; onnxruntime's MinMax and Entropy; ModelOpt (which places QDQ in the
+same call), where PYTHON has it. CPU seconds and peak memory count loading the model,
+not importing packages. A process above --limit-gb is stopped, and the row says so.
+Where both run the nodes as they stand and the model has no state, the ranges are held
+against onnxruntime's, bit for bit.
 """
 
 import argparse
+import dataclasses
 import json
-import resource
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
+import psutil
+
+from benchmarks.peer import peak_mb
+from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.plan import make_plan, tensors_of
+from me2e_compress.calibration.sample import Part
 from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.modules import ModuleMap
-from me2e_compress.passes import Context
-from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.import_normalize import ImportNormalize
-from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, replay
 
-RUNS = ("plain", "gauges")
+OURS = {
+    "plain": ("", True),
+    "max-min": ("max-min", True),
+    "entropy": ("entropy", True),
+    "plain, not optimized": ("", False),
+    "max-min, not optimized": ("max-min", False),
+}
+FRAMES = {"resnet50": 32}
+PEERS = {
+    "onnxruntime MinMax": "onnxruntime-minmax",
+    "onnxruntime Entropy": "onnxruntime-entropy",
+    "ModelOpt max": "modelopt",
+}
+LEVEL = {
+    "max-min": "plain",
+    "entropy": "plain",
+    "max-min, not optimized": "plain, not optimized",
+}
+"""What each of our rows is divided by; peers are divided by ``plain``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """What one process took; None where it was stopped."""
+
+    cpu_s: float | None
+    wall_s: float | None
+    peak_mb: float
+    tensors: int | None = None
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("model", type=Path)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--map", default="vad")
-    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--subjects", default="resnet50,bev-head,vad-tiny")
+    parser.add_argument("--frames", type=int, help="8, and 32 of resnet50")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--run", choices=RUNS)
+    parser.add_argument("--limit-gb", type=float, default=14)
+    parser.add_argument("--peer-python", type=Path, default=Path(sys.executable))
+    parser.add_argument("--without", default="", help="rows to leave out, a comma list")
+    parser.add_argument("--run", help="what this process is to measure")
     chosen = parser.parse_args()
     if chosen.run:
         print(json.dumps(measure(chosen)))
         return
-    with tempfile.TemporaryDirectory() as folder:
-        folded = Path(folder) / "folded.onnx"
-        prepare(chosen.model, folded, chosen.map)
-        options = ["--map", chosen.map, "--frames", str(chosen.frames)]
-        options += ["--threads", str(chosen.threads)]
-        rows = {run: child(folded, chosen.folder, run, options) for run in RUNS}
-    plain, gauges = rows["plain"], rows["gauges"]
-    for name, row in rows.items():
-        print(
-            f"{name:8} {row['cpu_s']:7.1f} s CPU {row['wall_s']:7.1f} s wall"
-            f" {row['peak_mb']:7.0f} MB peak, {row['tensors']:.0f} tensors"
-        )
-    print(
-        f"ratio    {gauges['cpu_s'] / plain['cpu_s']:7.2f}"
-        f" {gauges['wall_s'] / plain['wall_s']:14.2f}"
-        f" {gauges['peak_mb'] / plain['peak_mb']:15.2f}"
+    from benchmarks import subjects  # torch: not in the processes that are measured
+
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    for name in chosen.subjects.split(","):
+        count = chosen.frames or FRAMES.get(name, 8)
+        subject = subjects.make(name, chosen.out, count)
+        print(f"\n{name}, {count} frames, {chosen.threads} threads\n", flush=True)
+        show(subject, rows_of(subject, chosen, count))
+
+
+def rows_of(
+    subject: Subject, chosen: argparse.Namespace, count: int
+) -> dict[str, Row | str]:
+    """Measure everything, one process after the other."""
+    rows: dict[str, Row | str] = {}
+    common = ["--frames", str(count), "--threads", str(chosen.threads)]
+    left_out = [each.strip() for each in chosen.without.split(",")]
+    for name in OURS:
+        command = [sys.executable, "-m", "benchmarks.bench_calibration"]
+        command += [str(subject.folder), "--run", name, *common]
+        rows[name] = watch(command, chosen.limit_gb)
+    for name, tool in PEERS.items():
+        if name in left_out:
+            rows[name] = "left out"
+            continue
+        python = chosen.peer_python if tool == "modelopt" else Path(sys.executable)
+        if tool == "modelopt" and not has_modelopt(python):
+            rows[name] = f"not installed for {python}"
+            continue
+        output = subject.folder / f"{tool}.out"
+        command = [str(python), "-W", "ignore", "benchmarks/peer.py", tool]
+        command += [str(subject.model), str(subject.frames), str(output), *common]
+        rows[name] = watch(command, chosen.limit_gb)
+    return rows
+
+
+def watch(command: list[str], limit_gb: float) -> Row | str:
+    """Run a process; stop it where it takes more memory than it may."""
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+    peak = 0.0
+    seen = psutil.Process(process.pid)
+    while process.poll() is None:
+        try:
+            peak = max(peak, seen.memory_info().rss / 2**20)
+        except psutil.NoSuchProcess:
+            break
+        if peak > limit_gb * 1024:
+            process.kill()
+            process.communicate()
+            return Row(None, None, peak)
+        time.sleep(0.05)
+    out, err = process.communicate()
+    if process.returncode:
+        return f"failed: {(err.strip().splitlines() or ['no message'])[-1][:120]}"
+    return Row(**json.loads(out.strip().splitlines()[-1]))
 
 
-def prepare(source: Path, folded: Path, preset: str) -> None:
-    """Write the graph that is calibrated."""
-    context = Context(ModuleMap.load(preset))
-    model = graph.load(source)
-    graph.infer_shapes(model)
-    for each in (ImportNormalize(), FoldConstants()):
-        model = each.run(model, context).model
-    graph.save(model, folded)
+def has_modelopt(python: Path) -> bool:
+    probe = [str(python), "-W", "ignore", "-c", "import modelopt.onnx.quantization"]
+    return subprocess.run(probe, capture_output=True, check=False).returncode == 0
 
 
-def child(model: Path, folder: Path, run: str, options: list[str]) -> dict[str, float]:
-    """Measure in a process of its own."""
-    command = [sys.executable, __file__, str(model), str(folder), *options]
-    done = subprocess.run([*command, "--run", run], check=True, stdout=subprocess.PIPE)
-    found: dict[str, float] = json.loads(done.stdout)
-    return found
-
-
-class Part:
-    """The first frames of a recording."""
-
-    def __init__(self, whole: CalibrationSet, count: int) -> None:
-        self._frames = [whole[index] for index in range(min(count, len(whole)))]
-        self.fingerprint = whole.fingerprint
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self._frames)
-
-
-def measure(chosen: argparse.Namespace) -> dict[str, float]:
+def measure(chosen: argparse.Namespace) -> dict[str, float | int | None]:
     """Run over the frames and weigh this process."""
-    model = graph.load(chosen.model)
-    graph.infer_shapes(model)
-    scheme = QuantScheme.named("full", ModuleMap.load(chosen.map))
-    tensors = tensors_of(make_plan(model, scheme), model)
-    frames = Part(CalibrationSet(chosen.folder), chosen.frames)
+    method, optimize = OURS[chosen.run]
+    subject = at(chosen.out)
+    recording = CalibrationSet(subject.frames)
+    frames = Part(recording, tuple(range(min(chosen.frames, len(recording)))))
     cpu, wall = time.process_time(), time.perf_counter()
-    if chosen.run == "gauges":
-        Calibrator(threads=chosen.threads).run(model, tensors, frames)
+    tensors: tuple[str, ...] = ()
+    model = graph.load(subject.model)
+    if method:
+        graph.infer_shapes(model)
+        modules = ModuleMap.load(str(subject.map))
+        tensors = tensors_of(
+            make_plan(model, QuantScheme.named("full", modules)), model
+        )
+        found = Calibrator(method, chosen.threads, optimize).run(model, tensors, frames)
+        found.save(subject.folder / f"{chosen.run}.json")
     else:
-        for _ in replay(Session(model, threads=chosen.threads), frames):
+        session = Session(model, threads=chosen.threads, optimize=optimize)
+        for _ in replay(session, frames):
             pass
     return {
         "cpu_s": time.process_time() - cpu,
         "wall_s": time.perf_counter() - wall,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "tensors": len(tensors),
+        "peak_mb": peak_mb(),
+        "tensors": len(tensors) or None,
     }
+
+
+def show(subject: Subject, rows: dict[str, Row | str]) -> None:
+    print("| run | tensors | CPU s | x plain | peak MB | x plain | + MB |")
+    print("|---|---|---|---|---|---|---|")
+    for name, row in rows.items():
+        plain = rows[LEVEL.get(name, "plain")]
+        if isinstance(row, str) or isinstance(plain, str):
+            print(f"| {name} | | {row} | | | | |")
+            continue
+        print(
+            f"| {name} | {row.tensors or ''} | {shown(row.cpu_s, '.1f')}"
+            f" | {ratio(row, plain, lambda each: each.cpu_s)}"
+            f" | {row.peak_mb:.0f} | {ratio(row, plain, lambda each: each.peak_mb)}"
+            f" | {row.peak_mb - plain.peak_mb:+.0f} |"
+        )
+    print(f"\n{agreement(subject)}", flush=True)
+
+
+def ratio(row: Row, plain: Row, what: Callable[[Row], float | None]) -> str:
+    above, below = what(row), what(plain)
+    return "-" if above is None or below is None else f"{above / below:.2f}"
+
+
+def shown(value: float | None, form: str) -> str:
+    return "stopped" if value is None else format(value, form)
+
+
+def agreement(subject: Subject) -> str:
+    """Say how many ranges are onnxruntime's, bit for bit."""
+    ours = subject.folder / "max-min, not optimized.json"
+    theirs = subject.folder / "onnxruntime-minmax.out"
+    if Session(subject.model, threads=1, optimize=False).recurrent:
+        return "ranges: not comparable, the other tools feed no state forward"
+    if not ours.is_file() or not theirs.is_file():
+        return "ranges: not compared, one of the two did not finish"
+    mine = json.loads(ours.read_text())["tensors"]
+    other = json.loads(theirs.read_text())
+    common = [name for name in mine if name in other]
+    equal = sum(mine[name] == other[name] for name in common)
+    return f"ranges equal to onnxruntime's MinMax: {equal} of {len(common)} in common"
 
 
 if __name__ == "__main__":

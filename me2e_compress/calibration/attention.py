@@ -1,17 +1,22 @@
 """Find attention: the matrix products around every softmax."""
 
 import dataclasses
-from collections import deque
+import math
 from collections.abc import Collection, Iterable, Iterator
 
 import onnx_ir as ir
 
+from me2e_compress.calibration.nearest import Nearest, ahead, behind
 from me2e_compress.graph import static_shape
 
 FUSED = frozenset(
-    {"Attention", "GroupQueryAttention", "MultiHeadAttention", "PackedAttention"}
-)
-"""Operators that are attention as a whole (ONNX 23, com.microsoft)."""
+    {
+        "Attention", "GroupQueryAttention", "MultiHeadAttention", "PackedAttention",
+        "PackedMultiHeadAttention", "QAttention", "QKVTRT", "QKVTRT2",
+    }
+)  # fmt: skip
+"""Operators that are attention as a whole (ONNX 23, com.microsoft, DerryHub's
+BEVFormer_tensorrt)."""
 
 _PRODUCTS = ("Einsum", "Gemm", "MatMul")
 
@@ -54,84 +59,85 @@ class Attention:
 def find_attention(
     model: ir.Model, constants: Collection[ir.Value]
 ) -> dict[ir.Node, Attention]:
-    """Map every product that takes part in an attention to that attention.
+    """Map every node that takes part in an attention to that attention.
 
-    From each softmax one walk goes back to the product of queries and keys and one
-    forward to the product with the values, through scaling, masks, casts and changes of
-    layout. Both products may be MatMul, Gemm or Einsum, the softmax may be decomposed
-    into ``Div(Exp(x), ReduceSum(Exp(x)))``. Walks stop at every product and never enter
-    a node twice: the search is linear in the size of the graph.
+    One sweep over the graph remembers, for every value, which products lie behind it,
+    another which lie ahead; scaling, masks, casts and changes of layout are looked
+    through. A softmax with a product behind it is an attention: that product is queries
+    by keys, the one ahead weights by values. Products may be MatMul, Gemm or Einsum,
+    the softmax may be decomposed into ``Div(Exp(x), ReduceSum(Exp(x)))``. What a mask
+    is made of is told from the scores by its size. The search is linear in the graph.
+
+    Operators that are attention as a whole (:data:`FUSED`) are mapped too.
 
     Sampling weights of deformable attention come from a linear layer, not from such a
     product, and are not attention here.
 
     Args:
-        model: the graph, shapes inferred.
+        model: the graph, shapes inferred, in topological order.
         constants: values that no input changes: what multiplies one of them from the
-            left is a layer, not an attention.
+            left is a layer, not an attention, unless it is a batch of matrices (keys
+            that are learned or known beforehand).
     """
-    found: dict[ir.Node, Attention] = {}
-    back = _Walk(_SCORES, constants, forward=False)
-    ahead = _Walk(_WEIGHTS, constants, forward=True)
+
+    def is_product(node: ir.Node) -> bool:
+        return _is_product(node, constants)
+
+    scored = behind(model.graph, _SCORES, is_product)
+    weighed = ahead(model.graph, _WEIGHTS, is_product)
+    found = _fused(model.graph)
     for weights, scores in _softmaxes(model.graph):
-        queries_by_keys = back.products(scores)
+        queries_by_keys = [
+            node for node in _products(scored, scores) if _fits(node.outputs[0], scores)
+        ]
         if not queries_by_keys:
             continue
         attention = Attention(*_lengths(queries_by_keys[0].outputs[0]))
-        for product in (*queries_by_keys, *ahead.products(weights)):
+        for product in (*queries_by_keys, *_products(weighed, weights)):
             found.setdefault(product, attention)
     return found
 
 
-class _Walk:
-    """Walks that share what they have seen: a node entered before is not entered."""
+def _products(nearest: Nearest, value: ir.Value) -> list[ir.Node]:
+    return [node for _, node in nearest.get(value, ())]
 
-    def __init__(
-        self,
-        through: frozenset[str],
-        constants: Collection[ir.Value],
-        *,
-        forward: bool,
-    ) -> None:
-        self._through = through
-        self._constants = constants
-        self._forward = forward
-        self._seen: dict[ir.Node, list[ir.Node]] = {}
 
-    def products(self, start: ir.Value) -> list[ir.Node]:
-        """List the products that can be reached from a value, nearest first."""
-        queue, mine = deque([start]), list[ir.Node]()
-        while queue:
-            for node in self._next(queue.popleft()):
-                if node in self._seen:
-                    if self._seen[node] is not mine:
-                        mine += self._seen[node]
-                elif self._is_product(node):
-                    mine.append(node)
-                elif node.op_type in self._through:
-                    self._seen[node] = mine
-                    ends = node.outputs if self._forward else node.inputs
-                    queue.extend(end for end in ends if end is not None)
-        mine[:] = dict.fromkeys(mine)
-        return mine
+def _is_product(node: ir.Node, constants: Collection[ir.Value]) -> bool:
+    """Say whether a node multiplies two things, neither of them a layer's weight.
 
-    def _is_product(self, node: ir.Node) -> bool:
-        """Say whether a node multiplies by a matrix that is computed, not a weight.
+    The left one may be constant: learned queries that have not met the scene yet.
+    """
+    if node.op_type not in _PRODUCTS or node.domain not in ("", "ai.onnx"):
+        return False
+    right = node.inputs[1] if len(node.inputs) > 1 else None
+    if right is None:
+        return False
+    shape = static_shape(right) or ()
+    return right not in constants or math.prod(shape[:-2]) > 1
 
-        The left one may be constant: learned queries that have not met the scene yet.
-        """
-        return (
-            node.op_type in _PRODUCTS
-            and node.domain in ("", "ai.onnx")
-            and node.inputs[1] is not None
-            and node.inputs[1] not in self._constants
-        )
 
-    def _next(self, value: ir.Value) -> Iterable[ir.Node]:
-        if self._forward:
-            return value.consumers()
-        producer = value.producer()
-        return () if producer is None else (producer,)
+def _fits(product: ir.Value, scores: ir.Value) -> bool:
+    """Say whether scores may be this product: as many, or as many a row."""
+    left, right = static_shape(product), static_shape(scores)
+    if not left or not right:
+        return True
+    have, want = math.prod(left), math.prod(right)
+    return have == want or (left[-1] == right[-1] and have > 0 and want % have == 0)
+
+
+def _fused(nodes: Iterable[ir.Node]) -> dict[ir.Node, Attention]:
+    found: dict[ir.Node, Attention] = {}
+    for node in nodes:
+        if node.op_type in FUSED:
+            tokens = [_tokens(value) for value in node.inputs[:2]]
+            found[node] = Attention(tokens[0], tokens[-1])
+    return found
+
+
+def _tokens(value: ir.Value | None) -> int | None:
+    """Count the tokens of queries or keys, [batch, (heads,) tokens, width]."""
+    shape = static_shape(value)
+    return None if shape is None or len(shape) < 2 else shape[-2]
 
 
 def _softmaxes(nodes: Iterable[ir.Node]) -> Iterator[tuple[ir.Value, ir.Value]]:

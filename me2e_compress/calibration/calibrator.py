@@ -1,29 +1,24 @@
-"""One streaming pass over the frames: ranges of many tensors, memory of inference."""
+"""One streaming pass over the frames: many tensors in the memory of inference."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.observers import METHODS
+from me2e_compress.calibration.checkpoint import Checkpoint, Standing
+from me2e_compress.calibration.gauges import Counts, Extremes, Gauge
+from me2e_compress.calibration.observers import observer
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.taps import GAUGES, tap
-from me2e_compress.errors import FramesError, RecipeError
-from me2e_compress.runtime.frames import Frame, Frames
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.calibration.statistics import BINS, Statistics
+from me2e_compress.calibration.stream import Readings, Recording, gauged, stream
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.frames import Array
 
-
-class Recording(Frames, Protocol):
-    """Frames that can say which they are."""
-
-    @property
-    def fingerprint(self) -> str:
-        """A number that changes with the content."""
-        ...
+Progress: TypeAlias = Callable[[int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,76 +26,182 @@ class Calibrator:
     """Measures ranges.
 
     Attributes:
-        method: ``max-min``.
+        method: how statistics become ranges, see
+            :func:`me2e_compress.calibration.observers.observer`.
         threads: within an operator; 0 for every core.
         optimize: False runs the nodes as they stand: the ranges are then those of
             tools that switch onnxruntime's optimizations off, to the bit.
+        checkpoint: a file that says how far a calibration is; where it is there, the
+            calibration goes on from it. It is removed at the end. None keeps nothing.
+        every: frames between two checkpoints.
     """
 
     method: str = "max-min"
     threads: int = 0
     optimize: bool = True
+    checkpoint: Path | None = None
+    every: int = 8
 
     def run(
         self,
         model: ir.Model,
         tensors: Sequence[str],
         frames: Recording,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> Ranges:
-        """Run the model once over the frames, its own recurrent state fed forward.
+        """Collect statistics and read the ranges off them; see :meth:`collect`."""
+        return Ranges.of(
+            self.collect(model, tensors, frames, progress), observer(self.method)
+        )
+
+    def collect(
+        self,
+        model: ir.Model,
+        tensors: Sequence[str],
+        frames: Recording,
+        progress: Progress | None = None,
+    ) -> Statistics:
+        """Run the model over the frames, its own recurrent state fed forward.
+
+        Once; twice where the method needs histograms, whose bins the first pass finds.
 
         Args:
             model: the float graph.
             tensors: which to measure.
-            frames: the recording.
-            progress: called as ``progress(frames done, frames)``.
+            frames: the recording, or part of it in order.
+            progress: called as ``progress(frames done, frames)``, both passes counted.
 
         Raises:
-            FramesError: a frame does not fit, or makes a tensor NaN or infinite; the
-                message names the tensor and the frame.
+            FramesError: no frames; one does not fit, or makes a tensor NaN or infinite
+                (the message names tensor and frame); the checkpoint is of another
+                calibration.
             GraphError: onnxruntime cannot run the graph.
             RecipeError: no such method.
         """
-        if self.method not in METHODS:
-            raise RecipeError(
-                f"no calibration method {self.method}; there is {', '.join(METHODS)}"
-            )
-        observer = METHODS[self.method]()
-        if tensors:
-            session = Session(
-                tap(model, tensors),
-                threads=self.threads,
-                optimize=self.optimize,
-                frugal=True,
-            )
-            for done, (low, high) in enumerate(_extremes(session, tensors, frames), 1):
-                observer.update(low, high)
-                if progress:
-                    progress(done, len(frames))
-        lows, highs = observer.result()
-        ends = zip(lows.tolist(), highs.tolist(), strict=True)
-        return Ranges(
-            dict(zip(tensors, ends, strict=True)),
-            self.method,
-            len(frames),
+        counting = observer(self.method).counts
+        if not len(frames):
+            raise FramesError("no frames to calibrate on")
+        blank = Statistics(
             graph.digest(model),
             frames.fingerprint,
+            tuple(tensors),
+            tuple(frames.places),
+            np.empty((0, len(tensors), Extremes().width), np.float32),
+        )
+        if not tensors:
+            nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
+            return dataclasses.replace(blank, gauges=nothing)
+        job = _Job(self, model, blank, frames, progress, 2 if counting else 1)
+        job.extremes()
+        if counting:
+            job.counts()
+        job.book.clear()
+        return job.seen
+
+
+class _Job:
+    """One calibration under way."""
+
+    def __init__(
+        self,
+        settings: Calibrator,
+        model: ir.Model,
+        blank: Statistics,
+        frames: Recording,
+        progress: Progress | None,
+        passes: int,
+    ) -> None:
+        self.settings = settings
+        self.model = model
+        self.frames = frames
+        self.progress = progress
+        self.total = passes * len(frames)
+        key = {
+            "model": blank.model,
+            "recording": blank.source,
+            "choice of frames": list(blank.frames),
+            "list of tensors": list(blank.tensors),
+            "optimization level": settings.optimize,
+            "kind of method": "counts" if passes == 2 else "extremes",
+        }
+        self.book = Checkpoint(settings.checkpoint, key, settings.every)
+        self.begun = self.book.read()
+        gauges = self.begun.results.get("gauges", blank.gauges)
+        counts = self.begun.results.get("counts")
+        self.seen = dataclasses.replace(
+            blank,
+            gauges=np.asarray(gauges, np.float32),
+            counts=None if counts is None else np.array(counts, np.int64),
         )
 
+    def extremes(self) -> None:
+        """Take smallest, largest and mean square of every tensor, frame by frame."""
+        rows = list(self.seen.gauges)
 
-def _extremes(
-    session: Session, tensors: Sequence[str], frames: Iterable[Frame]
-) -> "Iterable[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]":
-    for index, values in enumerate(replay(session, frames, [GAUGES])):
-        gauges = values[GAUGES].astype(np.float32).reshape(-1, 3)
-        bad = np.isnan(gauges).any(1) | np.isinf(gauges[:, :2]).any(1)
-        if bad.any():
-            names = [tensors[at] for at in np.flatnonzero(bad).tolist()]
-            first = gauges[bad][0]
-            kind = "NaN" if np.isnan(first).any() else "infinite"
-            raise FramesError(
-                f"frame {index} makes tensor {names[0]} {kind}, and {len(names) - 1}"
-                f" more of {len(tensors)}: no range can be read from it"
-            )
-        yield gauges[:, 0], gauges[:, 1]
+        def take(readings: Readings, place: int) -> None:
+            _refuse_what_is_no_number(readings, self.seen.tensors, place)
+            rows.append(readings)
+            self.seen = dataclasses.replace(self.seen, gauges=np.stack(rows))
+
+        self._pass(Extremes(), 0, take)
+
+    def counts(self) -> None:
+        """Count the magnitudes of every tensor, all frames together."""
+        blank = np.zeros((len(self.seen.tensors), BINS), np.int64)
+        total = blank if self.seen.counts is None else self.seen.counts
+        self.seen = dataclasses.replace(self.seen, counts=total)
+
+        def take(readings: Readings, place: int) -> None:
+            np.add(total, readings.astype(np.int64), out=total)
+
+        self._pass(Counts(self.seen.exponents), len(self.frames), take)
+
+    def _pass(
+        self, gauge: Gauge, before: int, take: Callable[[Readings, int], None]
+    ) -> None:
+        """Run what is left of a pass; ``before`` frames were run by earlier passes."""
+        begin = max(self.begun.done - before, 0)
+        if begin >= len(self.frames):
+            return
+        session = gauged(
+            self.model,
+            self.seen.tensors,
+            gauge,
+            threads=self.settings.threads,
+            optimize=self.settings.optimize,
+        )
+        state = self.begun.state if begin else None
+        readings = stream(session, self.frames, gauge.width, begin, state)
+        for at, (numbers, after) in enumerate(readings, begin):
+            take(numbers, self.seen.frames[at])
+            done = before + at + 1
+            if self.book.due(done, self.total):
+                self.book.write(Standing(done, self._results(), after))
+            if self.progress:
+                self.progress(done, self.total)
+
+    def _results(self) -> dict[str, Array]:
+        results: dict[str, Array] = {"gauges": self.seen.gauges}
+        if self.seen.counts is not None:
+            results["counts"] = self.seen.counts
+        return results
+
+
+def _refuse_what_is_no_number(
+    readings: Readings, tensors: Sequence[str], place: int
+) -> None:
+    """Stop at a NaN or infinite element; a mean square may overflow, that is no harm.
+
+    Raises:
+        FramesError: names the first such tensors and the frame.
+    """
+    bad = np.isnan(readings).any(1) | np.isinf(readings[:, :2]).any(1)
+    if not bad.any():
+        return
+    names = [tensors[at] for at in np.flatnonzero(bad).tolist()]
+    kind = "NaN" if np.isnan(readings[bad][0]).any() else "infinite"
+    more = f" ({', '.join(names[1:5])}{', ...' if len(names) > 5 else ''})"
+    raise FramesError(
+        f"frame {place} makes tensor {names[0]} {kind}, and {len(names) - 1} more of"
+        f" {len(tensors)}{more if len(names) > 1 else ''}: no range can be read from it"
+    )

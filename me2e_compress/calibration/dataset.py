@@ -47,6 +47,11 @@ class CalibrationSet:
         """Count the frames."""
         return len(self.files)
 
+    @property
+    def places(self) -> range:
+        """Where the frames stand in the recording: all of them, in order."""
+        return range(len(self.files))
+
     def __iter__(self) -> Iterator[Frame]:
         """Read the frames in order, one in memory at a time."""
         return (self[index] for index in range(len(self)))

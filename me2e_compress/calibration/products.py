@@ -10,16 +10,18 @@ from me2e_compress.graph import static_shape
 
 @dataclasses.dataclass(frozen=True)
 class Extent:
-    """Size of one matrix product.
+    """Size of one matrix product, [M, K] x [K, N].
 
     Attributes:
         rows: M: of a product with a plain weight, all leading dimensions together;
             of a batch of products, the rows of one. None where the shape is open.
         columns: N, likewise of one product.
+        depth: K, what is summed over.
     """
 
     rows: int | None
     columns: int | None
+    depth: int | None
 
     @property
     def is_vector(self) -> bool:
@@ -41,16 +43,27 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     """
     left, right = static_shape(node.inputs[0]), static_shape(node.inputs[1])
     if node.op_type == "Gemm":
-        flip_left = bool(node.attributes.get_int("transA", 0))
-        flip_right = bool(node.attributes.get_int("transB", 0))
-        return Extent(
-            None if left is None else left[1 if flip_left else 0],
-            None if right is None else right[0 if flip_right else 1],
-        )
-    columns = None if right is None else (right[-1] if len(right) > 1 else 1)
-    if left is None:
-        return Extent(None, columns)
+        return _gemm(node, left, right)
+    columns, depth = (None, None) if right is None else _sides(right)
+    if not left:
+        return Extent(None, columns, depth)
     shared = weight and right is not None and math.prod(right[:-2]) == 1
-    if shared or len(left) < 2:
-        return Extent(math.prod(left[:-1]), columns)
-    return Extent(left[-2], columns)
+    rows = math.prod(left[:-1]) if shared or len(left) == 1 else left[-2]
+    return Extent(rows, columns, left[-1])
+
+
+def _sides(right: tuple[int, ...]) -> tuple[int, int]:
+    """Give N and K of a right operand; a vector is one column."""
+    return (right[-1], right[-2]) if len(right) > 1 else (1, math.prod(right))
+
+
+def _gemm(
+    node: ir.Node, left: tuple[int, ...] | None, right: tuple[int, ...] | None
+) -> Extent:
+    flip_left = bool(node.attributes.get_int("transA", 0))
+    flip_right = bool(node.attributes.get_int("transB", 0))
+    return Extent(
+        None if left is None else left[1 if flip_left else 0],
+        None if right is None else right[0 if flip_right else 1],
+        None if right is None else right[1 if flip_right else 0],
+    )

@@ -4,10 +4,21 @@ import dataclasses
 from pathlib import Path
 from typing import Self
 
+import numpy as np
 import pydantic
 
+from me2e_compress.calibration.observers import Observer, observer
+from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_json
+
+OUTLIER_CREST = 64
+"""Largest magnitude over root mean square (crest factor) beyond which a tensor is
+reported: its int8 step then exceeds half its root mean square, so that most elements
+round to 0, 1 or 2 steps."""
+
+IMPORTED = "imported"
+"""Method of ranges that another tool measured; on which frames, is not known."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,11 +26,13 @@ class Ranges:
     """The range of every calibrated tensor.
 
     Attributes:
-        tensors: (smallest, largest) element seen, by tensor name.
-        method: how extremes became ranges, e.g. ``max-min``.
+        tensors: (low end, high end) of the range, by tensor name.
+        method: how statistics became ranges, e.g. ``max-min`` or ``percentile:99.9``.
         frames: how many frames were seen.
         model: digest of the graph they were measured on.
-        source: fingerprint of the frames.
+        source: fingerprint of the recording.
+        outliers: crest factor of each tensor whose range a few elements make, see
+            :data:`OUTLIER_CREST`.
     """
 
     tensors: dict[str, tuple[float, float]]
@@ -27,6 +40,25 @@ class Ranges:
     frames: int
     model: str
     source: str
+    outliers: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, seen: Statistics, method: Observer) -> Self:
+        """Read ranges off what a calibration saw.
+
+        Raises:
+            FramesError: the method needs histograms, and none were collected.
+        """
+        lows, highs = method.ranges(seen)
+        ends = zip(lows.tolist(), highs.tolist(), strict=True)
+        return cls(
+            dict(zip(seen.tensors, ends, strict=True)),
+            method.text,
+            len(seen.frames),
+            seen.model,
+            seen.source,
+            _outliers(seen),
+        )
 
     @property
     def dead(self) -> tuple[str, ...]:
@@ -69,9 +101,11 @@ class Ranges:
             tensors: what it needs a range of.
             method: what was asked for.
             source: fingerprint of the frames at hand; None if there are none.
+                Imported ranges fit any method and frames.
 
         Raises:
             FramesError: says what is stale, and what to do.
+            RecipeError: no such method.
         """
         again = "calibrate the graph that is being quantized again"
         if self.model != model:
@@ -79,11 +113,13 @@ class Ranges:
                 f"ranges are stale: of graph {self.model[:12]}, not {model[:12]};"
                 f" {again}"
             )
-        if self.method != method:
-            raise FramesError(f"ranges are of method {self.method}, asked for {method}")
-        if source is not None and self.source != source:
+        asked = observer(method).text
+        if self.method not in (asked, IMPORTED):
+            raise FramesError(f"ranges are of method {self.method}, asked for {asked}")
+        wanted = self.source if source is None else source
+        if self.method != IMPORTED and self.source != wanted:
             raise FramesError(
-                f"ranges are stale: of frames {self.source[:12]}, not {source[:12]};"
+                f"ranges are stale: of frames {self.source[:12]}, not {wanted[:12]};"
                 f" {again}"
             )
         if missing := [name for name in tensors if name not in self.tensors]:
@@ -91,3 +127,16 @@ class Ranges:
                 f"ranges lack {missing[0]} and {len(missing) - 1} more of"
                 f" {len(tensors)} tensors; {again}"
             )
+
+
+def _outliers(seen: Statistics) -> dict[str, float]:
+    """Give the crest factors that are too large, each to three digits."""
+    if not seen.tensors:
+        return {}
+    root = np.sqrt(seen.gauges[:, :, 2].astype(np.float64).mean(axis=0))
+    crest = seen.reach / np.where(root > 0, root, np.inf)
+    return {
+        name: float(f"{factor:.3g}")
+        for name, factor in zip(seen.tensors, crest.tolist(), strict=True)
+        if factor > OUTLIER_CREST
+    }

@@ -3,6 +3,7 @@
 import typer
 from rich.markup import escape
 
+from me2e_compress.cli.calibrate import calibrate
 from me2e_compress.cli.compare import compare
 from me2e_compress.cli.compress import compress
 from me2e_compress.cli.console import errors
@@ -12,7 +13,10 @@ from me2e_compress.cli.export import export
 from me2e_compress.cli.extras import closed_loop
 from me2e_compress.cli.frames import frames
 from me2e_compress.cli.inspect import inspect
+from me2e_compress.cli.lint import lint
+from me2e_compress.cli.plan import plan
 from me2e_compress.cli.profile import profile
+from me2e_compress.cli.sensitivity import search, sensitivity
 from me2e_compress.errors import Me2eError
 
 app = typer.Typer(
@@ -22,7 +26,10 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (demo, doctor, export, inspect, frames, compress, compare, profile):
+for command in (
+    demo, doctor, export, inspect, frames, calibrate, plan, compress, lint, compare,
+    profile, sensitivity, search,
+):  # fmt: skip
     app.command()(command)
 closed_loop(app)
 

@@ -12,6 +12,7 @@ from me2e_compress.cli.console import (
     megabytes,
     print_json,
 )
+from me2e_compress.cli.int8 import Int8Options
 from me2e_compress.cli.job import check_output, choose, run, write
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.tables import notes, steps_table, verification_table
@@ -34,7 +35,23 @@ def compress(
         str | None,
         typer.Option(help="int8 modules: feature-ext, prediction or full"),
     ] = None,
+    rules: Annotated[
+        str | None, typer.Option(help="of the int8 plan: paper or tensorrt")
+    ] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(help="who runs the int8 graph: tensorrt or onnxruntime"),
+    ] = None,
+    overrides: Annotated[
+        Path | None, typer.Option(help="TOML file of exceptions to the int8 plan")
+    ] = None,
     frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
+    ranges: Annotated[
+        Path | None, typer.Option(help="saved RANGES.json instead of frames")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option(help="of calibration: max-min, percentile:99.9, ...")
+    ] = None,
     module_map: Annotated[
         str | None, typer.Option("--map", help="a preset or a TOML file")
     ] = None,
@@ -47,7 +64,8 @@ def compress(
     """Apply passes to a graph, check each, and write the smaller graph and a report."""
     source = model_path(model)
     check_output(source, output)
-    chosen = choose(recipe_name, passes, scheme)
+    int8 = Int8Options(scheme, rules, target, overrides, ranges, method)
+    chosen = choose(recipe_name, passes, int8)
     report = run(source, chosen, frames, module_map, seed, verify_frames, output.parent)
     report_path = write(report, source, output)
     if as_json:

@@ -18,6 +18,7 @@ from me2e_compress.manager.report import versions
 _EXTRAS = (
     ("torch", "zoo", "export the reference stacks, train the driver"),
     ("highway_env", "highway", "drive models in closed loop"),
+    ("tensorrt_rtx", "trt-check", "parse and build for TensorRT without a GPU"),
     ("onnxslim", "bench", "compare with onnxslim in the benchmarks"),
 )
 

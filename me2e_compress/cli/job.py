@@ -6,12 +6,13 @@ import onnx_ir as ir
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.plan import plan_of, save_plan
 from me2e_compress.cli.console import progress
+from me2e_compress.cli.int8 import Int8Options
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.atomic import write_json
 
 
@@ -28,12 +29,13 @@ def check_output(model: Path, output: Path) -> None:
 
 
 def choose(
-    recipe_name: str | None, passes: str | None, scheme: str | None
+    recipe_name: str | None, passes: str | None, int8: Int8Options
 ) -> tuple[Pass, ...]:
     """Build the passes that the options ask for.
 
     Raises:
-        RecipeError: both a recipe and a pipeline, none of the three, or a bad one.
+        RecipeError: both a recipe and a pipeline, none of the three, or a bad one;
+            options of int8 without int8.
     """
     if recipe_name is not None and passes is not None:
         raise RecipeError("give a recipe (-r) or a pipeline (--passes), not both")
@@ -41,16 +43,14 @@ def choose(
         chosen = recipe.load(recipe_name)
     elif passes is not None:
         chosen = recipe.parse(passes)
-    elif scheme is not None:
+    elif int8.scheme is not None:
         chosen = recipe.load("exact")
     else:
         raise RecipeError(
             f"say what to do: -r RECIPE ({', '.join(recipe.shipped())}), --passes TEXT"
             " or --scheme"
         )
-    if scheme is not None:
-        chosen = (*chosen, QuantizeInt8(scheme=scheme))
-    return chosen
+    return int8.apply(chosen)
 
 
 def run(
@@ -80,8 +80,14 @@ def run_on(model: ir.Model, passes: tuple[Pass, ...], modules: ModuleMap) -> ir.
 
 
 def write(report: Report, source: Path, output: Path) -> Path:
-    """Write the graph, and beside it what was done to it; give the report's path."""
+    """Write the graph, and beside it what was done to it; give the report's path.
+
+    A quantized graph has its plan beside it too, as ``OUTPUT.plan.json``.
+    """
     graph.save(report.model, output)
+    plan = plan_of(report.model)
+    if plan is not None:
+        save_plan(plan, output.with_name(output.stem + ".plan.json"))
     path = output.with_name(output.stem + ".report.json")
     write_json(path, report.record(source, output), indent=2)
     return path

@@ -3,15 +3,15 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable
-from typing import TypeAlias
+from collections.abc import Iterable, Iterator
+from typing import Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.session import Session, replay
 
 Float64: TypeAlias = npt.NDArray[np.float64]
@@ -64,6 +64,30 @@ class Fidelity:
     frames: int
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reference:
+    """What the model to be true to answered, for holding many others against it.
+
+    Attributes:
+        session: the model.
+        frames: the recording.
+        answers: its outputs on every frame, all in memory.
+    """
+
+    session: Session
+    frames: Frames
+    answers: tuple[dict[str, Array], ...]
+
+    @classmethod
+    def of(cls, session: Session, frames: Frames) -> Self:
+        """Run the model once over the frames."""
+        return cls(session, frames, tuple(replay(session, frames)))
+
+    def compare(self, other: Session) -> Fidelity:
+        """Hold another model against it, as :func:`compare` does."""
+        return _compare(self.session, iter(self.answers), other, self.frames)
+
+
 def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
 
@@ -79,6 +103,13 @@ def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
             is not a number; the message names it.
         FramesError: a frame fits one of the models not.
     """
+    here, there = itertools.tee(frames)
+    return _compare(a, replay(a, here), b, there)
+
+
+def _compare(
+    a: Session, answers: Iterator[dict[str, Array]], b: Session, frames: Iterable[Frame]
+) -> Fidelity:
     shared = [name for name in a.outputs if name in b.outputs]
     if not shared:
         raise EvaluationError(
@@ -88,8 +119,8 @@ def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
     adapter, reason = _common_adapter(a, b)
     moved: list[Float64] = []
     count = 0
-    here, there, along = itertools.tee(frames, 3)
-    runs = zip(replay(a, here, shared), replay(b, there, shared), along, strict=True)
+    there, along = itertools.tee(frames)
+    runs = zip(answers, replay(b, there, shared), along, strict=True)
     for left, right, frame in runs:
         for name, tally in tallies.items():
             tally.add(left[name], right[name], count)

@@ -7,6 +7,7 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fold_with_onnxsim import FoldWithOnnxsim
 from me2e_compress.passes.fuse_basic import FuseBasic
 from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 
 PASSES: dict[str, type[Pass]] = {
@@ -19,6 +20,7 @@ PASSES: dict[str, type[Pass]] = {
         AblateModules,
         FuseBasic,
         QuantizeInt8,
+        LowerInt8,
     )
 }
 

@@ -7,21 +7,26 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.plan import INT8, QuantPlan, make_plan, tensors_of
+from me2e_compress.calibration.plan import (
+    INT8,
+    Overrides,
+    QuantPlan,
+    make_plan,
+    sharing_costs,
+    stamp_plan,
+)
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.rules import paper_rules
+from me2e_compress.calibration.rules import rules_named
 from me2e_compress.calibration.scheme import QuantScheme
-from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, PassResult
-from me2e_compress.targets.tensorrt import place_qdq
+from me2e_compress.passes.measured import measured_ranges
+from me2e_compress.targets import target_named
+from me2e_compress.targets.lint import lint
+from me2e_compress.targets.quantized import describe_quantized
 
-QUANTIZED_OPS = frozenset(
-    {
-        "ConvInteger", "DequantizeLinear", "DynamicQuantizeLinear", "MatMulInteger",
-        "QLinearConv", "QLinearMatMul", "QuantizeLinear",
-    }
-)  # fmt: skip
+_SHOWN = 5
+"""How many of a kind a note lists."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,15 +37,22 @@ class QuantizeInt8:
     Result:  y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
 
     Which nodes, and why the others not, is the plan's to say
-    (:mod:`me2e_compress.calibration.plan`): attention of more than ``attention_limit``
-    tokens and matrix-vector products stay float. Ranges are measured on the context's
-    frames, or read from a file; there is no calibration on made-up data.
+    (:mod:`me2e_compress.calibration.plan`), and the graph carries it in its metadata:
+    attention of more than ``attention_limit`` tokens and matrix-vector products stay
+    float. Ranges are measured on the context's frames, or read from a file; there is no
+    calibration on made-up data.
 
     Attributes:
         scheme: ``feature-ext``, ``prediction`` or ``full``.
         modules: module names instead of a scheme.
+        rules: ``paper``, its two stages alone; ``tensorrt``, with what its kernels
+            and coordinates need besides.
+        without: ids of rules that are switched off, e.g. ``gemv``.
+        target: who will run the graph.
         attention_limit: longest attention that becomes int8, in tokens.
-        method: how ranges are read from the frames: ``max-min``.
+        overrides: TOML file of exceptions to the plan.
+        method: how ranges are read from the frames: ``max-min``,
+            ``moving-average:W``, ``percentile:P``, ``mse`` or ``entropy``.
         ranges: file of saved ranges instead of frames.
     """
 
@@ -49,7 +61,11 @@ class QuantizeInt8:
     changes_interface: ClassVar[bool] = False
     scheme: str = "full"
     modules: tuple[str, ...] = ()
+    rules: str = "paper"
+    without: tuple[str, ...] = ()
+    target: str = "tensorrt"
     attention_limit: int = 512
+    overrides: str | None = None
     method: str = "max-min"
     ranges: str | None = None
 
@@ -60,68 +76,94 @@ class QuantizeInt8:
             PreconditionError: the graph is quantized already, or of opset below 13.
             FramesError: neither frames nor ranges, or they are of another graph.
             ModuleMapError: no such module.
-            RecipeError: no such scheme or method.
+            RecipeError: no such scheme, rules, target or method, or bad overrides.
         """
-        _refuse_quantized(model)
+        if found := describe_quantized(model):
+            raise PreconditionError(
+                f"the graph is quantized already: {found}; int8 is not put on int8,"
+                " give the float graph that it was made of, or let lower-int8 rewrite"
+                " this one for onnxruntime"
+            )
+        target = target_named(self.target)
         graph.infer_shapes(model)
-        rules = paper_rules(self.attention_limit)
-        plan = make_plan(model, self._scheme(context), rules)
-        tensors = tensors_of(plan, model)
+        plan = self.plan(model, context)
+        tensors = target.tensors(plan, model)
         if not tensors:
             return PassResult(model, 0, ("nothing to quantize", *_notes(plan)))
-        ranges = self._ranges(model, tensors, context)
-        placed = place_qdq(model, plan, ranges)
-        notes = (*_notes(plan), *_findings(ranges))
+        ranges = measured_ranges(
+            self.name,
+            model,
+            tensors,
+            context,
+            method=self.method,
+            saved=self.ranges,
+        )
+        placed = target.place(model, plan, ranges)
+        stamp_plan(placed, plan)
+        notes = (*_notes(plan), *_findings(plan, ranges), _lint(placed, self.target))
         return PassResult(placed, len(plan.chosen), notes)
+
+    def plan(self, model: ir.Model, context: Context) -> QuantPlan:
+        """Decide for every node of a graph whose shapes are inferred."""
+        overrides = Overrides()
+        if self.overrides is not None:
+            overrides = Overrides.load(Path(self.overrides))
+        rules = rules_named(self.rules, self.attention_limit).without(self.without)
+        return make_plan(model, self._scheme(context), rules, overrides)
 
     def _scheme(self, context: Context) -> QuantScheme:
         if self.modules:
             return QuantScheme.of(self.modules, context.modules)
         return QuantScheme.named(self.scheme, context.modules)
 
-    def _ranges(
-        self, model: ir.Model, tensors: tuple[str, ...], context: Context
-    ) -> Ranges:
-        frames = context.frames
-        if self.ranges is not None:
-            saved = Ranges.load(Path(self.ranges))
-            saved.check(
-                model=graph.digest(model),
-                tensors=tensors,
-                method=self.method,
-                source=None if frames is None else frames.fingerprint,
-            )
-            return saved
-        if frames is None:
-            raise FramesError(
-                f"{self.name} needs recorded frames (--frames) or saved ranges"
-                " (--ranges): int8 ranges are never made up"
-            )
-        return Calibrator(self.method).run(model, tensors, frames)
-
-
-def _refuse_quantized(model: ir.Model) -> None:
-    for node in model.graph.all_nodes():
-        if node.op_type in QUANTIZED_OPS:
-            raise PreconditionError(
-                f"the graph is quantized already: {node.op_type} {node.name!r};"
-                " give the float graph, int8 is not put on int8"
-            )
-
 
 def _notes(plan: QuantPlan) -> tuple[str, ...]:
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
     scheme = plan.scheme
+    close = [f"{each.node}: {each.borderline}" for each in plan.borderline]
     return (
         f"scheme {scheme.name}: {', '.join(scheme.modules)}",
         f"{len(plan.chosen)} of {len(plan.decisions)} nodes {INT8}; by rule: {counts}",
+        *_first(close, "close decisions"),
     )
 
 
-def _findings(ranges: Ranges) -> tuple[str, ...]:
+def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
     notes = [f"{len(ranges.tensors)} tensors calibrated on {ranges.frames} frames"]
-    if ranges.dead:
-        notes.append(
-            f"{len(ranges.dead)} tensors are always zero: {', '.join(ranges.dead[:5])}"
-        )
-    return tuple(notes)
+    costs = sorted(sharing_costs(plan, ranges), key=lambda cost: -cost.loss_db)
+    shared = [
+        f"{cost.group.name}: {len(cost.group.tensors)} tensors, {cost.tensor} loses"
+        f" {cost.loss_db:.1f} dB"
+        for cost in costs
+    ]
+    return (
+        *notes,
+        *_first(list(ranges.dead), "always zero"),
+        *_first(_outliers(ranges), "a few elements make the range"),
+        *_first(shared, "scales shared by what a Concat joins"),
+    )
+
+
+def _lint(model: ir.Model, target: str) -> str:
+    found = lint(model, target)
+    if not found:
+        return f"lint for {target}: nothing found"
+    first = found[0]
+    return (
+        f"lint for {target}: {len(found)} findings, first {first.severity}"
+        f" {first.rule} {first.node!r}: {first.message}"
+    )
+
+
+def _outliers(ranges: Ranges) -> list[str]:
+    worst = sorted(ranges.outliers.items(), key=lambda item: -item[1])
+    return [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
+
+
+def _first(found: list[str], what: str) -> tuple[str, ...]:
+    """List the first few of many on one line, or nothing."""
+    if not found:
+        return ()
+    more = len(found) - _SHOWN
+    listed = "; ".join(found[:_SHOWN])
+    return (f"{what}: {listed}" + (f"; and {more} more" if more > 0 else ""),)

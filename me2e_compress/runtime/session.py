@@ -36,6 +36,7 @@ DTYPES: Mapping[str, np.dtype[np.generic]] = {
 
 
 _SHRINK = "memory.enable_memory_arena_shrinkage"
+_WEIGHTS_FILE = "session.optimized_model_external_initializers_file_name"
 
 
 class Session:
@@ -50,6 +51,8 @@ class Session:
             memory pattern, which reserves one block for everything that ever lives.
         release: True gives working memory back after every run, so that several
             sessions stand side by side in the memory of one.
+        rewritten: a file to write the graph to as onnxruntime's optimizations leave
+            it, its weights in a file beside it; it fits this machine's kernels only.
 
     Attributes:
         inputs: by name, what must be fed, in order.
@@ -69,6 +72,7 @@ class Session:
         optimize: bool = True,
         frugal: bool = False,
         release: bool = False,
+        rewritten: Path | None = None,
     ) -> None:
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
@@ -83,6 +87,9 @@ class Session:
         options.enable_mem_pattern = False
         if frugal:
             options.execution_order = ort.ExecutionOrder.PRIORITY_BASED
+        if rewritten is not None:
+            options.optimized_model_filepath = str(rewritten)
+            options.add_session_config_entry(_WEIGHTS_FILE, f"{rewritten.name}.data")
         self._each_run = ort.RunOptions()
         if release:
             self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
@@ -121,7 +128,10 @@ class Session:
 
 
 def replay(
-    session: Session, frames: Iterable[Frame], outputs: Sequence[str] | None = None
+    session: Session,
+    frames: Iterable[Frame],
+    outputs: Sequence[str] | None = None,
+    state: Mapping[str, Array] | None = None,
 ) -> Iterator[dict[str, Array]]:
     """Run a model over a recording, its own recurrent state fed forward.
 
@@ -133,6 +143,8 @@ def replay(
         session: the model.
         frames: the recording.
         outputs: which to yield; None for all.
+        state: what the recurrent inputs hold before a first frame that continues a
+            scene: where a replay that was interrupted goes on.
 
     Yields:
         The outputs of every frame, in order.
@@ -143,20 +155,20 @@ def replay(
     """
     wanted = list(session.outputs) if outputs is None else list(outputs)
     fetched = list(dict.fromkeys([*wanted, *session.recurrent.values()]))
-    state: dict[str, Array] = {}
+    memory: Mapping[str, Array] = {} if state is None else state
     for frame in frames:
         if frame.starts_scene:
-            state = {
+            memory = {
                 name: frame.arrays[name]
                 if name in frame.arrays
                 else _zeros(name, session.inputs[name])
                 for name in session.recurrent
             }
         try:
-            values = session.run({**frame.arrays, **state}, fetched)
+            values = session.run({**frame.arrays, **memory}, fetched)
         except FramesError as error:
             raise FramesError(f"frame {frame.index}: {error}") from error
-        state = {name: values[answer] for name, answer in session.recurrent.items()}
+        memory = {name: values[answer] for name, answer in session.recurrent.items()}
         yield {name: values[name] for name in wanted}
 
 

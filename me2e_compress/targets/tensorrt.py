@@ -3,7 +3,8 @@
 The rules (TensorRT 10 developer guide, "Explicit quantization", and what its ONNX
 parser accepts): zero points are 0; activations have one scale a tensor, weights one a
 channel; weights are stored as int8 behind a DequantizeLinear; biases and outputs have
-no QDQ; every reader of a tensor shares one pair.
+no QDQ, and of an Add only the residual branch has; every int8 reader of a tensor shares
+one pair, every float reader reads the tensor itself.
 """
 
 from collections.abc import Mapping
@@ -14,7 +15,12 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.observers import scale_of
-from me2e_compress.calibration.plan import Decision, QuantPlan
+from me2e_compress.calibration.plan import (
+    Decision,
+    QuantPlan,
+    share_scales,
+    tensors_of,
+)
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.weights import quantize_weight
 from me2e_compress.errors import PreconditionError
@@ -28,7 +34,12 @@ MIN_OPSET = 13
 BY = "quantize-int8"
 
 
-def place_qdq(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
+def tensors(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
+    """Name the activations that :func:`place` needs a range of."""
+    return tensors_of(plan, model)
+
+
+def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
     """Give a copy of a graph in which the plan's nodes read int8.
 
     Args:
@@ -53,7 +64,7 @@ def place_qdq(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
     copy = model.clone()
     nodes = {str(node.outputs[0].name): node for node in copy.graph}
     computed = evaluate_constants(model, _computed_weights(nodes, plan))
-    writer = _Writer(copy.graph, ranges, computed)
+    writer = _Writer(copy.graph, share_scales(plan, ranges), computed)
     for decision in plan.chosen:
         writer.apply(nodes[decision.output], decision)
     graph.sweep(copy)

@@ -5,7 +5,13 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.plan import Decision, make_plan, tensors_of
-from me2e_compress.calibration.rules import Operator, Weight, paper_rules
+from me2e_compress.calibration.rules import (
+    Operator,
+    RuleSet,
+    Weight,
+    paper_rules,
+    tensorrt_rules,
+)
 from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.errors import ModuleMapError, RecipeError
 from tests.nets import MODULES, conv_attention, net
@@ -213,7 +219,7 @@ def test_unknown_schemes_and_modules_are_errors() -> None:
 def test_a_rule_can_be_switched_off() -> None:
     model = net(LINEAR % ("1,64", "64,32", "1,32"), {"w": np.ones((64, 32))})
 
-    plan = make_plan(model, HEAD, (Operator(), Weight()))
+    plan = make_plan(model, HEAD, RuleSet("own", (Operator(), Weight())))
 
     assert plan.counts() == {"layer": 1}
 
@@ -238,3 +244,13 @@ def test_planning_is_linear_on_diamonds_and_on_many_softmaxes() -> None:
 
     # eight times the nodes; quadratic would be 64 times the time
     assert seconds[1] < 24 * max(seconds[0], 0.01)
+
+
+def test_five_thousand_nodes_are_planned_in_two_seconds() -> None:
+    model = diamonds(1250)
+    start = time.process_time()
+
+    plan = make_plan(model, HEAD, tensorrt_rules())
+
+    assert len(plan.decisions) > 5000
+    assert time.process_time() - start < 2

@@ -6,6 +6,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.plan import plan_of
 from me2e_compress.errors import (
     FramesError,
     ModuleMapError,
@@ -17,7 +18,7 @@ from me2e_compress.passes.base import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
 from tests.frames import record
-from tests.nets import MODULES, conv_attention, image
+from tests.nets import MODULES, conv_attention, image, net
 
 TENSORS = ("image", "q", "seen", "p", "mixed")
 
@@ -78,8 +79,79 @@ def test_without_frames_there_is_no_calibration() -> None:
 def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
     once = QuantizeInt8().run(conv_attention(), context).model
 
-    with pytest.raises(PreconditionError, match="quantized already: QuantizeLinear"):
+    with pytest.raises(PreconditionError) as caught:
         QuantizeInt8().run(once, context)
+
+    assert "quantized already: 7 DequantizeLinear, 5 QuantizeLinear" in str(
+        caught.value
+    )
+    assert "int8 with zero points 0; it carries the plan it was made by" in str(
+        caught.value
+    )
+
+
+def test_the_graph_carries_its_plan(context: Context) -> None:
+    plan = plan_of(QuantizeInt8(rules="tensorrt").run(conv_attention(), context).model)
+
+    assert plan is not None
+    assert plan.rules == "tensorrt"
+    assert len(plan.decisions) == 10
+
+
+def test_rules_of_tensorrt_keep_small_layers_in_float(context: Context) -> None:
+    notes = QuantizeInt8(rules="tensorrt").run(conv_attention(), context).notes
+
+    assert "1 of 10 nodes int8; by rule: layer 1, small-product 3" in notes
+
+
+@pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
+def test_what_was_placed_is_held_against_its_target(
+    context: Context, target: str
+) -> None:
+    notes = QuantizeInt8(target=target).run(conv_attention(), context).notes
+
+    assert notes[-1] == f"lint for {target}: nothing found"
+
+
+def test_what_the_target_refuses_is_noted(context: Context) -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    det (float[1,3,8,8] image, float[8,3,1,1] w) => (float[1,8] y) {
+        ["/backbone/Conv"] a = Conv(image, w)
+        ["/backbone/Det"] y = Det(a)
+    }
+    """
+    model = net(text, {"w": np.ones((8, 3, 1, 1))})
+
+    notes = QuantizeInt8(scheme="feature-ext").run(model, context).notes
+
+    assert "TensorRT's parser does not take Det" in notes[-1]
+
+
+def test_a_rule_that_is_switched_off_objects_to_nothing(context: Context) -> None:
+    options = QuantizeInt8(rules="tensorrt", without=("small-product",))
+
+    notes = options.run(conv_attention(), context).notes
+
+    assert "4 of 10 nodes int8; by rule: attention 2, layer 2" in notes
+
+
+def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> None:
+    path = tmp_path / "overrides.toml"
+    path.write_text('[[override]]\nmodule = "head"\ndtype = "float"\n')
+
+    notes = QuantizeInt8(overrides=str(path)).run(conv_attention(), context).notes
+
+    assert "1 of 10 nodes int8; by rule: layer 1, override 3" in notes
+
+
+def test_close_decisions_are_noted(context: Context) -> None:
+    notes = QuantizeInt8(attention_limit=60).run(conv_attention(), context).notes
+
+    assert (
+        "close decisions: /head/QK: 64 queries, 64 keys: close to the limit of 60;"
+        " /head/AV: 64 queries, 64 keys: close to the limit of 60"
+    ) in notes
 
 
 @pytest.mark.parametrize(
@@ -87,7 +159,11 @@ def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
     [
         ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
         ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
-        ({"method": "entropy"}, RecipeError, "no calibration method entropy"),
+        ({"without": ("speed",)}, RecipeError, "rule speed cannot be switched off"),
+        ({"rules": "int4"}, RecipeError, "no rule set int4; there are paper, tensorrt"),
+        ({"target": "qnn"}, RecipeError, "no target qnn; there are tensorrt"),
+        ({"overrides": "none.toml"}, RecipeError, "none.toml: no such file of over"),
+        ({"method": "median"}, RecipeError, "no calibration method median"),
     ],
 )
 def test_what_is_not_there_is_named(

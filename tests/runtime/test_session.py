@@ -145,3 +145,28 @@ def test_what_no_input_changes_is_constant_and_can_be_computed() -> None:
     np.testing.assert_array_equal(
         evaluate_constants(model, ["turned"])["turned"], [[1, 3, 5], [2, 4, 6]]
     )
+
+
+def test_a_replay_can_go_on_in_the_middle_of_a_scene(counter: ir.Model) -> None:
+    state = {"memory": np.full((1, 2), 5, np.float32)}
+
+    frames = [ones(3, False), ones(4, False), ones(5, True)]
+    sums = [v["y"][0, 0] for v in replay(Session(counter), frames, state=state)]
+
+    assert sums == [6, 7, 1]
+
+
+def test_the_graph_as_onnxruntime_rewrites_it_computes_the_same(
+    tmp_path: Path,
+) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[2] x) => (float[2] y) { a = Identity(x) b = Identity(a) y = Relu(b) }"
+    )
+    path = tmp_path / "rewritten.onnx"
+    Session(model, rewritten=path)
+
+    again = Session(path, optimize=False).run({"x": np.array([-1, 2], np.float32)})
+
+    assert again["y"].tolist() == [0, 2]
+    assert [node.op_type for node in ir.load(path).graph] == ["Relu"]

@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 from me2e_compress import graph
 from me2e_compress.calibration.plan import make_plan, tensors_of
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.rules import tensorrt_rules
 from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.calibration.weights import quantize_weight
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.runtime.session import run_once
-from me2e_compress.targets.tensorrt import place_qdq
+from me2e_compress.targets.tensorrt import place
 from tests.nets import MODULES, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)
@@ -47,7 +48,7 @@ def layers(seed: int = 0, opset: int = 17) -> ir.Model:
 def placed(model: ir.Model, reach: float = 3.0) -> ir.Model:
     plan = make_plan(model, FULL)
     tensors = dict.fromkeys(tensors_of(plan, model), (-reach, reach / 2))
-    return place_qdq(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+    return place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 
 
 def test_weights_are_stored_as_int8_along_their_channels() -> None:
@@ -206,3 +207,56 @@ def test_a_weight_that_is_also_read_in_float_stays() -> None:
     model = placed(net(text, {"w": np.ones((4, 4))}))
 
     assert {"w", "w_int8"} <= set(model.graph.initializers)
+
+
+BLOCK = """
+<ir_version: 9, opset_import: ["" : 17]>
+block (float[1,4,5,5] x, float[4,4,3,3] w, float[4,4,1,1] v) => (float[1,4,5,5] y) {
+    r = Relu(x)
+    a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(r, w)
+    s = Add(a, %s)
+    y = Relu(s)
+}
+"""
+
+
+def test_only_the_residual_branch_of_an_add_is_quantized() -> None:
+    weights = {"w": np.ones((4, 4, 3, 3)), "v": np.ones((4, 4, 1, 1))}
+    model = placed(net(BLOCK % "x", weights))
+
+    (add,) = (node for node in model.graph if node.op_type == "Add")
+    makers = [value.producer() for value in add.inputs if value is not None]
+    assert [node.op_type for node in makers if node] == ["Conv", "DequantizeLinear"]
+
+
+def test_a_residual_branch_shares_the_pair_of_its_other_readers() -> None:
+    weights = {"w": np.ones((4, 4, 3, 3)), "v": np.ones((4, 4, 1, 1))}
+    model = placed(net(BLOCK % "r", weights))
+
+    assert [n.op_type for n in model.graph].count("QuantizeLinear") == 1
+
+
+def test_what_a_concat_joins_is_on_one_scale() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    join (float[9,16] a, float[9,16] b, float[16,16] w, float[32,16] v)
+        => (float[9,16] k, float[9,16] m) {
+        k = MatMul(a, w)
+        ab = Concat<axis=1>(a, b)
+        m = MatMul(ab, v)
+    }
+    """
+    model = net(text, {"w": np.ones((16, 16)), "v": np.ones((32, 16))})
+    plan = make_plan(model, FULL, tensorrt_rules())
+    tensors = {"a": (-1.0, 1.0), "ab": (-1.0, 4.0)}
+
+    result = place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+
+    scales = [
+        graph.array_of(node.inputs[1])
+        for node in result.graph
+        if node.op_type == "QuantizeLinear"
+    ]
+    assert [float(each) for each in scales if each is not None] == [
+        np.float32(4 / 127)
+    ] * 2

@@ -1,6 +1,7 @@
 """Every lossy pass on the stack of real size; about a minute on two cores."""
 
 import math
+from collections import Counter
 from pathlib import Path
 
 import onnx_ir as ir
@@ -21,6 +22,9 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
+from me2e_compress.targets import onnxruntime
+from me2e_compress.targets.lint import lint
+from me2e_compress.targets.rtx import check
 from me2e_compress.zoo.frames import frames as drive
 from me2e_compress.zoo.stacks import VAD_TINY
 from tests.frames import record
@@ -71,7 +75,9 @@ def ranges(
     plan = make_plan(model, QuantScheme.named("full", context.modules))
     assert context.frames is not None
     path = tmp_path_factory.mktemp("ranges") / "ranges.json"
-    Calibrator(threads=2).run(model, tensors_of(plan, model), context.frames).save(path)
+    tensors = (*tensors_of(plan, model), *onnxruntime.tensors(plan, model))
+    unique = tuple(dict.fromkeys(tensors))
+    Calibrator(threads=2).run(model, unique, context.frames).save(path)
     return str(path)
 
 
@@ -111,6 +117,65 @@ def test_schemes_shrink_the_file_and_keep_the_plan(
     int8 = [n for n in result.model.graph if n.op_type == "DequantizeLinear"]
     assert len(int8) >= layers
     assert graph.size(result.model).weight_bytes / 1e6 < WEIGHT_MB - saved
+    assert lint(result.model, "tensorrt") == ()
+
+
+def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
+    folded: ir.Model,
+    reference: Session,
+    context: Context,
+    frames: CalibrationSet,
+    ranges: str,
+    tmp_path: Path,
+) -> None:
+    options = QuantizeInt8(target="onnxruntime", ranges=ranges)
+    result = options.run(folded.clone(), context).model
+
+    rewritten = tmp_path / "rewritten.onnx"
+    session = Session(result, threads=2, rewritten=rewritten)
+    kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
+    found = compare(reference, session, [frames[0]])
+
+    # ResNet-50 has 53, the neck two
+    assert kernels["QLinearConv"] == 55
+    assert kernels["Conv"] + kernels["FusedConv"] == 0
+    assert kernels["QGemm"] + kernels["MatMulIntegerToFloat"] >= 140
+    assert found.plan is not None
+    assert found.plan.max_m < 3.0
+    assert lint(result, "onnxruntime") == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["feature-ext", "prediction", "full"])
+def test_schemes_are_built_with_int8_kernels(
+    scheme: str, folded: ir.Model, context: Context, ranges: str
+) -> None:
+    pytest.importorskip("tensorrt_rtx")
+    result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
+
+    found = check(result.model)
+
+    assert found.passed, found.errors or found.missing
+    assert (found.cut, found.missing) == ((), ())
+
+
+def test_close_layers_are_decided_as_they_should(
+    folded: ir.Model, context: Context
+) -> None:
+    """The traps of this stack: long attention, one ego query, sampling offsets."""
+    options = QuantizeInt8(rules="tensorrt")
+    plan = options.plan(folded, context)
+    rules = {each.node.removeprefix("/pts_bbox_head/"): each for each in plan.decisions}
+
+    motion = "motion_decoder/layers.0/attentions.0/attn/MatMul_3"
+    assert rules[motion].rule == "attention-length"
+    assert "1800 queries and 1800 keys" in rules[motion].reason
+    ego = "ego_fut_decoder/ego_fut_decoder.0/MatMul"
+    assert rules[ego].rule == "gemv"
+    offsets = "transformer/encoder/layers.0/attentions.0/sampling_offsets/MatMul"
+    assert rules[offsets].rule == "coordinates"
+    residual = [each for each in plan.chosen if each.rule == "residual"]
+    assert len(residual) == 16
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,258 @@
+"""Int8 on onnxruntime's CPU: our files beside those of other tools, in one run.
+
+    python -m benchmarks.bench_int8_cpu OUT [--subjects resnet50,vad-tiny]
+        [--peer-python PYTHON] [--frames 2] [--rounds 4]
+
+Every tool quantizes the same graph, after the exact passes, with the same frames, all
+modules; the frames compared on are of another seed. Files stay in OUT and are not made
+again. Latency is one frame, recurrent state at zeros: a process a file, in turn, round
+by round; least CPU and wall time over all rounds. Kernels are counted in the graph as
+onnxruntime's optimizer leaves it. MACs count as int8 where both operands come through
+a DequantizeLinear, whatever the kernel; ``compare`` tells the signal to noise ratio.
+
+A peer above --limit-gb is stopped, one that is not installed is skipped, with a line.
+"""
+
+import argparse
+import dataclasses
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from benchmarks import subjects
+from benchmarks.bench_calibration import has_modelopt, watch
+from benchmarks.peer import peak_mb
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.metrics.fidelity import compare
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.lower_int8 import LowerInt8
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.runtime.race import race
+from me2e_compress.runtime.session import Session
+from me2e_compress.targets.onnxruntime import int8_layers
+
+FLOAT = "float"
+PEERS = {
+    "onnxruntime int8": "onnxruntime",
+    "onnxruntime uint8": "onnxruntime-uint8",
+    "ModelOpt": "modelopt",
+}
+OURS: dict[str, tuple[str, Pass]] = {
+    "ours for TensorRT": (FLOAT, QuantizeInt8()),
+    "ours": (FLOAT, QuantizeInt8(target="onnxruntime")),
+    "ours, rules tensorrt": (
+        FLOAT,
+        QuantizeInt8(target="onnxruntime", rules="tensorrt"),
+    ),
+    "ModelOpt, lowered": ("ModelOpt", LowerInt8()),
+}
+"""What each is made of, and how."""
+
+KERNELS = ("QLinearConv", "QLinearMatMul", "QGemm", "MatMulIntegerToFloat")
+RUNS = 3
+"""Measured runs of a process, after one that is not."""
+
+
+@dataclasses.dataclass
+class Row:
+    """One file."""
+
+    megabytes: float
+    int8_macs: float | None
+    kernels: int
+    sqnr_db: dict[str, float]
+    cpu_s: list[float] = dataclasses.field(default_factory=list)
+    wall_s: list[float] = dataclasses.field(default_factory=list)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--subjects", default="resnet50,vad-tiny")
+    parser.add_argument("--frames", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--limit-gb", type=float, default=14)
+    parser.add_argument("--peer-python", type=Path, default=Path(sys.executable))
+    parser.add_argument("--without", default="", help="files to leave out, joined by ;")
+    parser.add_argument("--child", choices=("make", "weigh", "time"))
+    parser.add_argument("--file", default="")
+    chosen = parser.parse_args()
+    if chosen.child:
+        job = {"make": make, "weigh": weigh, "time": clock}[chosen.child]
+        print(json.dumps(job(chosen)))
+        return
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    for name in chosen.subjects.split(","):
+        subject = subjects.make(name, chosen.out, chosen.frames)
+        print(f"\n{name}, {chosen.frames} frames, {chosen.threads} threads", flush=True)
+        rows = measure(subject, files(subject, chosen), chosen)
+        show(rows)
+
+
+def path_of(subject: subjects.Subject, name: str) -> Path:
+    """Give the file of one tool."""
+    if name == FLOAT:
+        return subject.model
+    return subject.folder / f"int8 {name}.onnx".replace(" ", "-").replace(",", "")
+
+
+def files(subject: subjects.Subject, chosen: argparse.Namespace) -> list[str]:
+    """Let every tool write its file, and name those that did."""
+    done = [FLOAT]
+    left_out = [each.strip() for each in chosen.without.split(";")]
+    for name in [*PEERS, *OURS]:
+        if name in left_out:
+            continue
+        path = path_of(subject, name)
+        if not path.is_file():
+            print(f"  {name}: {written(subject, name, chosen)}", flush=True)
+        if path.is_file():
+            keep_metadata(subject.model, path)
+            done.append(name)
+    return done
+
+
+def keep_metadata(source: Path, path: Path) -> None:
+    """Say in a file what its source says: ModelOpt drops which inputs are a state."""
+    said, model = graph.load(source).metadata_props, graph.load(path)
+    if any(key not in model.metadata_props for key in said):
+        model.metadata_props.update(said)
+        graph.save(model, path)
+
+
+def written(subject: subjects.Subject, name: str, chosen: argparse.Namespace) -> str:
+    """Run one tool in a process of its own; say what it took, or why it did not."""
+    if name in PEERS:
+        tool = PEERS[name]
+        python = chosen.peer_python if tool == "modelopt" else Path(sys.executable)
+        if tool == "modelopt" and not has_modelopt(python):
+            return f"skipped, not installed for {python}"
+        command = [str(python), "-W", "ignore", "benchmarks/peer.py", tool]
+        command += [str(subject.model), str(subject.frames)]
+        command += [str(path_of(subject, name)), "--frames", str(chosen.frames)]
+        found = watch(command, chosen.limit_gb)
+    elif not path_of(subject, OURS[name][0]).is_file():
+        return f"skipped, there is no file of {OURS[name][0]}"
+    else:
+        found = watch(own(subject, "make", name, chosen), chosen.limit_gb)
+    if isinstance(found, str):
+        return found
+    if found.cpu_s is None:
+        return f"stopped at {found.peak_mb:.0f} MB"
+    return f"{found.cpu_s:.1f} s CPU, {found.peak_mb:.0f} MB peak"
+
+
+def own(
+    subject: subjects.Subject, job: str, name: str, chosen: argparse.Namespace
+) -> list[str]:
+    """Give the command of a child process."""
+    command = [sys.executable, "-m", "benchmarks.bench_int8_cpu", str(subject.folder)]
+    command += ["--child", job, "--file", name, "--threads", str(chosen.threads)]
+    return [*command, "--frames", str(chosen.frames)]
+
+
+def make(chosen: argparse.Namespace) -> dict[str, float]:
+    """Write one of our files."""
+    subject = subjects.at(chosen.out)
+    source, step = OURS[chosen.file]
+    cpu, wall = time.process_time(), time.perf_counter()
+    modules, frames = ModuleMap.load(str(subject.map)), CalibrationSet(subject.frames)
+    model = graph.load(path_of(subject, source))
+    result = step.run(model, Context(modules, frames)).model
+    graph.save(result, path_of(subject, chosen.file))
+    return {
+        "cpu_s": time.process_time() - cpu,
+        "wall_s": time.perf_counter() - wall,
+        "peak_mb": peak_mb(),
+    }
+
+
+def measure(
+    subject: subjects.Subject, names: list[str], chosen: argparse.Namespace
+) -> dict[str, Row]:
+    """Weigh every file, then time them in turn."""
+    rows = {}
+    for name in names:
+        rows[name] = Row(**ask(own(subject, "weigh", name, chosen)))
+    for _ in range(chosen.rounds):
+        for name, row in rows.items():
+            lap = ask(own(subject, "time", name, chosen))
+            row.cpu_s += lap["cpu_s"]
+            row.wall_s += lap["wall_s"]
+    return rows
+
+
+def ask(command: list[str]) -> dict[str, Any]:
+    """Run a child and read its answer."""
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
+    answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return answer
+
+
+def weigh(chosen: argparse.Namespace) -> dict[str, object]:
+    """Measure what a file is: bytes, int8 layers and kernels, fidelity."""
+    subject = subjects.at(chosen.out)
+    path = path_of(subject, chosen.file)
+    model = graph.load(path)
+    graph.infer_shapes(model)
+    counts = [graph.macs(node) or 0 for node in int8_layers(model)]
+    total = graph.size(graph.load(subject.model)).macs
+    with tempfile.TemporaryDirectory() as folder:
+        rewritten = Path(folder) / "rewritten.onnx"
+        session = Session(path, threads=chosen.threads, rewritten=rewritten)
+        kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
+    found = {}
+    if chosen.file != FLOAT:
+        frames = CalibrationSet(subject.held_out)
+        reference = Session(subject.model, threads=chosen.threads, release=True)
+        fidelity = compare(reference, session, [frames[0], frames[1]])
+        found = {each.name: each.sqnr_db for each in fidelity.outputs}
+    return {
+        "megabytes": path.stat().st_size / 1e6,
+        "int8_macs": sum(counts) / total if total else None,
+        "kernels": sum(kernels[each] for each in KERNELS),
+        "sqnr_db": found,
+    }
+
+
+def clock(chosen: argparse.Namespace) -> dict[str, tuple[float, ...]]:
+    """Time one file."""
+    subject = subjects.at(chosen.out)
+    session = Session(path_of(subject, chosen.file), threads=chosen.threads)
+    frames = [CalibrationSet(subject.held_out)[0]]
+    lap = race({chosen.file: session}, frames, RUNS)[chosen.file]
+    return {"cpu_s": lap.cpu_s, "wall_s": lap.wall_s}
+
+
+def show(rows: dict[str, Row]) -> None:
+    plain = rows[FLOAT]
+    print("\n| file | MB | int8 MACs | int8 kernels | CPU ms | x | wall ms | x |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name, row in rows.items():
+        cpu, wall = min(row.cpu_s), min(row.wall_s)
+        macs = "-" if row.int8_macs is None else f"{row.int8_macs:.1%}"
+        print(
+            f"| {name} | {row.megabytes:.1f} | {macs} | {row.kernels}"
+            f" | {cpu * 1e3:.1f} | {min(plain.cpu_s) / cpu:.2f}"
+            f" | {wall * 1e3:.1f} | {min(plain.wall_s) / wall:.2f} |"
+        )
+    files = [name for name in rows if name != FLOAT]
+    outputs = dict.fromkeys(each for name in files for each in rows[name].sqnr_db)
+    print(f"\n| SQNR, dB | {' | '.join(files)} |")
+    print("|---" * (len(files) + 1) + "|")
+    for output in outputs:
+        found = [f"{rows[name].sqnr_db[output]:.1f}" for name in files]
+        print(f"| {output} | {' | '.join(found)} |")
+    print(flush=True)
+
+
+if __name__ == "__main__":
+    main()

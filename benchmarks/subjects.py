@@ -1,0 +1,71 @@
+"""The models that int8 is measured on, each with frames and a module map, in a folder.
+
+* ``resnet50``: a classifier, 224 x 224.
+* ``bev-head``: see :mod:`benchmarks.bev_head`.
+* ``vad-tiny``: the reference stack.
+
+The model in the folder is what ``quantize-int8`` sees: the exact passes are done.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import bev_head, resnet50
+from benchmarks.subject import Subject, at
+from me2e_compress import graph, recipe
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.zoo.export import export
+from me2e_compress.zoo.frames import write_frames
+
+__all__ = ["SUBJECTS", "Subject", "at", "make"]
+
+SUBJECTS = ("resnet50", "bev-head", "vad-tiny")
+SCENE = 4
+"""Frames a scene, where frames follow each other."""
+
+
+def make(name: str, out: Path, frames: int) -> Subject:
+    """Write a subject, unless it is there with as many frames."""
+    subject = Subject(name, out / name)
+    subject.folder.mkdir(parents=True, exist_ok=True)
+    if not subject.model.is_file():
+        _export(subject)
+    for folder, count, seed in ((subject.frames, frames, 0), (subject.held_out, 4, 1)):
+        if len(list(folder.glob("*.npz"))) < count:
+            shutil.rmtree(folder, ignore_errors=True)
+            _record(name, folder, count, seed)
+    return subject
+
+
+def _export(subject: Subject) -> None:
+    if subject.name == "vad-tiny":
+        export(subject.name, subject.source)
+        text = (Path(graph.__file__).parents[1] / "modules/presets/vad.toml").read_text(
+            encoding="utf-8"
+        )
+    else:
+        maker = {"resnet50": resnet50, "bev-head": bev_head}[subject.name]
+        maker.export(subject.source)
+        text = maker.MAP
+    subject.map.write_text(text, encoding="utf-8")
+    context = Context(ModuleMap.load(str(subject.map)))
+    manager = PassManager(recipe.load("exact"), verify_frames=0)
+    graph.save(manager.run(graph.load(subject.source), context).model, subject.model)
+
+
+def _record(name: str, folder: Path, count: int, seed: int) -> None:
+    if name == "vad-tiny":
+        write_frames(name, folder, count, seed, SCENE)
+    elif name == "bev-head":
+        bev_head.record(folder, count, seed)
+    else:
+        folder.mkdir(parents=True)
+        for index, image in enumerate(resnet50.images(count, seed)):
+            np.savez(folder / f"{index:06d}.npz", image=image)
+        scenes = json.dumps({"scenes": list(range(count))})
+        (folder / "scenes.json").write_text(scenes)

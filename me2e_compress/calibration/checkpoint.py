@@ -1,0 +1,110 @@
+"""Where a long calibration stands, on disk, so that a kill costs a few frames."""
+
+import dataclasses
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.runtime.frames import Array
+
+_STATE = "state/"
+
+
+@dataclasses.dataclass(frozen=True)
+class Standing:
+    """How far one pass over the frames has come.
+
+    Attributes:
+        done: frames seen.
+        results: what they gave so far, by name.
+        state: what recurrent inputs hold for the next frame.
+    """
+
+    done: int = 0
+    results: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+    state: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """One file that holds the standing of a calibration.
+
+    Attributes:
+        path: the file; None keeps nothing.
+        key: what the standing is of: digest of the graph, tensors, frames, ...
+        every: frames between two writes.
+    """
+
+    path: Path | None
+    key: Mapping[str, object]
+    every: int = 8
+
+    def read(self) -> Standing:
+        """Give the standing; nothing done where there is no file.
+
+        Raises:
+            FramesError: the file is of another calibration, or cannot be read.
+        """
+        if self.path is None or not self.path.is_file():
+            return Standing()
+        try:
+            with np.load(self.path, allow_pickle=False) as held:
+                found = {name: held[name] for name in held}
+            key = json.loads(str(found.pop("key")))
+            done = int(found.pop("done"))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise FramesError(f"{self.path}: not a checkpoint ({error})") from error
+        self._check(key)
+        return Standing(
+            done,
+            {name: a for name, a in found.items() if not name.startswith(_STATE)},
+            {
+                name.removeprefix(_STATE): array
+                for name, array in found.items()
+                if name.startswith(_STATE)
+            },
+        )
+
+    def write(self, standing: Standing) -> None:
+        """Keep a standing, all or nothing."""
+        if self.path is None:
+            return
+        state = {_STATE + name: array for name, array in standing.state.items()}
+        content = io.BytesIO()
+        with zipfile.ZipFile(content, "w") as archive:
+            for name, array in {
+                "key": np.array(json.dumps(self.key)),
+                "done": np.array(standing.done),
+                **standing.results,
+                **state,
+            }.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    np.lib.format.write_array(entry, np.asanyarray(array))
+        write_bytes(self.path, content.getvalue())
+
+    def due(self, done: int, total: int) -> bool:
+        """Say whether it is time to write."""
+        return self.path is not None and (done % self.every == 0 or done == total)
+
+    def clear(self) -> None:
+        """Remove the file of a calibration that is finished."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+
+    def _check(self, key: object) -> None:
+        wanted = json.loads(json.dumps(self.key))
+        if not isinstance(key, dict) or key.keys() != wanted.keys():
+            raise FramesError(
+                f"{self.path}: a checkpoint of another version; remove it"
+            )
+        if stale := [name for name in wanted if key[name] != wanted[name]]:
+            raise FramesError(
+                f"{self.path}: stale: a checkpoint of another {stale[0]}; remove it to"
+                " begin again"
+            )

@@ -1,0 +1,117 @@
+"""Ranges for other tools, and from them: TensorRT's cache, onnxruntime's table.
+
+Both know one number a tensor, so what comes back is symmetric: [-reach, reach].
+"""
+
+import os
+import struct
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from onnxruntime.quantization.calibrate import TensorData
+from onnxruntime.quantization.quant_utils import write_calibration_table
+
+from me2e_compress.calibration.observers import QUANT_MAX, MaxMin, scale_of
+from me2e_compress.calibration.ranges import IMPORTED, Ranges
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.atomic import write_bytes
+
+_VERSION = "TRT-101000"
+"""What the cache claims to be written by; TensorRT 10 reads caches of this form."""
+
+
+def write_tensorrt_cache(ranges: Ranges, path: Path) -> None:
+    """Write a TensorRT calibration cache: a line ``name: scale`` for every tensor.
+
+    The scale, reach / 127, is a float32 in big-endian hexadecimal.
+    """
+    kind = "MinMax" if ranges.method == MaxMin.name else "Entropy"
+    suffix = "Calibration2" if kind == "Entropy" else "Calibration"
+    lines = [f"{_VERSION}-{kind}{suffix}"]
+    lines += [
+        f"{name}: {struct.pack('!f', float(scale_of(*ends))).hex()}"
+        for name, ends in ranges.tensors.items()
+    ]
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
+
+
+def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
+    """Write onnxruntime's calibration table into a folder, as its own tool does.
+
+    That is ``calibration.flatbuffers``, which its TensorRT provider reads, and the
+    same as ``calibration.json`` and, a line ``name reach`` each, ``calibration.cache``.
+    """
+    table = {name: _entry(*ends) for name, ends in ranges.tensors.items()}
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".table-") as draft:
+        write_calibration_table(table, draft)
+        for file in sorted(Path(draft).iterdir()):
+            os.replace(file, folder / file.name)
+
+
+def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
+    """Read a TensorRT cache, or the ``calibration.cache`` of an onnxruntime table.
+
+    Neither says of which model it is: it counts as that of ``model`` if it has every
+    tensor that is needed.
+
+    Args:
+        path: the file.
+        model: digest of the graph that is to be quantized.
+        tensors: what it needs a range of.
+
+    Raises:
+        FramesError: no such file, a line that cannot be read, or a tensor is missing.
+    """
+    if not path.is_file():
+        raise FramesError(f"{path}: no such calibration cache")
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise FramesError(f"{path}: not a calibration cache ({error})") from error
+    if lines and lines[0].startswith("TRT-"):
+        reach = _parse(path, lines, 1, ": ", _hexadecimal)
+    else:
+        reach = _parse(path, lines, 0, " ", float)
+    return Ranges(_needed(path, reach, tensors), IMPORTED, 0, model, "")
+
+
+def _parse(
+    path: Path, lines: list[str], first: int, mark: str, read: Callable[[str], float]
+) -> dict[str, float]:
+    found = {}
+    for number, line in enumerate(lines[first:], first + 1):
+        name, parted, text = line.rpartition(mark)
+        try:
+            found[name] = read(text)
+        except (ValueError, struct.error) as error:
+            raise FramesError(
+                f"{path}: line {number} is no name and number: {line[:60]!r}"
+            ) from error
+        if not parted or not 0 <= found[name] < np.inf:
+            raise FramesError(f"{path}: line {number} is no range: {line[:60]!r}")
+    return found
+
+
+def _hexadecimal(text: str) -> float:
+    (scale,) = struct.unpack("!f", bytes.fromhex(text))
+    return float(scale) * QUANT_MAX
+
+
+def _needed(
+    path: Path, reach: Mapping[str, float], tensors: tuple[str, ...]
+) -> dict[str, tuple[float, float]]:
+    if missing := [name for name in tensors if name not in reach]:
+        raise FramesError(
+            f"{path}: a cache of another model: it lacks {missing[0]} and"
+            f" {len(missing) - 1} more of {len(tensors)} tensors"
+        )
+    return {name: (-reach[name], reach[name]) for name in tensors}
+
+
+def _entry(low: float, high: float) -> TensorData:
+    """Give both ends alike: the table keeps the larger number, not the magnitude."""
+    reach = np.array(max(abs(low), abs(high)), np.float32)
+    return TensorData(lowest=-reach, highest=reach)

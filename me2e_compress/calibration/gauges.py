@@ -1,0 +1,107 @@
+"""What is measured of a tensor, as nodes of its own graph."""
+
+import dataclasses
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.calibration.statistics import BINS
+
+Reading: TypeAlias = tuple[list[ir.Node], list[ir.Value]]
+"""Nodes that measure a tensor, in order, and the 1-D values that they end in."""
+
+
+class Gauge(Protocol):
+    """Measures tensors by nodes that stand behind them."""
+
+    @property
+    def width(self) -> int:
+        """How many numbers a tensor gives."""
+        ...
+
+    def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
+        """Measure a float32 value, the ``at``-th of those that are watched."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Extremes:
+    """Smallest element, largest element, mean square.
+
+    The mean square tells a tensor whose range a few elements make. It also finds every
+    NaN, which onnxruntime's ReduceMin and ReduceMax overlook unless it comes first.
+    """
+
+    width: int = 3
+
+    def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
+        """Reduce the whole tensor three times."""
+        one = _shared(where, np.array([1], np.int64), "one")
+        low, high, total = (
+            ir.node(op, [value], {"keepdims": 0})
+            for op in ("ReduceMin", "ReduceMax", "ReduceSumSquare")
+        )
+        size = ir.node("Size", [value])
+        count = _cast(size.outputs[0], ir.DataType.FLOAT)
+        mean = ir.node("Div", [total.outputs[0], count.outputs[0]])
+        flat = [
+            ir.node("Reshape", [each.outputs[0], one]) for each in (low, high, mean)
+        ]
+        nodes = [low, high, total, size, count, mean, *flat]
+        return nodes, [each.outputs[0] for each in flat]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Counts:
+    """A histogram of magnitudes.
+
+    Attributes:
+        exponents: int64 [tensors]: the bins of a tensor share [0, 2^exponent).
+        width: the number of bins.
+    """
+
+    exponents: npt.NDArray[np.int64]
+    width: int = BINS
+
+    def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
+        """Number the bins, and count the numbers as a text's words are counted.
+
+        TfidfVectorizer is the one standard operator that counts integers: exact, of
+        every opset from 9 on, without a second array as large as the tensor. Scaling
+        by a power of two is exact, so shards agree on the bin of every element.
+        """
+        bins_per_unit = np.ldexp(np.float32(BINS), -self.exponents[at])
+        factor = _shared(where, np.asarray(bins_per_unit, np.float32), f"factor_{at}")
+        last = _shared(where, np.array(BINS - 1, np.float32), "last_bin")
+        row = _shared(where, np.array([-1], np.int64), "row")
+        magnitude = ir.node("Abs", [value])
+        scaled = ir.node("Mul", [magnitude.outputs[0], factor])
+        capped = ir.node("Min", [scaled.outputs[0], last])
+        number = _cast(capped.outputs[0], ir.DataType.INT32)
+        words = ir.node("Reshape", [number.outputs[0], row])
+        bins = list(range(BINS))
+        count = ir.node(
+            "TfIdfVectorizer",
+            [words.outputs[0]],
+            {
+                "mode": "TF", "min_gram_length": 1, "max_gram_length": 1,
+                "max_skip_count": 0, "ngram_counts": [0], "ngram_indexes": bins,
+                "pool_int64s": bins,
+            },
+        )  # fmt: skip
+        nodes = [magnitude, scaled, capped, number, words, count]
+        return nodes, [count.outputs[0]]
+
+
+def _cast(value: ir.Value, to: ir.DataType) -> ir.Node:
+    return ir.node("Cast", [value], {"to": to.value})
+
+
+def _shared(where: ir.Graph, array: npt.NDArray[np.generic], name: str) -> ir.Value:
+    """Give a constant of the gauges, made where it is first asked for."""
+    name = f"me2e_gauge_{name}"
+    known = where.initializers.get(name)
+    return known if known is not None else graph.add_constant(where, array, name)

@@ -1,0 +1,138 @@
+"""Ranges read off histograms of magnitudes: what is rare may be clipped."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.calibration.observers.base import Ends, within
+from me2e_compress.calibration.observers.scale import QUANT_MAX
+from me2e_compress.calibration.statistics import BINS, Statistics
+
+Counts: TypeAlias = npt.NDArray[np.int64]
+"""How many magnitudes fell into each of the bins: int64 [bins]."""
+
+LEVELS = 128
+"""Magnitudes of the int8 grid, 0 to 127: TensorRT's entropy method compares with as
+many (S. Migacz, 8-bit inference with TensorRT, GTC 2017)."""
+
+_STRIDE = BINS // 256
+"""Thresholds are tried every so many bins: 240 of them instead of 1,920."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Percentile:
+    """The magnitude that ``percent`` of all elements of all frames do not exceed.
+
+    Attributes:
+        percent: above 0 and at most 100; the default is that of TensorRT's and
+            onnxruntime's tools.
+    """
+
+    name: ClassVar[str] = "percentile"
+    counts: ClassVar[bool] = True
+    percent: float = 99.99
+
+    @property
+    def text(self) -> str:
+        """The method with its percentile."""
+        return f"{self.name}:{self.percent:g}"
+
+    def ranges(self, seen: Statistics) -> tuple[Ends, Ends]:
+        """Cut every tensor off at its percentile, rounded up to the edge of a bin."""
+        return within(seen, _reaches(seen, self._edge))
+
+    def _edge(self, counts: Counts) -> int:
+        total = np.cumsum(counts)
+        share = total[-1] * (self.percent / 100)
+        return int(np.searchsorted(total, share)) + 1
+
+
+@dataclasses.dataclass(frozen=True)
+class MeanSquaredError:
+    """The threshold whose int8 grid moves the elements least, in mean square."""
+
+    name: ClassVar[str] = "mse"
+    counts: ClassVar[bool] = True
+
+    @property
+    def text(self) -> str:
+        """The method as it is named."""
+        return self.name
+
+    def ranges(self, seen: Statistics) -> tuple[Ends, Ends]:
+        """Cut every tensor off where rounding and clipping cost least."""
+        return within(seen, _reaches(seen, lambda counts: _best(counts, _noise)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Entropy:
+    """The threshold whose int8 grid keeps the distribution best: least KL divergence.
+
+    Migacz's method. Zero stands on every grid, so the bin of zeros counts as its
+    neighbour: the zeros behind a ReLU would drown the rest.
+    """
+
+    name: ClassVar[str] = "entropy"
+    counts: ClassVar[bool] = True
+
+    @property
+    def text(self) -> str:
+        """The method as it is named."""
+        return self.name
+
+    def ranges(self, seen: Statistics) -> tuple[Ends, Ends]:
+        """Cut every tensor off where the distribution suffers least."""
+        return within(seen, _reaches(seen, lambda counts: _best(counts, _divergence)))
+
+
+def _reaches(seen: Statistics, edge: Callable[[Counts], int]) -> Ends:
+    """Turn the chosen edge of every histogram into a magnitude."""
+    edges = [edge(counts) if counts.any() else BINS for counts in seen.counted()]
+    return np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents).astype(
+        np.float32
+    )
+
+
+def _best(counts: Counts, cost: Callable[[Counts, int], float]) -> int:
+    """Try thresholds up to the last bin in use, which is the first choice."""
+    top = int(np.flatnonzero(counts)[-1]) + 1
+    tried = [top, *range(LEVELS, top, _STRIDE)]
+    costs = [cost(counts, edge) for edge in tried]
+    best: int = tried[int(np.argmin(costs))]
+    return best
+
+
+def _noise(counts: Counts, edge: int) -> float:
+    """Sum the squared errors of a grid that ends at an edge, in bins."""
+    centres = np.arange(BINS) + 0.5
+    step = edge / QUANT_MAX
+    rounded = np.minimum(np.rint(centres / step), QUANT_MAX) * step
+    return float(counts @ np.square(centres - rounded))
+
+
+def _divergence(counts: Counts, edge: int) -> float:
+    """Give the KL divergence between the bins below an edge and their grid of levels.
+
+    What lies beyond the edge counts into the last bin before it. A level spreads its
+    elements evenly over those of its bins that are not empty.
+    """
+    kept = counts[:edge].astype(np.float64)
+    kept[0] = kept[1] if edge > 1 else kept[0]
+    clipped = kept.copy()
+    clipped[-1] += counts[edge:].sum()
+    if not kept.any():
+        return np.inf
+    level = np.arange(edge) * LEVELS // edge
+    filled = clipped > 0
+    held = np.bincount(level, kept, LEVELS)
+    bins = np.bincount(level, filled, LEVELS)
+    spread = np.where(filled, (held / np.maximum(bins, 1))[level], 0)
+    p, q = clipped / clipped.sum(), spread / spread.sum()
+    lost = (p > 0) & (q == 0)
+    if lost.any():
+        return np.inf
+    used = p > 0
+    return float(np.sum(p[used] * np.log(p[used] / q[used])))

@@ -1,0 +1,47 @@
+"""The plan: for every node, int8 or float, by which rule, and why."""
+
+from me2e_compress.calibration.plan.decision import (
+    FLOAT,
+    INT8,
+    RESIDUAL,
+    Decision,
+    QuantPlan,
+    ScaleGroup,
+)
+from me2e_compress.calibration.plan.files import (
+    Difference,
+    differences,
+    load_plan,
+    plan_of,
+    save_plan,
+    stamp_plan,
+)
+from me2e_compress.calibration.plan.groups import (
+    SharingCost,
+    share_scales,
+    sharing_costs,
+)
+from me2e_compress.calibration.plan.make import channel_axis, make_plan, tensors_of
+from me2e_compress.calibration.plan.overrides import Overrides
+
+__all__ = [
+    "FLOAT",
+    "INT8",
+    "RESIDUAL",
+    "Decision",
+    "Difference",
+    "Overrides",
+    "QuantPlan",
+    "ScaleGroup",
+    "SharingCost",
+    "channel_axis",
+    "differences",
+    "load_plan",
+    "make_plan",
+    "plan_of",
+    "save_plan",
+    "share_scales",
+    "sharing_costs",
+    "stamp_plan",
+    "tensors_of",
+]

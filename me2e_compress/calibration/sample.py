@@ -1,0 +1,96 @@
+"""Part of a recording: some frames drawn by seed, or one shard of many."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.frames import Frame
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """Some of the frames of a recording, in its order, scenes from their beginning.
+
+    Attributes:
+        whole: the recording.
+        places: which of its frames.
+    """
+
+    whole: CalibrationSet
+    places: tuple[int, ...]
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the whole recording: what its frames may be held against later."""
+        return self.whole.fingerprint
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self.places)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Read one frame; its index is the place in the whole recording."""
+        return self.whole[self.places[index]]
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Read the frames in order, one in memory at a time."""
+        return (self.whole[place] for place in self.places)
+
+
+def draw(whole: CalibrationSet, count: int, seed: int) -> Part:
+    """Draw ``count`` frames, scene by scene without replacement.
+
+    Scenes stay whole, since recurrent state grows along them; only the last one drawn
+    is cut, at its end. A recording of fewer frames is taken as it is: no frame counts
+    twice.
+
+    Args:
+        whole: the recording.
+        count: how many frames.
+        seed: same seed, same frames.
+
+    Raises:
+        FramesError: fewer than one frame was asked for.
+    """
+    if count < 1:
+        raise FramesError(f"{count} frames were asked for; at least 1 is needed")
+    scenes = _scenes(whole)
+    order = np.random.default_rng(seed).permutation(len(scenes)).tolist()
+    drawn = [place for at in order for place in scenes[at]]
+    return Part(whole, tuple(sorted(drawn[:count])))
+
+
+def shard(part: Part, number: int, count: int) -> Part:
+    """Give one of ``count`` parts with about as many scenes each.
+
+    Args:
+        part: the frames to share out.
+        number: which, from 1.
+        count: how many there are.
+
+    Raises:
+        FramesError: no such shard, or fewer scenes than shards.
+    """
+    if not 1 <= number <= count:
+        raise FramesError(f"no shard {number} of {count}: they count from 1")
+    taken = set(part.places)
+    scenes = [
+        [place for place in scene if place in taken] for scene in _scenes(part.whole)
+    ]
+    scenes = [scene for scene in scenes if scene]
+    if len(scenes) < count:
+        raise FramesError(
+            f"{len(scenes)} scenes cannot be shared by {count} shards: recurrent state"
+            " runs through a scene"
+        )
+    mine = np.array_split(np.arange(len(scenes)), count)[number - 1].tolist()
+    return Part(part.whole, tuple(place for at in mine for place in scenes[at]))
+
+
+def _scenes(whole: CalibrationSet) -> list[range]:
+    ends = [*whole.scenes, len(whole)]
+    return [range(start, end) for start, end in itertools.pairwise(ends)]

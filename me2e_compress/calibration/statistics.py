@@ -1,0 +1,173 @@
+"""What was seen of every tensor on every frame: enough for any range, in a few MB."""
+
+import dataclasses
+import io
+import itertools
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.atomic import write_bytes
+
+BINS = 2048
+"""Bins of a histogram of magnitudes, from 0 to the next power of two: at least 1,024
+of them in use, 8 for each of the 127 int8 steps. (TensorRT takes 2,048 to the largest
+magnitude itself, onnxruntime's percentile as many on both sides of zero.)"""
+
+_SMALLEST = -100
+"""Least exponent of a histogram: below, float32 cannot hold bins per unit."""
+
+Floats: TypeAlias = npt.NDArray[np.float32]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Statistics:
+    """What a calibration collected; shards of one recording can be merged.
+
+    Attributes:
+        model: digest of the graph.
+        source: fingerprint of the recording.
+        tensors: their names.
+        frames: places in the recording of the frames that were seen.
+        gauges: float32 [frames, tensors, 3]: smallest and largest element, mean square.
+        counts: int64 [tensors, bins] over all frames: how many magnitudes lie in each
+            bin of [0, 2^exponent); None where no histogram was asked for.
+    """
+
+    model: str
+    source: str
+    tensors: tuple[str, ...]
+    frames: tuple[int, ...]
+    gauges: Floats
+    counts: npt.NDArray[np.int64] | None = None
+
+    @property
+    def lows(self) -> Floats:
+        """The smallest elements: float32 [frames, tensors]."""
+        return self.gauges[:, :, 0]
+
+    @property
+    def highs(self) -> Floats:
+        """The largest elements: float32 [frames, tensors]."""
+        return self.gauges[:, :, 1]
+
+    @property
+    def reach(self) -> Floats:
+        """The largest magnitudes over all frames: float32 [tensors]."""
+        ends = np.abs(self.gauges[:, :, :2])
+        return np.asarray(ends.max(axis=(0, 2), initial=0), np.float32)
+
+    @property
+    def exponents(self) -> npt.NDArray[np.int64]:
+        """The least e for which 2^e exceeds the reach: int64 [tensors]."""
+        return np.maximum(np.frexp(self.reach)[1], _SMALLEST).astype(np.int64)
+
+    def counted(self) -> npt.NDArray[np.int64]:
+        """Give the histograms.
+
+        Raises:
+            FramesError: none were collected.
+        """
+        if self.counts is None:
+            raise FramesError(
+                "these statistics hold no histograms: calibrate again with a method"
+                " that needs them"
+            )
+        return self.counts
+
+    def save(self, path: Path) -> None:
+        """Write an ``.npz``, all or nothing; equal statistics give equal bytes."""
+        content = io.BytesIO()
+        np.savez(
+            content,
+            model=np.array(self.model),
+            source=np.array(self.source),
+            tensors=np.array(self.tensors, np.str_),
+            frames=np.array(self.frames, np.int64),
+            gauges=self.gauges,
+            counts=np.empty(0, np.int64) if self.counts is None else self.counts,
+        )
+        write_bytes(path, content.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FramesError: no such file, or not saved statistics.
+        """
+        if not path.is_file():
+            raise FramesError(f"{path}: no such statistics file")
+        try:
+            with np.load(path, allow_pickle=False) as held:
+                counts = held["counts"]
+                return cls(
+                    str(held["model"]),
+                    str(held["source"]),
+                    tuple(held["tensors"].tolist()),
+                    tuple(held["frames"].tolist()),
+                    held["gauges"],
+                    counts if counts.size else None,
+                )
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise FramesError(f"{path}: not saved statistics ({error})") from error
+
+
+def merge(parts: Sequence[Statistics]) -> Statistics:
+    """Join the shards of one calibration: what one run over all frames would give.
+
+    Bit for bit, histograms too: their bins are powers of two wide, so that those of a
+    shard of smaller reach fall whole into those of the joint one.
+
+    Raises:
+        FramesError: no shard, a frame in two of them, or shards of different graphs,
+            recordings, tensors or kinds.
+    """
+    if not parts:
+        raise FramesError("no shards to merge")
+    first = parts[0]
+    for each in parts[1:]:
+        for what in ("model", "source", "tensors"):
+            if getattr(each, what) != getattr(first, what):
+                raise FramesError(
+                    f"shards do not belong together: {what} of frames"
+                    f" {_span(each)} is not that of frames {_span(first)}"
+                )
+        if (each.counts is None) != (first.counts is None):
+            raise FramesError("some of the shards have histograms and some have not")
+    places = [(place, part, row) for part in parts for row, place in _rows(part)]
+    places.sort(key=lambda each: each[0])
+    frames = tuple(place for place, _, _ in places)
+    if doubles := [a for a, b in itertools.pairwise(frames) if a == b]:
+        raise FramesError(f"frame {doubles[0]} is in two of the shards")
+    gauges = np.stack([part.gauges[row] for _, part, row in places])
+    joint = dataclasses.replace(first, frames=frames, gauges=gauges, counts=None)
+    if first.counts is None:
+        return joint
+    counts = sum(_widened(part, joint.exponents) for part in parts)
+    return dataclasses.replace(joint, counts=np.asarray(counts, np.int64))
+
+
+def _rows(part: Statistics) -> list[tuple[int, int]]:
+    return list(enumerate(part.frames))
+
+
+def _span(part: Statistics) -> str:
+    return f"{part.frames[0]} to {part.frames[-1]}" if part.frames else "none"
+
+
+def _widened(
+    part: Statistics, exponents: npt.NDArray[np.int64]
+) -> npt.NDArray[np.int64]:
+    """Give the histograms over wider bins: 2^k of the old fall into one new."""
+    wide = np.zeros_like(part.counted())
+    steps = np.minimum(exponents - part.exponents, BINS.bit_length() - 1).tolist()
+    for at, step in enumerate(steps):
+        folded = part.counted()[at].reshape(-1, 1 << step).sum(axis=1)
+        wide[at, : len(folded)] = folded
+    return wide

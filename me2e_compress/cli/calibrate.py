@@ -1,0 +1,207 @@
+"""``me2e-compress calibrate``."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import onnx_ir as ir
+import typer
+from rich.markup import escape
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.exchange import (
+    read_foreign,
+    write_onnxruntime_table,
+    write_tensorrt_cache,
+)
+from me2e_compress.calibration.observers import observer
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.rules import RULE_SETS
+from me2e_compress.calibration.sample import Part, draw, shard
+from me2e_compress.calibration.statistics import Statistics, merge
+from me2e_compress.cli.console import console, print_json, progress
+from me2e_compress.cli.job import run_on
+from me2e_compress.cli.models import model_path
+from me2e_compress.errors import FramesError, PreconditionError, RecipeError
+from me2e_compress.modules import ModuleMap, map_of
+from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.targets import TARGETS
+from me2e_compress.targets.quantized import describe_quantized
+
+_SHOWN = 5
+
+
+def calibrate(
+    model: Annotated[
+        Path, typer.Argument(help="the float ONNX file", parser=model_path)
+    ],
+    frames: Annotated[
+        Path | None, typer.Argument(help="the recorded FRAMES; none for --import")
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="RANGES.json; SHARD.npz of a shard")
+    ] = Path("ranges.json"),
+    recipe_name: Annotated[
+        str, typer.Option("-r", "--recipe", help="whose passes before int8 are run")
+    ] = "exact",
+    method: Annotated[
+        str,
+        typer.Option(
+            help="max-min, moving-average[:w], percentile[:p], mse or entropy"
+        ),
+    ] = "max-min",
+    count: Annotated[
+        int, typer.Option("-n", "--count", help="frames, drawn in whole scenes")
+    ] = 256,
+    seed: Annotated[int, typer.Option(help="of the draw")] = 0,
+    module_map: Annotated[
+        str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
+    ] = None,
+    part: Annotated[
+        str | None, typer.Option("--shard", help="2/4: only the second of four shards")
+    ] = None,
+    shards: Annotated[
+        list[Path] | None, typer.Option("--merge", help="a SHARD.npz; once for each")
+    ] = None,
+    foreign: Annotated[
+        Path | None,
+        typer.Option("--import", help="a TensorRT cache or onnxruntime table"),
+    ] = None,
+    tensorrt_cache: Annotated[
+        Path | None, typer.Option(help="write a TensorRT calibration cache too")
+    ] = None,
+    onnxruntime_table: Annotated[
+        Path | None, typer.Option(help="write onnxruntime's table too: a folder")
+    ] = None,
+    threads: Annotated[int, typer.Option(help="of onnxruntime; 0 takes all")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
+) -> None:
+    """Measure the ranges of every tensor that any scheme, rule set or target needs.
+
+    A run that was killed goes on from OUTPUT.checkpoint; compress takes the ranges by
+    --ranges.
+    """
+    observer(method)
+    _check_sources(frames, shards, foreign, part)
+    passes = _before_int8(recipe.load(recipe_name))
+    ready, tensors = prepare(model, module_map, passes)
+    if foreign is not None:
+        found = read_foreign(foreign, graph.digest(ready), tensors)
+    elif shards:
+        seen = merge([Statistics.load(path) for path in shards])
+        found = Ranges.of(seen, observer(method))
+        found.check(model=graph.digest(ready), tensors=tensors, method=method)
+    else:
+        chosen = _choose(model, frames or Path(), count, seed, part)
+        checkpoint = output.with_name(output.name + ".checkpoint")
+        calibrator = Calibrator(method, threads, checkpoint=checkpoint)
+        with progress("calibrate") as advance:
+            seen = calibrator.collect(
+                ready, tensors, chosen, lambda done, of: advance(done, of, method)
+            )
+        if part is not None:
+            seen.save(output)
+            console.print(f"{output}: shard {part}, {len(chosen)} frames")
+            return
+        found = Ranges.of(seen, observer(method))
+    found.save(output)
+    if tensorrt_cache is not None:
+        write_tensorrt_cache(found, tensorrt_cache)
+    if onnxruntime_table is not None:
+        write_onnxruntime_table(found, onnxruntime_table)
+    if as_json:
+        print_json({**dataclasses.asdict(found), "dead": found.dead})
+    else:
+        _show(found, output)
+
+
+def _choose(model: Path, folder: Path, count: int, seed: int, part: str | None) -> Part:
+    """Draw frames that fit the model, or one shard of those."""
+    recording = CalibrationSet(folder)
+    recording.check(graph.load(model))
+    chosen = draw(recording, count, seed)
+    return chosen if part is None else shard(chosen, *_fraction(part))
+
+
+def prepare(
+    path: Path, module_map: str | None, passes: tuple[Pass, ...]
+) -> tuple[ir.Model, tuple[str, ...]]:
+    """Give the graph that int8 is put on, and every tensor that may be asked for.
+
+    Raises:
+        PreconditionError: the graph is quantized already, or nothing can be int8.
+    """
+    loaded = graph.load(path)
+    if quantized := describe_quantized(loaded):
+        raise PreconditionError(
+            f"the graph is quantized already: {quantized}; calibrate the float graph"
+            " that it was made of"
+        )
+    modules = map_of(loaded, module_map)
+    ready = run_on(loaded, passes, modules)
+    graph.infer_shapes(ready)
+    tensors = tensors_of_all(ready, modules)
+    if not tensors:
+        raise PreconditionError(f"{path}: no node can become int8")
+    return ready, tensors
+
+
+def tensors_of_all(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
+    """Name what any rule set and target reads when every module is int8."""
+    names: dict[str, None] = {}
+    for rules in RULE_SETS:
+        options = QuantizeInt8(modules=modules.names(), rules=rules)
+        plan = options.plan(model, Context(modules))
+        for target in TARGETS.values():
+            names |= dict.fromkeys(target.tensors(plan, model))
+    return tuple(names)
+
+
+def _check_sources(
+    frames: Path | None,
+    shards: list[Path] | None,
+    foreign: Path | None,
+    part: str | None,
+) -> None:
+    given = [each is not None for each in (frames, foreign)]
+    if sum(given) + bool(shards) != 1:
+        raise FramesError(
+            "give recorded frames, or shards (--merge), or another tool's cache"
+            " (--import): one of the three; ranges are never made up"
+        )
+    if part is not None and frames is None:
+        raise FramesError("--shard is for frames, and none are given")
+
+
+def _before_int8(passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
+    """Leave out the quantization and what follows it."""
+    names = [each.name for each in passes]
+    if QuantizeInt8.name not in names:
+        return passes
+    return passes[: names.index(QuantizeInt8.name)]
+
+
+def _fraction(text: str) -> tuple[int, int]:
+    number, slash, count = text.partition("/")
+    if not slash or not (number.isdecimal() and count.isdecimal()):
+        raise RecipeError(f"--shard is {text!r}; write 2/4 for the second of four")
+    return int(number), int(count)
+
+
+def _show(found: Ranges, output: Path) -> None:
+    console.print(
+        f"{output}: {len(found.tensors)} tensors, {found.method}, {found.frames} frames"
+    )
+    worst = sorted(found.outliers.items(), key=lambda item: -item[1])
+    outliers = [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
+    for what, names in (
+        ("always zero", list(found.dead)),
+        ("a few elements make the range", outliers),
+    ):
+        if names:
+            more = f"; and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+            line = f"{len(names)} {what}: {'; '.join(names[:_SHOWN])}{more}"
+            console.print(escape(line), soft_wrap=True)

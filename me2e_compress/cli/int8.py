@@ -1,0 +1,61 @@
+"""Options of int8 that commands have in common."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.errors import RecipeError
+from me2e_compress.passes import Pass
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+
+
+@dataclasses.dataclass(frozen=True)
+class Int8Options:
+    """What the command line says about int8; None leaves it to the recipe.
+
+    Attributes:
+        scheme: ``feature-ext``, ``prediction`` or ``full``.
+        rules: ``paper`` or ``tensorrt``.
+        target: who will run the graph.
+        overrides: TOML file of exceptions.
+        ranges: file of saved ranges.
+        method: how ranges are read from frames, or were for ``ranges``.
+    """
+
+    scheme: str | None = None
+    rules: str | None = None
+    target: str | None = None
+    overrides: Path | None = None
+    ranges: Path | None = None
+    method: str | None = None
+
+    def apply(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
+        """Put them into the quantization of a pipeline; add one for a scheme.
+
+        Raises:
+            RecipeError: there is nothing that they could apply to.
+        """
+        if self.scheme is not None:
+            passes = (*passes, QuantizeInt8(scheme=self.scheme))
+        options = {name: value for name, value in vars(self).items() if value}
+        options.pop("scheme", None)
+        if not options:
+            return passes
+        if not any(isinstance(each, QuantizeInt8) for each in passes):
+            raise RecipeError(
+                f"--{next(iter(options))} is for int8, and the pipeline has no"
+                f" {QuantizeInt8.name}: add --scheme"
+            )
+        return tuple(
+            self._changed(each) if isinstance(each, QuantizeInt8) else each
+            for each in passes
+        )
+
+    def _changed(self, given: QuantizeInt8) -> QuantizeInt8:
+        return dataclasses.replace(
+            given,
+            rules=self.rules or given.rules,
+            target=self.target or given.target,
+            overrides=str(self.overrides) if self.overrides else given.overrides,
+            ranges=str(self.ranges) if self.ranges else given.ranges,
+            method=self.method or given.method,
+        )

@@ -1,0 +1,135 @@
+"""``me2e-compress plan``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import onnx_ir as ir
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.plan import (
+    INT8,
+    QuantPlan,
+    differences,
+    load_plan,
+    plan_of,
+    save_plan,
+)
+from me2e_compress.calibration.plan.files import record
+from me2e_compress.calibration.rules import WEIGHTED
+from me2e_compress.cli.console import console, print_json, table
+from me2e_compress.cli.job import run_on
+from me2e_compress.cli.models import model_path
+from me2e_compress.errors import PreconditionError
+from me2e_compress.modules import map_of
+from me2e_compress.passes import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.targets.quantized import describe_quantized
+
+
+def plan(
+    model: Annotated[
+        Path,
+        typer.Argument(help="an ONNX file, float or with a plan", parser=model_path),
+    ],
+    scheme: Annotated[str, typer.Option(help="feature-ext, prediction, full")] = "full",
+    rules: Annotated[str, typer.Option(help="paper or tensorrt")] = "paper",
+    overrides: Annotated[
+        Path | None, typer.Option(help="TOML file of exceptions")
+    ] = None,
+    module_map: Annotated[
+        str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="another plan, or a model with one: compare")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="save it as JSON")
+    ] = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="every node, not only what could be int8")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
+) -> None:
+    """Show which nodes become int8, which stay float, by which rule, and why."""
+    options = QuantizeInt8(
+        scheme=scheme,
+        rules=rules,
+        overrides=None if overrides is None else str(overrides),
+    )
+    found = read_plan(model, options, module_map)
+    if output is not None:
+        save_plan(found, output)
+    if as_json:
+        print_json(record(found))
+    elif against is not None:
+        _compare(read_plan(against, options, module_map), found)
+    else:
+        _show(found, every=every)
+
+
+def read_plan(path: Path, options: QuantizeInt8, module_map: str | None) -> QuantPlan:
+    """Give the plan that a file is or carries, else the one that would be made of it.
+
+    Raises:
+        PreconditionError: the graph is quantized and carries no plan.
+    """
+    if path.suffix == ".json":
+        return load_plan(path)
+    model = graph.load(path)
+    carried = plan_of(model)
+    return make(model, options, module_map) if carried is None else carried
+
+
+def make(model: ir.Model, options: QuantizeInt8, module_map: str | None) -> QuantPlan:
+    """Plan a float graph as ``compress --scheme`` does, the exact passes done."""
+    if quantized := describe_quantized(model):
+        raise PreconditionError(
+            f"the graph is quantized already and carries no plan: {quantized}"
+        )
+    modules = map_of(model, module_map)
+    ready = run_on(model, recipe.load("exact"), modules)
+    graph.infer_shapes(ready)
+    return options.plan(ready, Context(modules))
+
+
+def _show(found: QuantPlan, *, every: bool) -> None:
+    shown = table("Decisions", "module", "node", "op", "", "rule", "why", left=6)
+    for each in found.decisions:
+        if every or each.op in WEIGHTED or each.dtype == INT8:
+            close = (
+                f" [bold]({escape(each.borderline)})[/bold]" if each.borderline else ""
+            )
+            shown.add_row(
+                each.module,
+                escape(each.node),
+                each.op,
+                each.dtype,
+                each.rule,
+                escape(each.reason + close),
+            )
+    console.print(shown)
+    if every and found.groups:
+        console.print(_groups(found))
+    counts = ", ".join(f"{rule} {count}" for rule, count in found.counts().items())
+    console.print(
+        f"scheme {found.scheme.name}, rules {found.rules}: {len(found.chosen)} of"
+        f" {len(found.decisions)} nodes int8; {counts}"
+    )
+
+
+def _groups(found: QuantPlan) -> Table:
+    shown = table("Decided together", "kind", "name", "tensors", "read by", left=4)
+    for group in found.groups:
+        tensors, nodes = ", ".join(group.tensors), ", ".join(group.nodes)
+        shown.add_row(group.kind, escape(group.name), escape(tensors), escape(nodes))
+    return shown
+
+
+def _compare(old: QuantPlan, new: QuantPlan) -> None:
+    lines = [str(each) for each in differences(old, new)]
+    for line in lines:
+        console.print(escape(line), soft_wrap=True)
+    console.print(f"{len(lines)} differences")

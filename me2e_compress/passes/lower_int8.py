@@ -1,0 +1,67 @@
+"""Int8 made for TensorRT, for onnxruntime."""
+
+import dataclasses
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.measured import measured_ranges
+from me2e_compress.targets import onnxruntime
+
+
+@dataclasses.dataclass(frozen=True)
+class LowerInt8:
+    """Rewrite a graph that was quantized for TensorRT so that a CPU is fast with it.
+
+    Given:   y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
+    Result:  y = DequantizeLinear(QuantizeLinear(Conv(DequantizeLinear(
+             QuantizeLinear(x)), DequantizeLinear(w_int8), DequantizeLinear(b_int32))))
+
+    The graph may be ModelOpt's, or what ``quantize-int8`` wrote for TensorRT. Layers,
+    weights and ranges stay the same, on uint8 instead of int8; what convolutions answer
+    is quantized too, and the ranges of that are measured on the context's frames, or
+    read from a file. Activations that TensorRT reads in int8 and onnxruntime has no
+    fast kernel for (the products of attention) become float again.
+
+    Attributes:
+        method: how ranges are read from the frames: ``max-min``.
+        ranges: file of saved ranges instead of frames.
+    """
+
+    name: ClassVar[str] = "lower-int8"
+    exact: ClassVar[bool] = False
+    changes_interface: ClassVar[bool] = False
+    method: str = "max-min"
+    ranges: str | None = None
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Read the pairs, calibrate what they do not tell, write them anew.
+
+        Raises:
+            PreconditionError: the graph is not quantized, or not in symmetric int8.
+            FramesError: neither frames nor ranges, or they are of another graph.
+        """
+        missing = onnxruntime.unranged(model)
+        ranges = None
+        if missing:
+            ranges = measured_ranges(
+                self.name,
+                model,
+                missing,
+                context,
+                method=self.method,
+                saved=self.ranges,
+            )
+        lowered = onnxruntime.convert(model, ranges)
+        graph.infer_shapes(lowered)
+        layers = onnxruntime.int8_layers(lowered)
+        return PassResult(
+            lowered,
+            len(layers),
+            (
+                f"{len(layers)} layers in int8 for onnxruntime",
+                f"{len(missing)} tensors calibrated besides those of the graph",
+            ),
+        )

@@ -1,0 +1,124 @@
+"""What int8 costs, module by module, and which nodes are to blame."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from me2e_compress.calibration.plan import RESIDUAL
+from me2e_compress.sensitivity.trials import Choice, Score, Trials
+
+BLAME = 0.5
+"""Nodes are to blame if they alone cost this part of what their module costs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """What one module costs when it alone is int8.
+
+    Attributes:
+        module: its name.
+        nodes: how many of its nodes are int8 then.
+        score: of that variant.
+        blamed: groups of nodes, worst first, each with its loss as the only int8
+            nodes of the graph; a group of one is a node found by bisection, a larger
+            one costs that only together, or was left whole when the trials were used
+            up. Empty where the cost is spread over the module.
+    """
+
+    module: str
+    nodes: int
+    score: Score
+    blamed: tuple[tuple[tuple[str, ...], float], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensitivity:
+    """What was found.
+
+    Attributes:
+        findings: the modules that have int8 nodes, worst first.
+        together: the score of all of them.
+        trials: variants that were built and run.
+    """
+
+    findings: tuple[Finding, ...]
+    together: Score
+    trials: int
+
+
+def analyse(
+    trials: Trials,
+    modules: Sequence[str],
+    *,
+    node_trials: int = 24,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Sensitivity:
+    """Score every module alone, then bisect it to the nodes that cost most.
+
+    Half of a module's nodes is int8 at a time, then half of the guilty half, and so on:
+    a node among n is found in about 2 log2 n trials.
+
+    Args:
+        trials: judges variants.
+        modules: which may be int8.
+        node_trials: most trials spent on the nodes of one module; 0 leaves nodes out.
+        progress: called as ``progress(modules done, modules, module)``.
+    """
+    findings = []
+    active = [name for name in modules if names_of(trials, name)]
+    for done, module in enumerate(active):
+        if progress:
+            progress(done, len(active), module)
+        names = names_of(trials, module)
+        score = trials.score(Choice((module,)))
+        blamed: tuple[tuple[tuple[str, ...], float], ...] = ()
+        if node_trials and score.loss > 0:
+            blamed = _Bisection(trials, module, names, node_trials).run(score.loss)
+        findings.append(Finding(module, len(names), score, blamed))
+    findings.sort(key=lambda each: -each.score.loss)
+    together = trials.score(Choice(tuple(active)))
+    return Sensitivity(tuple(findings), together, trials.done)
+
+
+def names_of(trials: Trials, module: str) -> tuple[str, ...]:
+    """Name the nodes that are int8 when a module is, in graph order.
+
+    Residual Adds are left out: they follow their convolution.
+    """
+    chosen = trials.plan(Choice((module,))).chosen
+    return tuple(dict.fromkeys(each.node for each in chosen if each.rule != RESIDUAL))
+
+
+class _Bisection:
+    """The search for the guilty nodes of one module."""
+
+    def __init__(
+        self, trials: Trials, module: str, names: tuple[str, ...], budget: int
+    ) -> None:
+        self._trials = trials
+        self._module = module
+        self._names = names
+        self._left = budget
+
+    def run(self, loss: float) -> tuple[tuple[tuple[str, ...], float], ...]:
+        """Split the costly groups, the costliest first."""
+        open_groups = [(self._names, loss)]
+        blamed = []
+        while open_groups:
+            open_groups.sort(key=lambda each: -each[1])
+            group, cost = open_groups.pop(0)
+            if len(group) == 1 or self._left < 2:
+                blamed.append((group, cost))
+                continue
+            middle = len(group) // 2
+            halves = [
+                (half, self._loss(half)) for half in (group[:middle], group[middle:])
+            ]
+            guilty = [each for each in halves if each[1] >= BLAME * loss]
+            open_groups += guilty
+        found = [each for each in blamed if len(each[0]) < len(self._names)]
+        return tuple(sorted(found, key=lambda each: -each[1]))
+
+    def _loss(self, only: tuple[str, ...]) -> float:
+        self._left -= 1
+        floats = tuple(name for name in self._names if name not in only)
+        return self._trials.score(Choice((self._module,), floats)).loss

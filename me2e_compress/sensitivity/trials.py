@@ -1,0 +1,149 @@
+"""One float model, calibrated once, of which many int8 variants are judged."""
+
+import dataclasses
+from collections.abc import Callable
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.calibration.plan import FLOAT, Overrides, QuantPlan, make_plan
+from me2e_compress.calibration.plan.overrides import Override
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.rules import RuleSet
+from me2e_compress.calibration.scheme import QuantScheme
+from me2e_compress.metrics.fidelity import Fidelity, Reference
+from me2e_compress.modules import ModuleMap
+from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.session import Session
+from me2e_compress.targets import Target
+
+_GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
+"""Makes a name a pattern that matches only itself."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """What is int8.
+
+    Attributes:
+        modules: these, in the order of the module map.
+        floats: names of nodes in them that stay float.
+    """
+
+    modules: tuple[str, ...]
+    floats: tuple[str, ...] = ()
+
+    def overrides(self) -> Overrides:
+        """Give the exceptions that keep the nodes float."""
+        return Overrides(
+            override=tuple(
+                Override(dtype=FLOAT, nodes=name.translate(_GLOB), reason="sensitive")
+                for name in self.floats
+            )
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """How an int8 variant does.
+
+    Attributes:
+        fidelity: against the float model, on the frames.
+        driving: what the hook for driving gave; None where there is none.
+        weight_bytes: of all its weights.
+    """
+
+    fidelity: Fidelity
+    driving: float | None
+    weight_bytes: int
+
+    @property
+    def loss(self) -> float:
+        """What is to be small: metres that the plan moves, mean over the frames.
+
+        For a model whose plan is not known, the amplitude of the noise of its worst
+        output, relative to the signal: 10^(-SQNR / 20).
+        """
+        if self.fidelity.plan is not None:
+            return self.fidelity.plan.mean_m
+        worst = min(each.sqnr_db for each in self.fidelity.outputs)
+        return float(10 ** (-worst / 20))
+
+    @property
+    def unit(self) -> str:
+        """Unit of the loss."""
+        return "m" if self.fidelity.plan is not None else "of the signal"
+
+
+class Trials:
+    """Makes int8 variants of a model and judges them; each choice once.
+
+    Args:
+        model: the float graph after the exact passes, shapes inferred.
+        modules: its module map.
+        rules: of the plans.
+        target: how int8 is written. Fidelity is judged on what is written.
+        ranges: of every tensor that any variant needs.
+        frames: to judge on; read once for every variant.
+        drive: gives a score of closed-loop driving for a graph, larger is better.
+        threads: of onnxruntime; 0 takes all.
+
+    Attributes:
+        model: as given; ``modules`` and ``ranges`` too.
+        reference: what the float model answered.
+        done: how many variants were built and run.
+    """
+
+    def __init__(
+        self,
+        model: ir.Model,
+        modules: ModuleMap,
+        rules: RuleSet,
+        target: Target,
+        ranges: Ranges,
+        frames: Frames,
+        *,
+        drive: Callable[[ir.Model], float] | None = None,
+        threads: int = 0,
+    ) -> None:
+        self.model = model
+        self.modules = modules
+        self.done = 0
+        self._rules = rules
+        self._target = target
+        self.ranges = ranges
+        self._drive = drive
+        self._threads = threads
+        self._known: dict[Choice, Score] = {}
+        self.reference = Reference.of(
+            Session(model, threads=threads, release=True), frames
+        )
+
+    def plan(self, choice: Choice) -> QuantPlan:
+        """Decide for every node, as ``quantize-int8`` will for the recipe."""
+        scheme = QuantScheme.of(choice.modules, self.modules)
+        return make_plan(self.model, scheme, self._rules, choice.overrides())
+
+    def variant(self, choice: Choice) -> ir.Model:
+        """Give the graph of a choice."""
+        if not choice.modules:
+            return self.model
+        return self._target.place(self.model, self.plan(choice), self.ranges)
+
+    def score(self, choice: Choice) -> Score:
+        """Judge a choice.
+
+        Raises:
+            GraphError: onnxruntime cannot run the variant.
+            EvaluationError: an output is no number.
+        """
+        if choice not in self._known:
+            graph_of_choice = self.variant(choice)
+            session = Session(graph_of_choice, threads=self._threads, release=True)
+            self._known[choice] = Score(
+                self.reference.compare(session),
+                None if self._drive is None else self._drive(graph_of_choice),
+                graph.size(graph_of_choice).weight_bytes,
+            )
+            self.done += 1
+        return self._known[choice]

@@ -1,0 +1,127 @@
+"""What onnxruntime's CPU can compute on uint8 activations and int8 weights."""
+
+import math
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.graph import static_shape
+
+MOVES = frozenset(
+    {
+        "AveragePool", "Flatten", "GlobalAveragePool", "MaxPool", "Reshape", "Resize",
+        "Slice", "Squeeze", "Transpose", "Unsqueeze",
+    }
+)  # fmt: skip
+"""Operators that choose, move or average elements: what they answer lies on the grid,
+or at least in the range, of what they read."""
+
+JOINS = frozenset({"Add", "Concat"})
+"""Operators that read several tensors of the network, each on a grid of its own."""
+
+
+def is_layer(node: ir.Node) -> bool:
+    """Say whether a layer has an int8 kernel; its weight is taken for granted.
+
+    There is QLinearConv, but none for ConvTranspose; QGemm has neither beta nor a
+    transposed left operand; MatMul must have one weight for the whole batch.
+    """
+    if node.domain not in ("", "ai.onnx"):
+        return False
+    if node.op_type == "Conv":
+        return bias_of(node) is None or graph.array_of(bias_of(node)) is not None
+    if node.op_type == "Gemm":
+        return _is_plain_gemm(node)
+    if node.op_type != "MatMul":
+        return False
+    left, right = node.inputs[0], static_shape(node.inputs[1])
+    rank = 0 if left is None or left.shape is None else len(left.shape)
+    return rank >= 2 and right is not None and len(right) == 2
+
+
+def _is_plain_gemm(node: ir.Node) -> bool:
+    bias = bias_of(node)
+    return (
+        node.attributes.get_float("alpha", 1.0) == 1
+        and node.attributes.get_float("beta", 1.0) == 1
+        and not node.attributes.get_int("transA", 0)
+        and (bias is None or is_bias(bias, 2))
+    )
+
+
+def channel_axis(node: ir.Node) -> int:
+    """Give the axis of a weight that its scales must run along.
+
+    Conv [M, C/g, ...]: 0. Gemm [K, N]: 1, or 0 where it is transposed. MatMul: 1.
+    """
+    if node.op_type == "Gemm":
+        return 0 if node.attributes.get_int("transB", 0) else 1
+    return 0 if node.op_type == "Conv" else 1
+
+
+def bias_of(node: ir.Node) -> ir.Value | None:
+    """Give the bias of a Conv or Gemm."""
+    return node.inputs[2] if len(node.inputs) > 2 else None
+
+
+def is_bias(value: ir.Value | None, rank: int) -> bool:
+    """Say whether a value is a constant that adds one number to every column.
+
+    Args:
+        value: what is added.
+        rank: of the product; a constant of higher rank would lend it that.
+    """
+    array = graph.array_of(value)
+    return (
+        array is not None
+        and array.ndim <= rank
+        and math.prod(array.shape[:-1]) == 1
+        and array.dtype == np.float32
+    )
+
+
+def biased_end(product: ir.Node) -> ir.Node | None:
+    """Give the Add that puts a bias on a MatMul, if nothing else reads the product."""
+    value = product.outputs[0]
+    readers = list(value.consumers())
+    left = product.inputs[0]
+    rank = 0 if left is None or left.shape is None else len(left.shape)
+    if value.is_graph_output() or len(readers) != 1 or readers[0].op_type != "Add":
+        return None
+    addition = readers[0]
+    others = [each for each in addition.inputs if each is not value]
+    return addition if len(others) == 1 and is_bias(others[0], rank) else None
+
+
+def is_move(node: ir.Node) -> bool:
+    """Say whether a node only moves, picks or averages what its first input holds."""
+    if node.domain not in ("", "ai.onnx") or node.op_type not in MOVES:
+        return False
+    if node.op_type == "Resize":
+        return node.attributes.get_string("mode", "nearest") == "nearest"
+    return len(node.outputs) == 1
+
+
+def end_of(node: ir.Node) -> ir.Value:
+    """Give the value that a layer's kernel answers: behind the ReLU, if one follows.
+
+    A ReLU costs nothing where its uint8 grid begins at zero: quantization clips.
+    """
+    value = node.outputs[0]
+    readers = list(value.consumers())
+    if (
+        len(readers) == 1
+        and not value.is_graph_output()
+        and is_clip_at_zero(readers[0])
+    ):
+        return readers[0].outputs[0]
+    return value
+
+
+def is_clip_at_zero(node: ir.Node) -> bool:
+    """Say whether a node is a ReLU, or a Clip that begins at zero."""
+    if node.op_type == "Clip" and len(node.inputs) > 1:
+        low = graph.array_of(node.inputs[1])
+        return low is not None and float(low) == 0.0
+    return node.op_type == "Relu"

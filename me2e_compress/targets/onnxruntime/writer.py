@@ -1,0 +1,91 @@
+"""Write constants and new nodes into a graph that is being lowered."""
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.graph import provenance
+
+BY = "quantize-int8"
+
+
+class Writer:
+    """Writes into one graph; equal constants are stored once.
+
+    Args:
+        where: the graph.
+    """
+
+    def __init__(self, where: ir.Graph) -> None:
+        self.graph = where
+        self._constants: dict[tuple[str, bytes], ir.Value] = {}
+        self._names = {value.name for node in where for value in node.outputs}
+        self._names |= {value.name for value in where.inputs}
+
+    def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
+        """Give the initializer that holds an array, a new one if there is none."""
+        kind = f"{array.dtype}{array.shape}"
+        key = (kind, hashlib.sha256(array.tobytes()).digest())
+        if key not in self._constants:
+            self._constants[key] = graph.add_constant(self.graph, array, name)
+        return self._constants[key]
+
+    def node(
+        self,
+        op: str,
+        inputs: Sequence[ir.Value],
+        name: str,
+        sources: Sequence[ir.Node],
+        attributes: dict[str, int] | None = None,
+    ) -> ir.Node:
+        """Make a node, and its output; it stands nowhere yet.
+
+        Args:
+            op: a standard operator.
+            inputs: what it reads.
+            name: of the node and of what it answers, or with a number behind it.
+            sources: the nodes whose heir it is, the leading one first.
+            attributes: integers.
+        """
+        unique, count = name, 0
+        while unique in self._names:
+            count += 1
+            unique = f"{name}_{count}"
+        self._names.add(unique)
+        node = ir.node(op, inputs, attributes or {}, name=unique)
+        node.outputs[0].name = unique
+        provenance.inherit(node, sources, by=BY)
+        return node
+
+    def dequantized(
+        self,
+        name: str,
+        integers: npt.NDArray[np.generic],
+        scales: npt.NDArray[np.float32],
+        axis: int,
+        reader: ir.Node,
+    ) -> ir.Value:
+        """Store integers and give the float tensor they stand for, before its reader.
+
+        Args:
+            name: what the new names begin with.
+            integers: int8 or int32.
+            scales: float32 [channels], or a scalar for one step everywhere.
+            axis: which axis of the integers the channels run along.
+            reader: the node that will read it.
+        """
+        zeros = np.zeros(scales.shape, integers.dtype)
+        stored = self.constant(integers, f"{name}_{integers.dtype}")
+        steps = self.constant(scales, f"{name}_scale")
+        inputs = [stored, steps, self.constant(zeros, f"{name}_zero")]
+        axes = {"axis": axis} if scales.ndim else None
+        label = f"{reader.name or reader.outputs[0].name}/{name}_float"
+        node = self.node("DequantizeLinear", inputs, label, [reader], axes)
+        node.outputs[0].shape = ir.Shape(integers.shape)
+        node.outputs[0].dtype = ir.DataType.FLOAT
+        self.graph.insert_before(reader, node)
+        return node.outputs[0]

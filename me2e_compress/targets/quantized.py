@@ -1,0 +1,61 @@
+"""Recognise a graph that somebody has quantized already."""
+
+from collections import Counter
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.calibration.plan.files import METADATA
+
+PAIRS = ("QuantizeLinear", "DequantizeLinear")
+INTEGER_OPS = frozenset(
+    {
+        "ConvInteger", "DynamicQuantizeLinear", "DynamicQuantizeLSTM",
+        "DynamicQuantizeMatMul", "MatMulBnb4", "MatMulInteger", "MatMulIntegerToFloat",
+        "MatMulNBits", "QAttention", "QEmbedLayerNormalization", "QGemm",
+        "QLinearAdd", "QLinearAveragePool", "QLinearConcat", "QLinearConv",
+        "QLinearGlobalAveragePool", "QLinearLeakyRelu", "QLinearMatMul", "QLinearMul",
+        "QLinearSigmoid", "QLinearSoftmax", "QLinearWhere",
+    }
+)  # fmt: skip
+"""Operators on integers (ONNX, com.microsoft): what runtimes' quantizers write."""
+
+
+def describe_quantized(model: ir.Model) -> str | None:
+    """Say in words how a graph is quantized; None if it is not.
+
+    Returns:
+        How many operators of which kind, on which grid, and by whom if it says so.
+    """
+    counts = Counter(
+        node.op_type
+        for node in model.graph.all_nodes()
+        if node.op_type in INTEGER_OPS or node.op_type in PAIRS
+    )
+    if not counts:
+        return None
+    listed = ", ".join(f"{count} {op}" for op, count in sorted(counts.items()))
+    parts = [listed]
+    if any(op in counts for op in PAIRS):
+        parts.append(_grid(model))
+    if METADATA in model.metadata_props:
+        parts.append("it carries the plan it was made by")
+    elif model.producer_name:
+        parts.append(f"made by {model.producer_name}")
+    return "; ".join(parts)
+
+
+def _grid(model: ir.Model) -> str:
+    """Name the element types of all pairs, and whether they are symmetric."""
+    pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIRS]
+    zeros = [node.inputs[2] if len(node.inputs) > 2 else None for node in pairs]
+    types = dict.fromkeys(_type(zero) for zero in zeros)
+    arrays = [graph.array_of(zero) for zero in zeros]
+    centred = not any(array.any() for array in arrays if array is not None)
+    grid = "zero points 0" if centred else "zero points that are not 0"
+    return f"{' and '.join(types)} with {grid}"
+
+
+def _type(zero: ir.Value | None) -> str:
+    """Name what a zero point is; uint8 is what ONNX takes where there is none."""
+    return "uint8" if zero is None or zero.dtype is None else zero.dtype.name.lower()

@@ -1,0 +1,103 @@
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnxruntime.quantization.CalTableFlatBuffers.TrtTable import TrtTable
+
+from me2e_compress.calibration.exchange import (
+    read_foreign,
+    write_onnxruntime_table,
+    write_tensorrt_cache,
+)
+from me2e_compress.calibration.observers import scale_of
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.errors import FramesError
+
+NAMES = ("/head/MatMul output", "a: b", "image")
+
+
+def ranges(method: str = "max-min") -> Ranges:
+    ends = {NAMES[0]: (-3.5, 1.25), NAMES[1]: (0.0, 7.0), NAMES[2]: (-1e-3, 0.0)}
+    return Ranges(ends, method, 4, "digest", "frames")
+
+
+@pytest.mark.parametrize(
+    ("method", "head"),
+    [
+        ("max-min", "TRT-101000-MinMaxCalibration"),
+        ("mse", "TRT-101000-EntropyCalibration2"),
+    ],
+)
+def test_the_cache_is_as_tensorrt_writes_it(
+    tmp_path: Path, method: str, head: str
+) -> None:
+    write_tensorrt_cache(ranges(method), tmp_path / "c")
+    first, *lines = (tmp_path / "c").read_text().splitlines()
+
+    assert first == head
+    assert lines[0] == f"{NAMES[0]}: {struct.pack('>f', 3.5 / 127).hex()}"
+
+
+@settings(max_examples=20, deadline=None)
+@given(reach=st.floats(1e-30, 1e30))
+def test_scales_survive_the_way_through_a_cache(
+    tmp_path_factory: pytest.TempPathFactory, reach: float
+) -> None:
+    path = tmp_path_factory.mktemp("cache") / "c"
+    write_tensorrt_cache(Ranges({"t": (0, reach)}, "mse", 1, "m", "f"), path)
+
+    found = read_foreign(path, "m", ("t",))
+
+    assert scale_of(*found.tensors["t"]) == scale_of(0, reach)
+
+
+def test_the_table_of_onnxruntime_holds_the_magnitudes(tmp_path: Path) -> None:
+    write_onnxruntime_table(ranges(), tmp_path / "table")
+    content = (tmp_path / "table" / "calibration.flatbuffers").read_bytes()
+
+    table = TrtTable.GetRootAsTrtTable(content, 0)
+    held = {}
+    for at in range(table.DictLength()):
+        entry = table.Dict(at)
+        assert entry is not None
+        held[(entry.Key() or b"").decode()] = float(entry.Value() or b"nan")
+    assert held == pytest.approx(dict(zip(NAMES, (3.5, 7, 1e-3), strict=True)))
+    found = read_foreign(tmp_path / "table" / "calibration.cache", "m", NAMES)
+    assert found.tensors[NAMES[0]] == (-3.5, 3.5)
+    assert [each.name for each in (tmp_path / "table").iterdir() if each.is_dir()] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("TRT-8501-X\nimage: zz", "line 2 is no name and number: 'image: zz'"),
+        ("TRT-8501-X\nimage: 3c0a", "line 2 is no name and number"),
+        ("TRT-8501-X\nimage: 7fc00000", "line 2 is no range"),
+        ("image", "line 1 is no name"),
+        ("image -2", "line 1 is no range"),
+        ("other 2", "a cache of another model: it lacks image and 0 more of 1"),
+    ],
+)
+def test_a_cache_that_does_not_fit_is_refused(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    path = tmp_path / "c"
+    with pytest.raises(FramesError, match="no such calibration cache"):
+        read_foreign(path, "m", ("image",))
+    path.write_text(text)
+
+    with pytest.raises(FramesError, match=message):
+        read_foreign(path, "m", ("image",))
+
+
+def test_imported_ranges_fit_any_method_but_one_graph(tmp_path: Path) -> None:
+    write_tensorrt_cache(ranges(), tmp_path / "c")
+    found = read_foreign(tmp_path / "c", "digest", NAMES)
+
+    found.check(model="digest", tensors=NAMES, method="entropy", source="others")
+    with pytest.raises(FramesError, match="of graph digest, not elsewhere"):
+        found.check(model="elsewhere", tensors=NAMES, method="entropy")
+    assert np.isfinite(list(found.tensors.values())).all()

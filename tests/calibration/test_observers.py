@@ -1,0 +1,163 @@
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.calibration.observers import (
+    Entropy,
+    MaxMin,
+    MeanSquaredError,
+    MovingAverage,
+    Percentile,
+    observer,
+    scale_of,
+)
+from me2e_compress.calibration.statistics import BINS, Statistics
+from me2e_compress.errors import FramesError, RecipeError
+
+Values = npt.NDArray[np.float64]
+
+
+def seen(*tensors: Values) -> Statistics:
+    """Statistics of one frame, computed the plain way."""
+    gauges = np.array(
+        [[(x.min(), x.max(), np.mean(x * x)) for x in tensors]], np.float32
+    )
+    names = tuple(f"t{at}" for at in range(len(tensors)))
+    bare = Statistics("m", "s", names, (0,), gauges)
+    counts = [
+        np.histogram(np.abs(x), BINS, (0, 2.0**e))[0]
+        for x, e in zip(tensors, bare.exponents, strict=True)
+    ]
+    return Statistics("m", "s", names, (0,), gauges, np.array(counts))
+
+
+def extremes(*frames: tuple[float, float]) -> Statistics:
+    gauges = np.array([[(low, high, 1)] for low, high in frames], np.float32)
+    return Statistics("m", "s", ("t",), tuple(range(len(frames))), gauges)
+
+
+def reach(method: object, x: Values) -> float:
+    lows, highs = method.ranges(seen(x))  # type: ignore[attr-defined]
+    return float(max(-lows[0], highs[0]))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "scale"),
+    [(-1.27, 0.5, 0.01), (0.0, 12.7, 0.1), (-254.0, 254.0, 2.0), (0.0, 0.0, 1.0)],
+)
+def test_the_scale_covers_the_larger_side(
+    low: float, high: float, scale: float
+) -> None:
+    assert scale_of(low, high) == np.float32(scale)
+
+
+def test_max_min_is_static() -> None:
+    lows, highs = MaxMin().ranges(extremes((-1, 2), (-3, 1), (0, 0)))
+
+    assert (lows.tolist(), highs.tolist()) == ([-3], [2])
+
+
+def test_the_moving_average_forgets_slowly_and_in_order() -> None:
+    lows, highs = MovingAverage(0.5).ranges(extremes((-1, 2), (-3, 1), (0, 0)))
+
+    assert (lows.tolist(), highs.tolist()) == ([-1], [0.75])
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.floats(0.5, 100), st.integers(0, 9))
+def test_a_percentile_leaves_out_no_more_than_it_may(percent: float, seed: int) -> None:
+    x = np.random.default_rng(seed).standard_cauchy(5000)
+    found = reach(Percentile(percent), x)
+    magnitudes = np.abs(x)
+    bin_width = 2.0 ** np.frexp(magnitudes.max())[1] / BINS
+
+    assert np.mean(magnitudes <= found) >= percent / 100
+    assert np.mean(magnitudes <= found - bin_width) < percent / 100
+
+
+def test_the_mse_threshold_is_the_best_of_a_search_over_the_elements() -> None:
+    x = np.random.default_rng(3).standard_t(4, size=20_000)
+
+    def noise(threshold: float) -> float:
+        step = threshold / 127
+        rounded = np.clip(np.rint(x / step), -127, 127) * step
+        return float(np.mean((x - rounded) ** 2))
+
+    best = min(noise(t) for t in np.linspace(0.2, 1, 400) * np.abs(x).max())
+    found = noise(reach(MeanSquaredError(), x))
+
+    assert found < noise(np.abs(x).max().item()) * 0.95
+    assert found == pytest.approx(best, rel=0.03)
+
+
+def test_entropy_agrees_with_the_algorithm_written_out() -> None:
+    x = np.random.default_rng(5).standard_t(3, size=40_000)
+    counts = seen(x).counted()[0]
+    counts[0] = counts[1]
+    top = np.flatnonzero(counts)[-1] + 1
+    costs = {}
+    for edge in [top, *range(128, top, BINS // 256)]:
+        p = counts[:edge].astype(float)
+        q = np.zeros(edge)
+        for level in range(128):
+            members = [j for j in range(edge) if j * 128 // edge == level]
+            used = [j for j in members if p[j] > 0]
+            for j in used:
+                q[j] = p[members].sum() / len(used)
+        p[-1] += counts[edge:].sum()
+        p, q = p / p.sum(), q / q.sum()
+        ill = (p > 0) & (q == 0)
+        on = p > 0
+        costs[edge] = np.inf if ill.any() else np.sum(p[on] * np.log(p[on] / q[on]))
+    expected = min(costs, key=lambda edge: costs[edge])
+
+    width = 2.0 ** np.frexp(np.abs(x).max())[1] / BINS
+    assert expected < top
+    assert reach(Entropy(), x) == pytest.approx(expected * width)
+
+
+@pytest.mark.parametrize("method", [Percentile(), MeanSquaredError(), Entropy()])
+def test_no_method_reaches_beyond_what_was_seen(method: object) -> None:
+    x = np.random.default_rng(1).uniform(0, 3, 500)
+    lows, highs = method.ranges(seen(x, np.zeros(4)))  # type: ignore[attr-defined]
+
+    assert lows[0] == np.float32(x.min())
+    assert 0 < highs[0] <= np.float32(x.max())
+    assert (lows[1], highs[1]) == (0, 0)
+
+
+def test_histogram_methods_say_that_they_lack_histograms() -> None:
+    with pytest.raises(FramesError, match="no histograms"):
+        Percentile().ranges(extremes((0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("text", "canonical"),
+    [
+        ("max-min", "max-min"),
+        ("percentile", "percentile:99.99"),
+        ("percentile:99.9", "percentile:99.9"),
+        ("moving-average:0.1", "moving-average:0.1"),
+        ("entropy", "entropy"),
+    ],
+)
+def test_methods_are_read_from_text(text: str, canonical: str) -> None:
+    assert observer(text).text == canonical
+    assert observer(canonical) == observer(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fp8", "no calibration method fp8; there is max-min, .*entropy, all int8"),
+        ("mse:3", "mse takes no number, found '3'"),
+        ("percentile:x", "above 0 and at most 100, found 'x'"),
+        ("percentile:0", "above 0"),
+        ("moving-average:2", "at most 1, found '2'"),
+    ],
+)
+def test_what_is_no_method_is_refused(text: str, message: str) -> None:
+    with pytest.raises(RecipeError, match=message):
+        observer(text)

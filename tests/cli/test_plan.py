@@ -1,0 +1,147 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.plan import load_plan, plan_of
+from tests.cli.conftest import Command
+from tests.nets import net
+
+
+def compressed(command: Command, dense: Path, *more: str | Path) -> Path:
+    output = dense / "out.onnx"
+    options = ("--scheme", "prediction", "--frames", dense / "frames")
+    place = ("--map", dense / "map.toml", "-o", output)
+    assert command("compress", dense / "dense.onnx", *options, *place, *more) == 0
+    return output
+
+
+def test_a_quantized_file_has_its_plan_beside_it_and_inside(
+    command: Command, dense: Path
+) -> None:
+    output = compressed(command, dense)
+
+    saved = load_plan(dense / "out.plan.json")
+    assert saved == plan_of(graph.load(output))
+    assert [each.node for each in saved.chosen] == ["/plan_head/MatMul"]
+
+
+def test_the_plan_that_is_shown_is_the_one_that_is_made(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compressed(command, dense)
+    capsys.readouterr()
+    words = ("--scheme", "prediction", "--map", dense / "map.toml", "--json")
+
+    assert command("plan", dense / "dense.onnx", *words) == 0
+
+    shown = json.loads(capsys.readouterr().out)
+    assert shown == json.loads((dense / "out.plan.json").read_text())
+
+
+def test_plans_are_compared(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = compressed(command, dense)
+    capsys.readouterr()
+    words = ("--scheme", "prediction", "--rules", "tensorrt")
+    more = ("--map", dense / "map.toml", "--against", output)
+
+    assert command("plan", dense / "dense.onnx", *words, *more) == 0
+
+    said = capsys.readouterr().out
+    assert "/plan_head/MatMul: int8 (layer) -> float (small-product)" in said
+    assert "1 differences" in said
+
+
+def test_a_plan_is_shown_with_reasons(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--scheme", "feature-ext", "--map", dense / "map.toml")
+
+    assert command("plan", dense / "dense.onnx", *words, "--all") == 0
+
+    said = capsys.readouterr().out
+    assert "0 of 2 nodes int8; module 1" in said
+    assert "/backbone/Relu" in said
+
+
+def test_what_is_decided_together_is_listed(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = net(
+        '<ir_version: 9, opset_import: ["" : 17]>'
+        "two (float[4,32] x, float[32,32] v, float[32,32] w)"
+        " => (float[4,32] k, float[4,32] q) { k = MatMul(x, v) q = MatMul(x, w) }",
+        {"v": np.eye(32), "w": np.ones((32, 32))},
+    )
+    graph.save(model, tmp_path / "two.onnx")
+    (tmp_path / "map.toml").write_text(
+        '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
+    )
+    words = ("--map", tmp_path / "map.toml", "--all")
+
+    assert command("plan", tmp_path / "two.onnx", *words) == 0
+
+    assert "shared-input" in capsys.readouterr().out
+
+
+def test_options_of_int8_reach_the_pass(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (dense / "o.toml").write_text('[[override]]\nop = "MatMul"\ndtype = "float"\n')
+    more = ("--overrides", dense / "o.toml", "--rules", "tensorrt", "--json")
+
+    compressed(command, dense, *more)
+
+    step = json.loads(capsys.readouterr().out)["steps"][-1]
+    assert 'rules="tensorrt"' in step["text"]
+    assert "0 of 2 nodes int8; by rule: override 1" in step["notes"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ("-r", "exact", "--target", "tensorrt"),
+            "--target is for int8, and the",
+        ),
+        (("--scheme", "full", "--target", "npu"), "no target npu; there are tensorrt"),
+        (("--scheme", "int4"), "no scheme int4; there are feature-ext"),
+        (("--scheme", "full", "--rules", "fp8"), "no rule set fp8; there are paper"),
+        (("--scheme", "full", "--overrides", "none.toml"), "none.toml: no such file"),
+        (("--scheme", "full", "--ranges", "none.json"), "none.json"),
+        (("--scheme", "full"), "needs recorded frames (--frames) or saved ranges"),
+    ],
+)
+def test_what_int8_cannot_do_is_one_line(
+    command: Command,
+    dense: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    message: str,
+) -> None:
+    place = ("--map", dense / "map.toml", "-o", dense / "no.onnx")
+
+    assert command("compress", dense / "dense.onnx", *words, *place) == 1
+
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert message in line
+    assert not (dense / "no.onnx").exists()
+
+
+def test_a_quantized_graph_is_explained_not_quantized_again(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = compressed(command, dense)
+    capsys.readouterr()
+    words = ("--scheme", "prediction", "--frames", dense / "frames")
+
+    again = command("compress", output, *words, "-o", dense / "twice.onnx")
+
+    assert again == 1
+    assert "quantized already: 2 DequantizeLinear, 1 Quantize" in (
+        capsys.readouterr().err
+    )

@@ -1,0 +1,218 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.rules import rules_named
+from me2e_compress.errors import EvaluationError
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.sensitivity import (
+    Budget,
+    Choice,
+    Trials,
+    advise,
+    analyse,
+    search,
+    write_recipe,
+)
+from me2e_compress.targets import TARGETS
+from tests.frames import record
+from tests.nets import net
+
+LAYERS = 6
+MODULES = ModuleMap.parse(
+    """
+    [modules.backbone]
+    role = "feature"
+    patterns = ["backbone"]
+    [modules.head]
+    role = "prediction"
+    patterns = ["head"]
+    """,
+    "two",
+)
+
+
+def delicate(bad: int) -> ir.Model:
+    """Six layers in a row; one of the last four reads a tensor with an outlier."""
+    steps, weights = [], {}
+    random = np.random.default_rng(0)
+    value = "x"
+    for at in range(LAYERS):
+        module = "backbone" if at < 2 else "head"
+        spoil = "spike" if at == bad else "ones"
+        steps.append(f'["/{module}/Mul_{at}"] a{at} = Mul({value}, {spoil})')
+        steps.append(f'["/{module}/MatMul_{at}"] b{at} = MatMul(a{at}, w{at})')
+        value = f"b{at}"
+        turn, _ = np.linalg.qr(random.standard_normal((32, 32)))
+        weights[f"w{at}"] = turn
+    spike = np.ones(32)
+    spike[3] = 2000.0
+    weights |= {"spike": spike, "ones": np.ones(32)}
+    if bad < LAYERS:
+        weights[f"w{bad}"] = weights[f"w{bad}"].copy()
+        weights[f"w{bad}"][3] /= 2000.0
+    ports = ", ".join(f"float[32,32] w{at}" for at in range(LAYERS))
+    text = (
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        f"deep (float[6,32] x, {ports}, float[32] spike, float[32] ones)"
+        " => (float[1,6,2] plan) <int64[2] s = {0, 0}, int64[2] e = {6, 2},"
+        " int64[1] z = {0}> {" + "\n".join(steps) + f' ["/head/cut"] c = Slice({value}'
+        ', s, e) ["/head/up"] plan = Unsqueeze(c, z) }'
+    )
+    return net(text, weights)
+
+
+def trials(tmp_path: Path, bad: int) -> Trials:
+    random = np.random.default_rng(1)
+    frames = [
+        {"x": random.standard_normal((6, 32)).astype(np.float32)} for _ in range(3)
+    ]
+    recording = CalibrationSet(record(tmp_path / "frames", frames))
+    model = delicate(bad)
+    target = TARGETS["tensorrt"]
+    rules = rules_named("paper")
+    everything = QuantizeInt8(scheme="full").plan(model, Context(MODULES))
+    ranges = Calibrator(threads=1).run(
+        model, target.tensors(everything, model), recording
+    )
+    return Trials(model, MODULES, rules, target, ranges, recording, threads=1)
+
+
+@pytest.mark.parametrize("bad", [2, 3, 5])
+def test_the_guilty_node_is_found_by_bisection(tmp_path: Path, bad: int) -> None:
+    found = analyse(trials(tmp_path, bad), ("backbone", "head"))
+
+    worst = found.findings[0]
+    assert worst.module == "head"
+    assert worst.nodes == 4
+    assert [group for group, _ in worst.blamed] == [(f"/head/MatMul_{bad}",)]
+    assert worst.score.loss > 5 * found.findings[1].score.loss
+    assert worst.score.unit == "m"
+
+
+def test_a_module_without_a_culprit_blames_nobody(tmp_path: Path) -> None:
+    found = analyse(trials(tmp_path, bad=99), ("backbone", "head"), node_trials=2)
+
+    assert {each.module for each in found.findings} == {"backbone", "head"}
+    for each in found.findings:
+        assert all(len(group) < each.nodes for group, _ in each.blamed)
+
+
+def test_node_trials_are_kept_and_no_choice_runs_twice(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    found = analyse(judge, ("backbone", "head"), node_trials=0)
+
+    assert found.trials == 3
+    assert not any(each.blamed for each in found.findings)
+    analyse(judge, ("backbone", "head"), node_trials=0)
+    assert judge.done == 3
+
+
+def test_the_advice_floats_the_culprit_and_nothing_else(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    found = analyse(judge, ("backbone", "head"))
+    limit = found.together.loss / 4
+
+    choice = advise(judge, found, limit)
+
+    assert choice == Choice(("backbone", "head"), ("/head/MatMul_3",))
+    assert judge.score(choice).loss <= limit
+    assert advise(judge, found, 1e9) == Choice(("backbone", "head"))
+    assert advise(judge, found, 0.0) == Choice(())
+
+
+def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    choice = Choice(("backbone", "head"), ("/head/MatMul_3",))
+    path = tmp_path / "advised.toml"
+    overrides = write_recipe(path, choice, ("fold-constants",), "paper", "tensorrt")
+
+    *_, int8 = recipe.load(path)
+    made = int8.run(
+        delicate(3), Context(MODULES, CalibrationSet(tmp_path / "frames"))
+    ).model
+
+    assert overrides == tmp_path / "advised.overrides.toml"
+    assert isinstance(int8, QuantizeInt8)
+    made.metadata_props.clear()
+    expected = judge.variant(choice)
+    expected.metadata_props.clear()
+    assert [node.name for node in made.graph] == [node.name for node in expected.graph]
+
+
+def test_a_recipe_without_int8_has_no_int8(tmp_path: Path) -> None:
+    path = tmp_path / "r.toml"
+
+    assert write_recipe(path, Choice(()), ("fold-constants",), "paper", "x") is None
+    assert [each.name for each in recipe.load(path)] == ["fold-constants"]
+
+
+def test_driving_is_asked_of_every_variant(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    assert judge.score(Choice(("head",))).driving is None
+    seen: list[ir.Model] = []
+
+    def drive(made: ir.Model) -> float:
+        seen.append(made)
+        return 42.0
+
+    driven = Trials(
+        judge.model, MODULES, rules_named("paper"), TARGETS["tensorrt"],
+        judge.ranges, judge.reference.frames, drive=drive, threads=1,
+    )  # fmt: skip
+
+    assert driven.score(Choice(("head",))).driving == 42.0
+    assert [n.op_type for n in seen[0].graph].count("QuantizeLinear") > 0
+
+
+def weight_bytes(made: ir.Model) -> float:
+    return float(graph.size(made).weight_bytes)
+
+
+def test_the_search_keeps_the_budget_and_loses_least(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    whole = weight_bytes(judge.model)
+    only_backbone = weight_bytes(judge.variant(Choice(("backbone",))))
+    only_head = weight_bytes(judge.variant(Choice(("head",))))
+
+    loose = search(judge, ("backbone", "head"), Budget(whole, "bytes", weight_bytes))
+    tight = search(
+        judge, ("backbone", "head"), Budget(only_backbone, "bytes", weight_bytes)
+    )
+    tighter = search(
+        judge, ("backbone", "head"), Budget(only_head, "bytes", weight_bytes)
+    )
+
+    assert loose[-1].modules == ()
+    assert tight[-1].modules == ("backbone",)
+    assert tighter[-1].modules == ("head",)
+    for each in (loose[-1], tight[-1], tighter[-1]):
+        assert each.score is not None
+        assert each.measured_cost is not None
+    assert tight[-1].measured_cost == only_backbone
+
+
+def test_a_budget_that_nothing_fits_is_an_error(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    with pytest.raises(EvaluationError, match=r"nothing fits 10 bytes: the float"):
+        search(judge, ("backbone", "head"), Budget(10, "bytes", weight_bytes))
+
+
+def test_a_model_without_a_plan_is_judged_by_its_worst_output(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    score = judge.score(Choice(("head",)))
+    bare = dataclasses.replace(
+        score, fidelity=dataclasses.replace(score.fidelity, plan=None)
+    )
+
+    sqnr_db = score.fidelity.outputs[0].sqnr_db
+    assert bare.loss == pytest.approx(10 ** (-sqnr_db / 20))
+    assert bare.unit == "of the signal"

@@ -1,0 +1,203 @@
+import numpy as np
+import onnx
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.plan import make_plan
+from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.targets import tensorrt
+from me2e_compress.targets.onnxruntime import convert, unranged
+from tests.nets import conv_attention
+from tests.targets.onnxruntime.lowered import (
+    FULL,
+    IMAGE,
+    TOKENS,
+    Feeds,
+    block,
+    calibrated,
+    kernels,
+    linear,
+    lowered,
+    measured,
+    ran,
+    sqnr_db,
+)
+
+PAIRED = """
+<ir_version: 9, opset_import: ["" : 19]>
+foreign (float[4,6] x) => (float[4,3] y)
+<float s = {0.02}, int8 z = {0}, float[3] ws = {0.01, 0.02, 0.03},
+ int8[3] wz = {0, 0, 0},
+ float[6,3] w = {0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9,
+                 1.0, 1.1, 1.2, -0.1, -0.2, -0.3, 1.27, 2.54, 3.81}>
+{
+    xq = QuantizeLinear(x, s, z)
+    xd = DequantizeLinear(xq, s, z)
+    wq = QuantizeLinear<axis=1>(w, ws, wz)
+    wd = DequantizeLinear<axis=1>(wq, ws, wz)
+    y = MatMul(xd, wd)
+}
+"""
+"""Weights in float behind a pair, as ModelOpt writes them."""
+
+
+def placed(model: ir.Model, fed: Feeds) -> ir.Model:
+    plan = make_plan(model, FULL)
+    ranges = measured(model, tensorrt.tensors(plan, model), fed)
+    return tensorrt.place(model, plan, ranges)
+
+
+def converted(source: ir.Model, fed: Feeds) -> ir.Model:
+    missing = unranged(source)
+    return convert(source, measured(source, missing, fed) if missing else None)
+
+
+@pytest.mark.parametrize(
+    ("model", "fed"), [(block(), IMAGE), (linear(), TOKENS)], ids=["block", "linear"]
+)
+def test_a_tensorrt_graph_runs_with_the_kernels_of_a_lowered_plan(
+    model: ir.Model, fed: Feeds
+) -> None:
+    found = converted(placed(model, fed), fed)
+
+    assert kernels(found) == kernels(calibrated(model, fed))
+    want, got = ran(model, fed), ran(found, fed)
+    assert all(sqnr_db(want[name], got[name]) > 25 for name in want)
+
+
+def test_only_what_convolutions_answer_is_left_to_calibrate() -> None:
+    assert set(unranged(placed(block(), IMAGE))) == {"a1", "z3", "y"}
+    assert unranged(placed(linear(), TOKENS)) == ()
+
+
+def test_what_is_left_to_calibrate_is_never_made_up() -> None:
+    with pytest.raises(FramesError, match=r"no range, the first is a1.*calibrated too"):
+        convert(placed(block(), IMAGE))
+
+
+def test_weights_behind_a_pair_become_stored_integers() -> None:
+    source = ir.from_onnx_text(PAIRED)
+    small = convert(source)
+
+    stored = [
+        graph.array_of(value)
+        for value in small.graph.initializers.values()
+        if value.dtype == ir.DataType.INT8 and value.shape is not None
+        if len(value.shape) == 2
+    ]
+    weight = graph.array_of(source.graph.initializers["w"])
+    assert weight is not None
+    steps = weight.astype(np.float32) / np.array([0.01, 0.02, 0.03], np.float32)
+    assert len(stored) == 1
+    np.testing.assert_array_equal(stored[0], np.rint(steps).astype(np.int8))
+    assert kernels(small)["MatMulIntegerToFloat"] == 1
+
+
+def test_attention_products_of_a_tensorrt_graph_become_float() -> None:
+    generator = np.random.default_rng(0)
+    fed = {
+        "image": generator.standard_normal((1, 3, 8, 8)).astype(np.float32),
+        "memory": np.zeros((1, 8, 64), np.float32),
+    }
+    source = placed(conv_attention(), fed)
+
+    found = kernels(converted(source, fed))
+
+    assert found["MatMul"] + found["FusedMatMul"] == 2
+    assert found["QLinearConv"] == 1
+
+
+def test_outputs_keep_their_names_and_the_source_stays() -> None:
+    source = placed(block(), IMAGE)
+    before = graph.digest(source)
+
+    result = converted(source, IMAGE)
+
+    onnx.checker.check_model(ir.to_proto(result), full_check=True)
+    assert [value.name for value in result.graph.outputs] == ["y", "pooled"]
+    assert graph.digest(source) == before
+
+
+def test_an_output_behind_a_pair_stays_an_output() -> None:
+    text = PAIRED.replace(
+        "y = MatMul(xd, wd)",
+        """m = MatMul(xd, wd)
+    yq = QuantizeLinear(m, s, z)
+    y = DequantizeLinear(yq, s, z)""",
+    )
+    x = np.random.default_rng(0).uniform(-0.3, 0.3, (4, 6)).astype(np.float32)
+    source = ir.from_onnx_text(text)
+
+    result = convert(source)
+
+    assert [value.name for value in result.graph.outputs] == ["y"]
+    assert sqnr_db(ran(source, {"x": x})["y"], ran(result, {"x": x})["y"]) > 30
+
+
+def test_a_bias_stored_as_integers_is_read() -> None:
+    text = PAIRED.replace(
+        "float s = {0.02}",
+        "float s = {0.02}, int32[3] b = {5000, -5000, 0},"
+        " float[3] bs = {0.0002, 0.0004, 0.0006}, int32[3] bz = {0, 0, 0}",
+    ).replace(
+        "y = MatMul(xd, wd)",
+        """bd = DequantizeLinear<axis=0>(b, bs, bz)
+    y = Gemm(xd, wd, bd)""",
+    )
+    x = np.zeros((4, 6), np.float32)
+
+    got = ran(convert(ir.from_onnx_text(text)), {"x": x})["y"]
+
+    np.testing.assert_allclose(got, [[1.0, -2.0, 0.0]] * 4, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("int8 z = {0}", "int8 z = {3}", "zero point 3: only symmetric int8"),
+        ("int8 z = {0}", "uint8 z = {128}", "quantizes to uint8: only symmetric int8"),
+        ("float s = {0.02}", "float16 s = {9503}", "float16 scale, expected float32"),
+        (
+            "axis=1>(w",
+            "axis=0>(w",
+            r"scales of shape \[6\] along axis 0, expected one for each of 3",
+        ),
+    ],
+)
+def test_other_grids_are_refused(old: str, new: str, message: str) -> None:
+    text = PAIRED.replace(old, new)
+    if "axis=0" in new:
+        text = (
+            text.replace("axis=1>(wq", "axis=0>(wq")
+            .replace(
+                "float[3] ws = {0.01, 0.02, 0.03}",
+                "float[6] ws = {1., 1., 1., 1., 1., 1.}",
+            )
+            .replace("int8[3] wz = {0, 0, 0}", "int8[6] wz = {0, 0, 0, 0, 0, 0}")
+        )
+
+    with pytest.raises(PreconditionError, match=message):
+        convert(ir.from_onnx_text(text))
+
+
+def test_an_activation_with_several_scales_is_refused() -> None:
+    text = (
+        PAIRED.replace("(x, s, z)", "<axis=0>(x, s, z)")
+        .replace("(xq, s, z)", "<axis=0>(xq, s, z)")
+        .replace("float s = {0.02}", "float[4] s = {1., 1., 1., 1.}")
+        .replace("int8 z = {0}", "int8[4] z = {0, 0, 0, 0}")
+    )
+
+    with pytest.raises(PreconditionError, match=r"4 scales: .* take one"):
+        convert(ir.from_onnx_text(text))
+
+
+def test_a_float_graph_is_refused() -> None:
+    with pytest.raises(PreconditionError, match="no quantized activation"):
+        convert(block())
+
+
+def test_a_lowered_graph_is_refused() -> None:
+    with pytest.raises(PreconditionError, match="quantizes to uint8"):
+        convert(lowered(block()))

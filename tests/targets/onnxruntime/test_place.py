@@ -1,0 +1,146 @@
+import numpy as np
+import onnx
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.plan import make_plan
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.graph import provenance
+from me2e_compress.targets.lint import lint
+from me2e_compress.targets.onnxruntime import place, tensors
+from tests.nets import conv_attention
+from tests.targets.onnxruntime.lowered import (
+    FULL,
+    IMAGE,
+    TOKENS,
+    block,
+    calibrated,
+    kernels,
+    linear,
+    lowered,
+    ran,
+    sqnr_db,
+)
+
+
+def producer(model: ir.Model, name: str) -> ir.Node:
+    (node,) = (n for n in model.graph if any(o.name == name for o in n.outputs))
+    return node
+
+
+def test_a_residual_block_runs_in_int8_from_end_to_end() -> None:
+    found = kernels(calibrated(block(), IMAGE))
+
+    assert found["QLinearConv"] == 4
+    assert found["QLinearAdd"] == 1
+    assert found["QuantizeLinear"] == 1
+    assert not {"Conv", "FusedConv", "Add", "Relu", "MaxPool"} & set(found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_lowered_graph_stays_close(seed: int) -> None:
+    for model, fed in ((block(seed), IMAGE), (linear(seed), TOKENS)):
+        want, got = ran(model, fed), ran(calibrated(model, fed), fed)
+        # 8 bits are about 45 dB a layer of normal numbers; four in a row cost some
+        assert all(25 < sqnr_db(want[name], got[name]) < 60 for name in want)
+
+
+def test_kernels_answer_what_the_pairs_say() -> None:
+    for model, fed in ((block(), IMAGE), (linear(), TOKENS)):
+        small = calibrated(model, fed)
+        want, got = ran(small, fed, optimize=False), ran(small, fed)
+        assert all(sqnr_db(want[name], got[name]) > 35 for name in want)
+
+
+def test_attention_products_read_floats() -> None:
+    model = lowered(conv_attention())
+
+    for name in ("scores", "mixed"):
+        read = [str(value.name) for value in producer(model, name).inputs if value]
+        assert read == [
+            str(v.name) for v in producer(conv_attention(), name).inputs if v
+        ]
+    assert kernels(model)["QLinearConv"] == 1
+
+
+def test_float_readers_of_a_linear_layers_input_read_it_unrounded() -> None:
+    inputs = producer(calibrated(linear(), TOKENS), "doubled").inputs
+
+    assert [str(value.name) for value in inputs if value] == ["x", "y"]
+
+
+def test_sums_around_linear_layers_stay_float() -> None:
+    assert kernels(calibrated(linear(), TOKENS))["QLinearAdd"] == 0
+
+
+def test_tensors_without_sign_use_the_whole_grid() -> None:
+    scales, zeros = {}, {}
+    for node in lowered(block(), reach=2.55).graph:
+        if node.op_type == "QuantizeLinear" and node.inputs[0] is not None:
+            name = str(node.inputs[0].name)
+            _, scale, zeros[name] = (graph.array_of(value) for value in node.inputs)
+            assert scale is not None
+            scales[name] = float(scale.item())
+
+    # an output keeps its name on what is dequantized
+    signed, unsigned = {"x", "z3", "y_replaced"}, {"a1", "p1", "a2", "a3"}
+    assert {name for name, zero in zeros.items() if zero == 128} == signed
+    assert {name for name, zero in zeros.items() if zero == 0} >= unsigned
+    assert {scales[name] for name in signed} == {np.float32(2.55 / 127)}
+    assert {scales[name] for name in unsigned} == {np.float32(2.55 / 255)}
+
+
+def test_what_only_moves_elements_shares_the_grid_of_what_it_moves() -> None:
+    model = block()
+
+    assert tensors(make_plan(model, FULL), model) == (
+        "x", "a1", "a2", "a3", "z3", "y",
+    )  # fmt: skip
+
+
+def test_the_result_is_a_valid_graph_and_the_source_untouched() -> None:
+    model = block()
+    before = graph.digest(model)
+
+    result = lowered(model)
+
+    onnx.checker.check_model(ir.to_proto(result), full_check=True)
+    assert graph.digest(model) == before
+    assert [port.name for port in result.graph.outputs] == ["y", "pooled"]
+
+
+def test_the_lint_of_the_target_finds_nothing() -> None:
+    for model in (block(), linear(), conv_attention()):
+        assert lint(lowered(model), "onnxruntime") == ()
+
+
+def test_the_same_plan_gives_the_same_graph() -> None:
+    assert graph.digest(lowered(block())) == graph.digest(lowered(block()))
+
+
+def test_every_node_keeps_its_past() -> None:
+    for model in (block(), linear(), conv_attention()):
+        result = lowered(model)
+        assert not provenance.missing(result)
+        fresh = [n for n in result.graph if n.op_type.endswith("quantizeLinear")]
+        pasts = [provenance.read(node) for node in fresh]
+        assert all(past and past.passes == ("quantize-int8",) for past in pasts)
+
+
+def test_opset_12_is_refused() -> None:
+    model = linear()
+    model.graph.opset_imports[""] = 12
+
+    with pytest.raises(PreconditionError, match=r"opset 12: .*needs 13"):
+        lowered(model)
+
+
+def test_a_missing_range_is_named() -> None:
+    model = block()
+    plan = make_plan(model, FULL)
+    some = Ranges({"x": (-1.0, 1.0), "a1": (0.0, 1.0)}, "max-min", 1, "", "")
+
+    with pytest.raises(FramesError, match=r"4 tensors have no range.* a2.*calibrated"):
+        place(model, plan, some)

@@ -1,0 +1,66 @@
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from tests.nets import net
+from tests.targets.onnxruntime.lowered import calibrated, feeds, kernels
+
+NECK = """
+<ir_version: 9, opset_import: ["" : 17]>
+neck (float[1,4,8,8] fine, float[1,4,4,4] coarse, float[6,4,1,1] w1, float[6,4,1,1] w2,
+      float[6,6,3,3] w3) => (float[1,6,8,8] y)
+<float[4] scales = {1, 1, 2, 2}> {
+    a = Conv<kernel_shape=[1,1]>(fine, w1)
+    b = Conv<kernel_shape=[1,1]>(coarse, w2)
+    up = Resize<mode="nearest", coordinate_transformation_mode="asymmetric",
+                nearest_mode="floor">(b, "", scales)
+    merged = MERGE
+    y = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(merged, w3)
+}
+"""
+FED = feeds(3, fine=(1, 4, 8, 8), coarse=(1, 4, 4, 4))
+
+
+def neck(merge: str, mode: str = "nearest", channels: int = 6) -> ir.Model:
+    generator = np.random.default_rng(0)
+    shapes = {"w1": (6, 4, 1, 1), "w2": (6, 4, 1, 1), "w3": (6, channels, 3, 3)}
+    text = NECK.replace("MERGE", merge).replace('nearest", c', f'{mode}", c')
+    text = text.replace("float[6,6,3,3]", f"float[6,{channels},3,3]")
+    weights = {name: generator.standard_normal(size) for name, size in shapes.items()}
+    return net(text, weights)
+
+
+@pytest.mark.parametrize(
+    ("merge", "channels", "kernel"),
+    [("Add(a, up)", 6, "QLinearAdd"), ("Concat<axis=1>(a, up)", 12, "QLinearConcat")],
+)
+def test_a_neck_merges_its_levels_in_int8(
+    merge: str, channels: int, kernel: str
+) -> None:
+    found = kernels(calibrated(neck(merge, channels=channels), FED))
+
+    assert found["QLinearConv"] == 3
+    assert found[kernel] == 1
+    assert found["Resize"] == 1
+    # in: the two levels; out: the answer
+    assert (found["QuantizeLinear"], found["DequantizeLinear"]) == (2, 1)
+
+
+def test_what_interpolates_reads_floats_and_so_does_the_sum_behind_it() -> None:
+    found = kernels(calibrated(neck("Add(a, up)", mode="linear"), FED))
+
+    assert found["QLinearConv"] == 3
+    assert (found["QLinearAdd"], found["Add"]) == (0, 1)
+
+
+def test_a_sum_that_no_layer_reads_stays_float() -> None:
+    model = neck("Add(a, up)")
+    last = model.graph[-1]
+    merged = last.inputs[0]
+    assert merged is not None
+    last.replace_input_with(0, model.graph[0].outputs[0])
+    model.graph.outputs.append(merged)
+
+    found = kernels(calibrated(model, FED))
+
+    assert (found["QLinearAdd"], found["Add"]) == (0, 1)
