@@ -9,7 +9,7 @@ from me2e_compress.cli.console import errors
 from me2e_compress.cli.demo import demo
 from me2e_compress.cli.doctor import doctor
 from me2e_compress.cli.export import export
-from me2e_compress.cli.extras import closed_loop
+from me2e_compress.cli.extras import closed_loop, training
 from me2e_compress.cli.frames import frames
 from me2e_compress.cli.inspect import inspect
 from me2e_compress.cli.profile import profile
@@ -25,6 +25,7 @@ app = typer.Typer(
 for command in (demo, doctor, export, inspect, frames, compress, compare, profile):
     app.command()(command)
 closed_loop(app)
+training(app)
 
 
 def run() -> int:
