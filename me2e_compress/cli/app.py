@@ -10,7 +10,7 @@ from me2e_compress.cli.console import errors
 from me2e_compress.cli.demo import demo
 from me2e_compress.cli.doctor import doctor
 from me2e_compress.cli.export import export
-from me2e_compress.cli.extras import closed_loop
+from me2e_compress.cli.extras import closed_loop, training
 from me2e_compress.cli.frames import frames
 from me2e_compress.cli.inspect import inspect
 from me2e_compress.cli.lint import lint
@@ -32,6 +32,7 @@ for command in (
 ):  # fmt: skip
     app.command()(command)
 closed_loop(app)
+training(app)
 
 
 def run() -> int:

@@ -6,16 +6,16 @@ import typer
 
 from me2e_compress.errors import MissingExtraError
 
-_NEEDED = ("highway_env", "cv2", "jinja2", "matplotlib", "scipy")
+_ROAD = ("highway_env", "cv2", "jinja2", "matplotlib", "scipy")
+_ZOO = ("torch",)
 _NAMES = ("evaluate", "routes", "score", "study")
 
 
 def closed_loop(app: typer.Typer) -> None:
     """Add the commands that drive or score: the extra ``highway`` brings them."""
-    if not _is_complete():
+    if not _are_there(_ROAD):
         for name in _NAMES:
-            anything = {"allow_extra_args": True, "ignore_unknown_options": True}
-            app.command(name, context_settings=anything)(_advise)
+            _advise_on(app, name, "highway")
         return
     from me2e_compress.cli.evaluate import evaluate
     from me2e_compress.cli.routes import routes
@@ -26,9 +26,14 @@ def closed_loop(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def _advise(context: typer.Context) -> None:
-    """Say what to install: this command drives in closed loop."""
-    raise MissingExtraError(f"what {context.info_name} needs", "highway")
+def training(app: typer.Typer) -> None:
+    """Add the command that trains: it takes the extras ``zoo`` and ``highway``."""
+    if not _are_there((*_ROAD, *_ZOO)):
+        _advise_on(app, "train", "zoo,highway")
+        return
+    from me2e_compress.cli.train import train
+
+    app.command()(train)
 
 
 def need_closed_loop(what: str) -> None:
@@ -37,9 +42,21 @@ def need_closed_loop(what: str) -> None:
     Raises:
         MissingExtraError: it is not, and ``what`` needs it.
     """
-    if not _is_complete():
+    if not _are_there(_ROAD):
         raise MissingExtraError(what, "highway")
 
 
-def _is_complete() -> bool:
-    return all(importlib.util.find_spec(name) is not None for name in _NEEDED)
+def _advise_on(app: typer.Typer, name: str, extra: str) -> None:
+    """Add a command that does nothing but say what to install."""
+
+    def advise(context: typer.Context) -> None:
+        raise MissingExtraError(f"what {context.info_name} needs", extra)
+
+    anything = {"allow_extra_args": True, "ignore_unknown_options": True}
+    app.command(name, context_settings=anything, help=f"Needs the extra {extra}.")(
+        advise
+    )
+
+
+def _are_there(packages: tuple[str, ...]) -> bool:
+    return all(importlib.util.find_spec(name) is not None for name in packages)

@@ -1,13 +1,16 @@
 """``me2e-compress train``."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.markup import escape
 
-from me2e_compress.cli.console import console, errors
-from me2e_compress.errors import MissingExtraError
+from me2e_compress.cli.console import console, errors, number, progress, table
+from me2e_compress.metrics.measure import Estimate
+
+if TYPE_CHECKING:
+    from me2e_compress.zoo.train.course import News
 
 
 def train(
@@ -21,18 +24,30 @@ def train(
     ] = False,
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
-    try:
-        from me2e_compress.zoo.train.course import FULL, SMALL, News, run
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(error.name or "torch", "zoo,highway") from error
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=errors) as bar:
-        task = bar.add_task("")
+    from me2e_compress.zoo.train.course import run  # takes torch seconds to import
+    from me2e_compress.zoo.train.curriculum import FULL, SMALL
 
-        def tell(news: News) -> None:
-            bar.update(
-                task, description=news.what, completed=news.done, total=news.total
-            )
+    told = ""
+    with progress("train") as advance:
 
-        driver = run(SMALL if small else FULL, output, workers, tell)
-    console.print(f"{driver} drives; its log is {driver.parent / 'training'}")
+        def tell(news: "News") -> None:
+            nonlocal told
+            if news.what != told and not errors.is_terminal:
+                errors.print(news.what)  # a log wants lines, not a bar
+            told = news.what
+            advance(news.done, news.total, news.what)
+
+        rounds = run(SMALL if small else FULL, output, workers, tell)
+    columns = ("round", "routes", "driving score, %", "success rate, %")
+    shown = table("driven on fresh routes after every round", *columns)
+    for which, each in enumerate(rounds):
+        found = (each.scores.driving_score, each.scores.success_rate)
+        shown.add_row(str(which), str(each.scores.routes), *map(_between, found))
+    console.print(shown)
+    console.print(f"wrote {escape(str(rounds[-1].driver))}", soft_wrap=True)
+    console.print(f"its log is {escape(str(rounds[-1].log))}", soft_wrap=True)
+
+
+def _between(estimate: Estimate) -> str:
+    ends = f"{number(estimate.low, '.1f')} to {number(estimate.high, '.1f')}"
+    return f"{number(estimate.value, '.1f')} ({ends})"

@@ -14,6 +14,7 @@ from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.admission import examine
 from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.scenarios.registry import stage_of
+from me2e_compress.runtime.parent import end_with_parent
 
 VARIANTS = 5
 """Routes of each type, as in Bench2Drive's 220."""
@@ -106,5 +107,6 @@ def generate(
     if workers == 1:
         yield from map(reap, scenarios)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    context = get_context("spawn")
+    with ProcessPoolExecutor(workers, context, end_with_parent) as pool:
         yield from pool.map(reap, scenarios)

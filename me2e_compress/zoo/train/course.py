@@ -1,80 +1,29 @@
 """The whole way from nothing to a driver: collect, train, let it drive, train again."""
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import torch
+import numpy as np
 
 from me2e_compress.errors import TrainingError
 from me2e_compress.graph import sha256_of
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.runtime.atomic import write_json
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.export import write
 from me2e_compress.zoo.highway.stack import Highway
+from me2e_compress.zoo.train import trial
+from me2e_compress.zoo.train.checkpoint import Checkpoint, fit
+from me2e_compress.zoo.train.curriculum import Course, Round, held_out_of
 from me2e_compress.zoo.train.episodes import Collection, collect
-from me2e_compress.zoo.train.loop import Training, train
+from me2e_compress.zoo.train.log import Log
+from me2e_compress.zoo.train.loop import train
+from me2e_compress.zoo.train.options import difference
+from me2e_compress.zoo.train.stage import LOG
 
-HELD_OUT_EVERY = 28
-"""One episode in so many of the expert's is only looked at."""
-
-
-@dataclass(frozen=True)
-class Round:
-    """Collect, then train on everything collected so far.
-
-    Attributes:
-        seed: of the routes that are driven.
-        variants: routes of each type.
-        expert_share: share of the driving that the expert does; less than 1 lets the
-            driver of the round before drive (DAgger, Ross et al., 2011).
-        training: what is learned then.
-        scenarios: types of routes; empty for all 44.
-    """
-
-    seed: int
-    variants: int
-    expert_share: float
-    training: Training
-    scenarios: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Course:
-    """All rounds. The first is driven by the expert alone.
-
-    Attributes:
-        rounds: in order.
-        config: sizes of the model.
-    """
-
-    rounds: tuple[Round, ...]
-    config: HighwayConfig = field(default_factory=HighwayConfig)
-
-    def __post_init__(self) -> None:
-        """Refuse rounds in which nobody could drive."""
-        if not self.rounds or self.rounds[0].expert_share != 1.0:
-            raise TrainingError("the expert drives alone in the first round")
-
-
-FULL = Course(
-    (
-        Round(100, 14, 1.0, Training(steps=1000)),
-        Round(200, 4, 0.3, Training(steps=900, rate=8e-4, seed=1)),
-        Round(300, 4, 0.15, Training(steps=700, rate=8e-4, seed=2)),
-    )
-)
-"""What trained the driver that ships."""
-
-FEW = ("HighwayCutIn", "VanillaSignalizedTurnEncounterRedLight")
-BRIEF = Training(steps=4, batch=1, workers=2, save_every=2, check_every=4)
-SMALL = Course(
-    (
-        Round(100, 1, 1.0, BRIEF, FEW),
-        Round(200, 1, 0.5, replace(BRIEF, steps=2, check_every=2, seed=1), FEW),
-    ),
-)
-"""The same way in small: it learns nothing, but every part of it runs."""
+MANIFEST = "course.json"
 
 
 @dataclass(frozen=True)
@@ -92,91 +41,128 @@ class News:
     total: int
 
 
+@dataclass(frozen=True)
+class Trained:
+    """What came of a round.
+
+    Attributes:
+        driver: the ``.onnx``.
+        scores: over the routes of the course's trial.
+        log: losses and scores, one JSON object a line.
+    """
+
+    driver: Path
+    scores: Scores
+    log: Path
+
+
+Listener = Callable[[News], None]
+
+
 def run(
-    course: Course,
-    folder: Path,
-    workers: int,
-    on_news: Callable[[News], None] = lambda news: None,
-) -> Path:
+    course: Course, folder: Path, workers: int, on_news: Listener = lambda news: None
+) -> tuple[Trained, ...]:
     """Go the whole way, or what is left of it after an interruption.
+
+    The same course comes to the same bytes with as many workers, however often it was
+    interrupted.
 
     Args:
         course: the rounds.
-        folder: gets a folder a round: ``episodes/``, ``training/``, ``driver.onnx``.
+        folder: gets a folder a round: ``episodes/``, ``training-0/``, ``trial/``,
+            ``driver.onnx``.
         workers: processes, for driving and for training.
         on_news: told how far it is.
 
     Returns:
-        The last ``driver.onnx``.
+        What came of each round; the last driver is the one that was asked for.
 
     Raises:
         TrainingError: the folder is of another course, or a part failed.
-        EvaluationError: episodes of another collection are in the way.
+        EvaluationError: episodes or results of something else are in the way.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    _claim(folder, course, workers)
-    learned, held_out = list[Path](), list[Path]()
-    start, driver = None, None
-    for number, each in enumerate(course.rounds):
-        place = folder / f"round-{number}"
-        files = _drive(each, course, place, driver, workers, number, on_news)
+    course = course.on(workers)
+    claim(folder, course)
+    way = _Way(course, folder, workers, on_news)
+    return tuple(way.go(number, each) for number, each in enumerate(course.rounds))
+
+
+class _Way:
+    """What the rounds hand on to each other."""
+
+    def __init__(
+        self, course: Course, folder: Path, workers: int, on_news: Listener
+    ) -> None:
+        self.course, self.folder, self.workers = course, folder, workers
+        self.on_news = on_news
+        self.learned, self.held_out = list[Path](), list[Path]()
+        self.start: Path | None = None
+        self.driver: Path | None = None
+
+    def go(self, number: int, each: Round) -> Trained:
+        """One round."""
+        place, label = self.folder / f"round-{number}", f"round {number}"
+        files = self._collect(each, place / "episodes", label)
         if number == 0:
-            held_out = files[HELD_OUT_EVERY // 4 :: HELD_OUT_EVERY] or files[:1]
-        learned += [file for file in files if file not in held_out]
-        on_news(News(f"round {number}: training", 0, each.training.steps))
-        training = replace(each.training, workers=min(workers, each.training.workers))
-        start = train(
-            training, course.config, learned, held_out, start, place / "training"
+            self.held_out = held_out_of(files)
+        fresh = [file for file in files if file not in self.held_out]
+        self.learned += fresh * each.repeat
+        self.start, log = self._train(each, place, label)
+        self.driver = place / "driver.onnx"
+        if not self.driver.exists():
+            write(load(self.start, self.course.config), self.driver)
+        scores = self._try(self.driver, place / "trial", label)
+        row = {"learned_frames": frames_in(self.learned), **trial.row_of(scores)}
+        log.add("closed_loop", each.trainings[-1].steps, row)
+        return Trained(self.driver, scores, log.path)
+
+    def _collect(self, each: Round, folder: Path, label: str) -> list[Path]:
+        student = None if each.expert_share == 1.0 else self.driver
+        what = Collection(
+            each.seed,
+            each.variants,
+            image_size=self.course.config.image_size,
+            scenarios=each.scenarios,
+            expert_share=each.expert_share,
+            student=None if student is None else sha256_of(student),
         )
-        driver = place / "driver.onnx"
-        write(load(start, course.config), driver)
-    if driver is None:
-        raise TrainingError("a course without rounds trains nothing")
-    return driver
+        tell = self._teller(f"{label}: driving")
+        collect(
+            folder, what, student, self.workers, lambda now: tell(now.done, now.total)
+        )
+        return episodes_in(folder)
+
+    def _train(self, each: Round, place: Path, label: str) -> tuple[Path, Log]:
+        """All stages: the checkpoint and the log of the last."""
+        made, config = list[Path](), self.course.config
+        for number, training in enumerate(each.trainings):
+            tell = self._teller(f"{label}: training {number + 1}/{len(each.trainings)}")
+            folder = place / f"training-{number}"
+            files = (self.learned, self.held_out)
+            start = made[-1] if made else self.start
+            made.append(train(training, config, *files, start, folder, tell))
+        return made[-1], Log(made[-1].with_name(LOG))
+
+    def _try(self, driver: Path, folder: Path, label: str) -> Scores:
+        what, path = self.course.trial, self.folder / "trial.json"
+        tell = self._teller("finding routes to try the driver on")
+        routes = trial.routes_of(what, path, self.workers, tell)
+        tell = self._teller(f"{label}: trying the driver")
+        return trial.drive(driver, routes, folder, self.workers, tell)
+
+    def _teller(self, what: str) -> Callable[[int, int], None]:
+        return lambda done, total: self.on_news(News(what, done, total))
 
 
 def load(checkpoint: Path, config: HighwayConfig) -> Highway:
     """The driver of a checkpoint: its averaged weights.
 
     Raises:
-        TrainingError: it is no checkpoint of this model.
+        TrainingError: it is no checkpoint, or one of another model.
     """
     model = Highway(config)
-    try:
-        model.load_state_dict(torch.load(checkpoint, weights_only=True)["mean"])
-    except (OSError, KeyError, RuntimeError) as error:
-        first = str(error).splitlines()[0]
-        raise TrainingError(f"{checkpoint}: not a checkpoint: {first}") from error
+    fit(model, Checkpoint.load(checkpoint).mean, checkpoint)
     return model.eval()
-
-
-def _drive(
-    each: Round,
-    course: Course,
-    place: Path,
-    driver: Path | None,
-    workers: int,
-    number: int,
-    on_news: Callable[[News], None],
-) -> list[Path]:
-    student = None if each.expert_share == 1.0 else driver
-    what = Collection(
-        each.seed,
-        each.variants,
-        image_size=course.config.image_size,
-        scenarios=each.scenarios,
-        expert_share=each.expert_share,
-        student=None if student is None else sha256_of(student),
-    )
-    told = f"round {number}: driving"
-    collect(
-        place / "episodes",
-        what,
-        student,
-        workers,
-        lambda progress: on_news(News(told, progress.done, progress.total)),
-    )
-    return episodes_in(place / "episodes")
 
 
 def episodes_in(folder: Path) -> list[Path]:
@@ -186,26 +172,37 @@ def episodes_in(folder: Path) -> list[Path]:
     )
 
 
-def _claim(folder: Path, course: Course, workers: int) -> None:
-    """Write down what the folder is, or refuse it."""
-    path = folder / "course.json"
-    words = json.dumps({"course": repr(course), "workers": workers}, indent=1)
-    if not path.exists():
-        path.write_text(words)
-        return
-    if path.read_text() != words:
+def claim(folder: Path, course: Course) -> None:
+    """Make a folder that of a course, or check that it is.
+
+    Raises:
+        TrainingError: it is another one's, or holds something else.
+        OSError: it cannot be written.
+    """
+    manifest = folder / MANIFEST
+    folder.mkdir(parents=True, exist_ok=True)
+    if not manifest.exists():
+        if any(not file.name.startswith(".") for file in folder.iterdir()):
+            raise TrainingError(f"{folder}: not empty, and holds no {MANIFEST}")
+        write_json(manifest, asdict(course), indent=1)
+    try:
+        before = json.loads(manifest.read_bytes())
+    except ValueError as error:
+        raise TrainingError(f"{manifest}: not JSON") from error
+    if not isinstance(before, dict):
+        raise TrainingError(f"{manifest}: not a course")
+    if (words := difference(before, asdict(course))) is not None:
+        name, old, new = words
         raise TrainingError(
-            f"{folder}: another course was begun here, or with other workers: take "
-            "another folder, or the same options"
+            f"{folder}: another course was begun here: its {name} is {old}, this one's "
+            f"{new}; take another folder, or the same options"
         )
 
 
-def frames_in(files: Sequence[Path]) -> int:
-    """How many camera frames episodes hold."""
-    import numpy as np
-
+def frames_in(files: Iterable[Path]) -> int:
+    """How many samples different episodes hold, six camera images each."""
     total = 0
-    for file in files:
+    for file in sorted(set(files)):
         with np.load(file) as content:
             total += len(content["time_us"])
     return total

@@ -1,18 +1,18 @@
 """Training in several processes that average their gradients; resumes after a kill."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch.multiprocessing.spawn import ProcessException, spawn
 
 from me2e_compress.errors import TrainingError
+from me2e_compress.runtime.parent import end_with_parent
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.train.checkpoint import Checkpoint
-from me2e_compress.zoo.train.parent import end_with_parent
+from me2e_compress.zoo.train.options import difference
 from me2e_compress.zoo.train.stage import CHECKPOINT, Stage, Task, Training
 from me2e_compress.zoo.train.together import Together
 
@@ -31,7 +31,7 @@ def train(
     held_out: Sequence[Path],
     start: Path | None,
     folder: Path,
-    on_step: Callable[[int], None] = lambda step: None,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Path:
     """Run a stage, or what is left of it.
 
@@ -45,7 +45,7 @@ def train(
         held_out: episodes that are only looked at.
         start: checkpoint to begin with; None begins with random weights.
         folder: gets ``last.pt`` and ``log.jsonl``.
-        on_step: told now and then how many steps are done.
+        on_step: told now and then how many steps of how many are done.
 
     Returns:
         The checkpoint.
@@ -68,10 +68,10 @@ def train(
     try:
         running = spawn(_process, (task, together), what.workers, join=False)
         while running is not None and not running.join(LOOK_S):
-            on_step(together.told())
+            on_step(together.told(), what.steps)
     except ProcessException as error:
         raise TrainingError(f"{folder}: training failed: {_told(error)}") from error
-    on_step(what.steps)
+    on_step(what.steps, what.steps)
     return last
 
 
@@ -95,22 +95,10 @@ def _steps(checkpoint: Path, what: Training) -> int:
         TrainingError: it is none, or of another stage.
     """
     found = Checkpoint.load(checkpoint)
-    before, now = _flat(json.loads(found.what)), _flat(asdict(what))
-    for name in sorted({*before} & {*now} - {*MAY_CHANGE}):
-        if before[name] != now[name]:
-            raise TrainingError(
-                f"{checkpoint}: of another training: its {name} is {before[name]}, "
-                f"this one's {now[name]}"
-            )
+    words = difference(json.loads(found.what), asdict(what), MAY_CHANGE)
+    if words is not None:
+        raise TrainingError(
+            f"{checkpoint}: of another training: its {words[0]} is {words[1]}, this "
+            f"one's {words[2]}"
+        )
     return found.step
-
-
-def _flat(options: Mapping[str, Any]) -> dict[str, str]:
-    """Options of options by dotted names, as JSON tells them."""
-    flat = dict[str, str]()
-    for name, value in options.items():
-        if isinstance(value, dict):
-            flat |= {f"{name}.{key}": one for key, one in _flat(value).items()}
-        else:
-            flat[name] = json.dumps(value)
-    return flat

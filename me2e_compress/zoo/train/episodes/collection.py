@@ -119,7 +119,7 @@ def claim(folder: Path, what: Collection) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not manifest.exists():
-            if any(folder.iterdir()):
+            if any(not file.name.startswith(".") for file in folder.iterdir()):
                 raise EvaluationError(f"{folder}: not empty, and holds no {MANIFEST}")
             write_json(manifest, wanted, indent=1)
         found = json.loads(manifest.read_bytes())

@@ -17,6 +17,7 @@ from me2e_compress.evaluators.highway.runner import Conditions, drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.runtime.parent import end_with_parent
 from me2e_compress.zoo.train.episodes.arrays import Arrays, arrays_of
 from me2e_compress.zoo.train.episodes.collection import (
     Collection,
@@ -25,7 +26,6 @@ from me2e_compress.zoo.train.episodes.collection import (
     tasks_of,
 )
 from me2e_compress.zoo.train.episodes.recording import Recording
-from me2e_compress.zoo.train.parent import end_with_parent
 
 SUFFIX, SKIPPED = ".npz", ".skipped"
 SHORTEST_US = 2_000_000
