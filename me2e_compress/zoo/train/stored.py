@@ -86,10 +86,10 @@ def _arrays(file: Path) -> dict[str, Array]:
     """What is read of a file; nothing is known of it yet but the names."""
     names = (*KEPT, "jpeg_offsets", "jpeg")
     try:
-        content = np.load(file)
-        if not isinstance(content, np.lib.npyio.NpzFile):
-            raise TrainingError(f"{file}: not an episode: it is a single array")
-        with content:
+        with file.open("rb") as source:
+            content = np.load(source)
+            if not isinstance(content, np.lib.npyio.NpzFile):
+                raise TrainingError(f"{file}: not an episode: it is a single array")
             missing = [name for name in names if name not in content]
             if missing:
                 raise TrainingError(f"{file}: not an episode: it has no {missing[0]}")

@@ -82,6 +82,7 @@ def test_the_folder_says_what_it_is(folder: Path) -> None:
         "noise": 1.0,
         "expert_share": 1.0,
         "student": None,
+        "scenarios": [],
     }
 
 
