@@ -37,12 +37,12 @@ def arrays_of(
     arrays["path_attributes"][:] = (1.75, 5.25, 1.75, 8.0)
     arrays["agents"][..., 0] = -1
     arrays["agents"][:, 0] = (0, 20, 0.5, 1, 0, 4.6, 1.9, 5, 0, 0)
-    arrays["agents"][:, 1] = (0, 9, -3.5, 0, 1, 4.6, 1.9, 0, 2, 0)
+    arrays["agents"][:, 1] = (0, 9, -3.5, 0, -1, 4.6, 1.9, 0, -2, 0)
     arrays["futures"][:] = np.nan
     arrays["futures"][:, 0] = np.stack([20 + 5 * times, np.full(6, 0.5)], -1)
-    arrays["futures"][:, 1] = np.stack([np.full(6, 9.0), -3.5 + 2 * times], -1)
+    arrays["futures"][:, 1] = np.stack([np.full(6, 9.0), -3.5 - 2 * times], -1)
     arrays["signals"][..., :2], arrays["signals"][..., 6] = -1, np.nan
-    arrays["signals"][:, 0] = (0, 0, 18, 2, -1, 0, 15, 0)
+    arrays["signals"][:, 0] = (0, 0, 18, 2, 1, 0, 15, 0)
     arrays["ground"] = rng.integers(1, 7, (samples, GRID.rows, GRID.columns), np.uint8)
     arrays["occupancy"] = rng.integers(0, 256, arrays["occupancy"].shape, np.uint8)
     arrays["known_steps"] = np.full(samples, 6)
