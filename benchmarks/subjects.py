@@ -16,11 +16,11 @@ import numpy as np
 from benchmarks import bev_head, resnet50
 from benchmarks.subject import Subject, at
 from me2e_compress import graph, recipe
+from me2e_compress.cli.frames import record
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.zoo.export import export
-from me2e_compress.zoo.frames import write_frames
 
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
 
@@ -60,7 +60,7 @@ def _export(subject: Subject) -> None:
 
 def _record(name: str, folder: Path, count: int, seed: int) -> None:
     if name == "vad-tiny":
-        write_frames(name, folder, count, seed, SCENE)
+        record(name, folder, count, seed, SCENE)
     elif name == "bev-head":
         bev_head.record(folder, count, seed)
     else:
