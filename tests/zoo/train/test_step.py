@@ -123,7 +123,7 @@ def test_the_same_seed_gives_the_same_losses(
     model: Highway, lamps: LampHead, episodes: Episodes
 ) -> None:
     found = [outcome(model, lamps, episodes, Augmentation(), 3) for _ in range(2)]
-    numbers = [{k: float(v) for k, v in one.losses.items()} for one in found]
+    numbers = [{k: float(v.detach()) for k, v in one.losses.items()} for one in found]
     assert numbers[0] == numbers[1]
 
 

@@ -29,7 +29,7 @@ def together() -> Together:
 
 @pytest.fixture(scope="module")
 def answers(together: Together) -> torch.Tensor:
-    answers = torch.full((3, 2, 5), torch.nan).share_memory_()
+    answers: torch.Tensor = torch.full((3, 2, 5), torch.nan).share_memory_()
     spawn(average, (together, answers), 3)
     return answers
 
