@@ -1,0 +1,55 @@
+"""The page about the driver says what the driver is."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.cli.inspect import look
+from me2e_compress.zoo.shipped import shipped
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "driver.md"
+
+
+def told() -> dict[str, tuple[int, float]]:
+    """Parameters and million MACs by module, from the table."""
+    row = r"^\| `(\w+)` \|.*\| ([\d,]+) \| ([\d.]+) \|$"
+    rows = re.findall(row, PAGE.read_text(), re.MULTILINE)
+    return {name: (int(n.replace(",", "")), float(macs)) for name, n, macs in rows}
+
+
+def test_parameters_and_macs_are_those_of_the_file() -> None:
+    found = {
+        item.module: (item.parameters, round((item.macs or 0) / 1e6, 1))
+        for item in look(shipped("highway"), None).modules
+    }
+    assert told() == found
+
+
+def test_modules_are_told_in_the_order_of_the_map() -> None:
+    names = [item.module for item in look(shipped("highway"), None).modules]
+    assert list(told()) == names
+
+
+@pytest.mark.parametrize(
+    "path", sorted(set(re.findall(r"`(zoo/[\w/]+(?:\.py|/))`", PAGE.read_text())))
+)
+def test_a_file_it_names_is_there(path: str) -> None:
+    assert (ROOT / "me2e_compress" / path).exists()
+
+
+@pytest.mark.parametrize(
+    "link", sorted(set(re.findall(r"\]\(([^)#]+)", PAGE.read_text())))
+)
+def test_a_link_leads_somewhere(link: str) -> None:
+    assert (PAGE.parent / link).exists()
+
+
+def test_its_example_is_python_that_names_what_exists() -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    pytest.importorskip("torch")
+    head, _, _ = example.partition("\ncourse = ")
+    names: dict[str, object] = {}
+    exec(compile(head, "driver.md", "exec"), names)
+    assert {"FULL", "HighwayConfig", "run"} <= set(names)
