@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -30,7 +31,7 @@ from me2e_compress.zoo.train.log import Log
 from me2e_compress.zoo.train.stage import Training
 from tests.zoo.train.small import WORKERS
 
-pytestmark = pytest.mark.xdist_group("small-course")
+pytestmark = [pytest.mark.xdist_group("small-course"), pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +160,7 @@ def finish(folder: Path, rounds: int) -> None:
     assert start(folder, rounds).wait(600) == 0
 
 
+@pytest.mark.slow
 def test_killed_twice_it_comes_to_the_same_driver(small: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     kill_while_driving(folder, 1, 0)
@@ -166,6 +168,10 @@ def test_killed_twice_it_comes_to_the_same_driver(small: Path, tmp_path: Path) -
     finish(folder, 1)
     drivers = [place / "round-0" / "driver.onnx" for place in (folder, small)]
     assert drivers[0].read_bytes() == drivers[1].read_bytes()
+
+
+def _has_results(trial: Path) -> bool:
+    return any(trial.glob("*/*.json"))
 
 
 @pytest.mark.slow
@@ -177,7 +183,7 @@ def test_killed_in_every_part_it_comes_to_the_same_driver(
         kill_while_driving(folder, 2, which)
         kill_while_training(folder, 2, which)
         trial = folder / f"round-{which}" / "trial"
-        kill_when(folder, 2, lambda trial=trial: any(trial.glob("*/*.json")))
+        kill_when(folder, 2, partial(_has_results, trial))
     finish(folder, 2)
     drivers = [place / "round-1" / "driver.onnx" for place in (folder, small)]
     assert drivers[0].read_bytes() == drivers[1].read_bytes()
