@@ -57,6 +57,49 @@ class RoadMap:
     rough: Tensor
 
 
+@dataclass
+class Route:
+    """What the command picks from the map.
+
+    Attributes:
+        lateral: [B] metres that the ego is left of it.
+        path: [B, P, 2] metres in the ego frame.
+        headings: [B, P] radians.
+        attributes: [B, P, 4], see `RoadMap`.
+        points: [B, P, C] its queries.
+    """
+
+    lateral: Tensor
+    path: Tensor
+    headings: Tensor
+    attributes: Tensor
+    points: Tensor
+
+
+class Choice(nn.Module):
+    """The route of the command, as a module: exported nodes have its scope."""
+
+    def forward(self, road: RoadMap, command: Tensor) -> Route:
+        """Pick for int64 [B] commands."""
+        return route_of(road, command)
+
+
+def route_of(road: RoadMap, command: Tensor) -> Route:
+    """The route of each command, int64 [B]."""
+
+    def picked(values: Tensor) -> Tensor:
+        where = command.view(-1, *(1 for _ in values.shape[1:]))
+        return values.gather(1, where.expand(-1, 1, *values.shape[2:])).squeeze(1)
+
+    return Route(
+        picked(road.lateral),
+        picked(road.paths),
+        picked(road.headings),
+        picked(road.attributes),
+        picked(road.query.unflatten(1, (COMMANDS, -1))),
+    )
+
+
 class Map(nn.Module):
     """Queries for the points of six routes, a raster, three signal queries."""
 

@@ -23,24 +23,27 @@ from me2e_compress.zoo.highway.costs import (
     swept,
 )
 from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
-from me2e_compress.zoo.highway.map import GAP_SCALE_M, RoadMap
-from me2e_compress.zoo.highway.motion import Futures
-from me2e_compress.zoo.highway.track import Tracks
+from me2e_compress.zoo.highway.map import GAP_SCALE_M
 from me2e_compress.zoo.highway.world import (
     EGO_FEATURES,
     SPEED_SCALE_MPS,
     Candidates,
     EgoState,
     World,
-    world_of,
 )
 
-LIMITS = 4
-"""Too fast, too far left, too far right, left of the oncoming lanes."""
+LIMITS = 5
+"""Too fast, too far left, too far right, left of the oncoming lanes, off the route."""
+BENDS = (0, 3, 6)
+"""Points of the route, 2 m apart, whose headings tell how the ego stands to it."""
+ASIDE = 1 + len(BENDS)
+"""How far the ego is beside the route, and those headings."""
 COSTS = STEPS * (2 * 2 + 1 + RASTER_CHANNELS + SIGNAL_KINDS + LIMITS)
 """Overlap and nearness at twelve instants, the rest at six."""
 
 
+BESIDE_M = 4.0
+"""A lane beside the route, or more: no worse."""
 CAUTION = 4.0
 """What a certain collision costs before training, in units of the logits."""
 
@@ -67,7 +70,7 @@ class Planner(nn.Module):
         times = STEP_S * torch.arange(1, STEPS + 1)
         self.register_buffer("times", times, False)
         self.anchor = mlp(STEPS * 2, channels, channels)
-        self.ego = mlp(EGO_FEATURES + COMMANDS, channels, channels)
+        self.ego = mlp(EGO_FEATURES + COMMANDS + ASIDE, channels, channels)
         self.box = mlp(9, channels, channels)
         self.road = mlp(6, channels, channels)
         self.grid = nn.Sequential(
@@ -84,30 +87,15 @@ class Planner(nn.Module):
         self.penalty = mlp(EGO_FEATURES, 16, 4)
         nn.init.constant_(self.penalty.get_parameter("2.bias"), CAUTION)
 
-    def forward(
-        self,
-        tracks: Tracks,
-        road: RoadMap,
-        futures: Futures,
-        occupancy: Tensor,
-        ego: EgoState,
-        command: Tensor,
-    ) -> tuple[Tensor, World]:
-        """Decide.
+    def forward(self, world: World, ego: EgoState, command: Tensor) -> Tensor:
+        """Decide: the best plan [B, 6, 2].
 
         Args:
-            tracks: of the track module.
-            road: of the map module.
-            futures: of the motion module.
-            occupancy: [B, 6, H, W] logits of the occ module.
+            world: what the modules say.
             ego: what the ego does.
             command: int64 [B].
-
-        Returns:
-            (the best plan [B, 6, 2], what was read).
         """
-        world = world_of(tracks, road, futures, occupancy, command)
-        return self.consider(world, ego.features(), command).best(), world
+        return self.consider(world, ego.features(), command).best()
 
     def consider(self, world: World, ego: Tensor, command: Tensor) -> Candidates:
         """Make the candidates and score them.
@@ -140,7 +128,8 @@ class Planner(nn.Module):
     def _query(self, world: World, ego: Tensor, command: Tensor) -> Tensor:
         """[B, K, C]: each anchor looks at agents, route, signals and occupancy."""
         pick = command[:, None] == torch.arange(COMMANDS, device=command.device)
-        told = self.ego(torch.cat([ego, pick.to(ego.dtype)], -1))
+        aside = torch.stack([world.lateral, *(world.headings[:, i] for i in BENDS)], -1)
+        told = self.ego(torch.cat([ego, pick.to(ego.dtype), aside.to(ego.dtype)], -1))
         query = self.anchor(self.anchors.flatten(1) / 10) + told[:, None]
         boxes = torch.cat([world.boxes / 10, world.score[..., None]], -1)
         agents = (world.agents + self.box(boxes)) * world.score[..., None]
@@ -196,7 +185,7 @@ class Planner(nn.Module):
         return beyond_lines(arc, gap) * asked[:, None, None]
 
     def _limits(self, world: World, arc: Tensor, offset: Tensor) -> Tensor:
-        """[B, K, 6, 4] too fast, too far left, right, left of the oncoming lanes."""
+        """[B, K, 6, 5] how far beyond each of `LIMITS`."""
         weights = hats(arc, world.path.shape[1]).flatten(1, 2)
         here = torch.matmul(weights, world.attributes).unflatten(1, arc.shape[1:])
         before = torch.cat([torch.zeros_like(arc[..., :1]), arc[..., :-1]], -1)
@@ -207,6 +196,7 @@ class Planner(nn.Module):
                 (offset + 1.0 - here[..., 0]).clamp(min=0),
                 (1.0 - offset - here[..., 1]).clamp(min=0),
                 (offset + 1.0 - here[..., 2]).clamp(min=0),
+                offset.abs().clamp(max=BESIDE_M) / BESIDE_M,
             ],
             -1,
         )

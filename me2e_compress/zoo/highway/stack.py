@@ -8,12 +8,12 @@ from torch import Tensor, nn
 from me2e_compress.zoo.highway.backbone import Backbone, Neck
 from me2e_compress.zoo.highway.bev_encoder import BevEncoder
 from me2e_compress.zoo.highway.config import HighwayConfig
-from me2e_compress.zoo.highway.map import Map, RoadMap
+from me2e_compress.zoo.highway.map import Choice, Map, RoadMap
 from me2e_compress.zoo.highway.motion import Futures, Motion
 from me2e_compress.zoo.highway.occ import Occ
 from me2e_compress.zoo.highway.planner import Planner
 from me2e_compress.zoo.highway.track import Track, Tracks
-from me2e_compress.zoo.highway.world import EgoState
+from me2e_compress.zoo.highway.world import EgoState, World, gather
 
 MEMORY = 2
 """Of the ego: when it last looked (s), how lately it stood (1 now, 0 never)."""
@@ -50,6 +50,9 @@ class Highway(nn.Module):
         self.track, self.map = Track(config), Map(config)
         self.motion, self.occ = Motion(config), Occ(config)
         self.planner = Planner(config)
+        # no weights: their names say whose part of the world they make
+        self.map_route, self.map_raster = Choice(), nn.Sigmoid()
+        self.motion_modes, self.occ_taken = nn.Softmax(-1), nn.Sigmoid()
 
     def look(self, img: Tensor) -> tuple[Tensor, Tensor]:
         """Images [B, 6, 3, H, W] to features [B * 6, C, h, w] of strides 4 and 8."""
@@ -71,6 +74,23 @@ class Highway(nn.Module):
         road = self.map(bev, tokens, images)
         return Seen(tracks, road, self.motion(tracks, road), self.occ(bev))
 
+    def world(self, seen: Seen, command: Tensor) -> World:
+        """Gather what the planner reads; the command, int64 [B], picks the route.
+
+        Every part is made in a scope of the exported graph that begins with the name
+        of its module: who takes a module away takes all of it, outputs too.
+        """
+        road, futures = seen.road, seen.futures
+        return gather(
+            seen.tracks,
+            road,
+            self.map_route(road, command),
+            self.map_raster(road.raster),
+            futures,
+            self.motion_modes(futures.logits),
+            self.occ_taken(seen.occupancy),
+        )
+
     def forward(
         self,
         img: Tensor,
@@ -89,7 +109,7 @@ class Highway(nn.Module):
             can_bus: [18], see the policy contract.
             command: int64 [1].
             timestamp: [1] seconds since the route began.
-            prev_bev: [1, N, C + 1], zeros at the start.
+            prev_bev: [1, N, C + 2], zeros at the start.
             prev_memory: [1, 2], zeros at the start.
 
         Returns:
@@ -101,15 +121,15 @@ class Highway(nn.Module):
         fine, middle = self.look(img)
         bev, tokens, kept = self.bev_encoder(fine, lidar2img, bus, elapsed, prev_bev)
         seen = self.understand(bev, tokens, middle)
-        tracks, road, futures = seen.tracks, seen.road, seen.futures
         ego = EgoState(bus, stood_lately(bus[:, 7], prev_memory[:, 1], elapsed))
-        plan, world = self.planner(tracks, road, futures, seen.occupancy, ego, command)
+        world = self.world(seen, command)
+        plan = self.planner(world, ego, command)
         memory = torch.stack([timestamp, ego.stood], -1)
         return (
             plan,
-            tracks.boxes,
-            tracks.score,
-            futures.travel,
+            world.boxes,
+            world.score,
+            world.travel,
             world.path,
             world.occupancy,
             kept,

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from me2e_compress.zoo.highway.config import COMMANDS, STEPS
-from me2e_compress.zoo.highway.map import RoadMap
+from me2e_compress.zoo.highway.config import STEPS
+from me2e_compress.zoo.highway.map import RoadMap, Route, route_of
 from me2e_compress.zoo.highway.motion import Futures
 from me2e_compress.zoo.highway.track import Tracks
 
@@ -105,6 +105,8 @@ def world_of(
 ) -> World:
     """Gather what the planner reads; the command picks the route.
 
+    The same numbers as `Highway.world`, outside of every module.
+
     Args:
         tracks: of the track module.
         road: of the map module.
@@ -112,22 +114,50 @@ def world_of(
         occupancy: [B, 6, H, W] logits of the occ module.
         command: int64 [B].
     """
-    pick = command[:, None] == torch.arange(COMMANDS, device=command.device)
-    chosen = pick.to(road.paths.dtype)
-    queries = road.query.unflatten(1, (COMMANDS, -1))
+    return gather(
+        tracks,
+        road,
+        route_of(road, command),
+        road.raster.sigmoid(),
+        futures,
+        futures.logits.softmax(-1),
+        occupancy.sigmoid(),
+    )
+
+
+def gather(
+    tracks: Tracks,
+    road: RoadMap,
+    route: Route,
+    raster: Tensor,
+    futures: Futures,
+    modes: Tensor,
+    occupancy: Tensor,
+) -> World:
+    """Lay out what the planner reads.
+
+    Args:
+        tracks: of the track module.
+        road: of the map module.
+        route: that the command picks from it.
+        raster: [B, 4, H, W] probabilities, of the map module.
+        futures: of the motion module.
+        modes: [B, A, M] probabilities, of the motion module.
+        occupancy: [B, 6, H, W] probabilities, of the occ module.
+    """
     return World(
         futures.query,
         tracks.boxes,
         tracks.score,
         futures.travel,
-        futures.logits.softmax(-1),
-        (road.lateral * chosen).sum(1),
-        (road.paths * chosen[:, :, None, None]).sum(1),
-        (road.headings * chosen[:, :, None]).sum(1),
-        (road.attributes * chosen[:, :, None, None]).sum(1),
-        (queries * chosen[:, :, None, None].to(queries.dtype)).sum(1),
-        road.raster.sigmoid(),
+        modes,
+        route.lateral,
+        route.path,
+        route.headings,
+        route.attributes,
+        route.points,
+        raster,
         road.signal_query,
         road.signals,
-        occupancy.sigmoid(),
+        occupancy,
     )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from me2e_compress.zoo.highway.stack import Highway
-from me2e_compress.zoo.highway.world import World, world_of
+from me2e_compress.zoo.highway.world import World
 from me2e_compress.zoo.train.data import Episodes, Indices
 from me2e_compress.zoo.train.step import NONE, pixels_of, remember
 
@@ -81,8 +81,7 @@ def _episode(
             where = slice(number * FRAMES, (number + 1) * FRAMES)
             bev = model.bev_encoder.fuse(joined[where])
             seen = model.understand(bev, model.bev_encoder.tokens(bev), middle)
-            parts = seen.tracks, seen.road, seen.futures, seen.occupancy
-            worlds.append(world_of(*parts, command[where]))
+            worlds.append(model.world(seen, command[where]))
     return {
         field.name: _packed(
             field.name, torch.cat([getattr(world, field.name) for world in worlds])

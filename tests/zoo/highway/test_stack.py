@@ -7,25 +7,29 @@ import numpy.typing as npt
 import onnx
 import pytest
 import torch
-from torch import nn
 
 from me2e_compress.evaluators.highway.cameras import CameraRig
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.session import Session
-from me2e_compress.zoo.highway.bev_encoder import motion_of
-from me2e_compress.zoo.highway.export import parameters, write
+from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of
+from me2e_compress.zoo.highway.config import HighwayConfig
+from me2e_compress.zoo.highway.export import parameters
 from me2e_compress.zoo.highway.stack import Highway, stood_lately
 from me2e_compress.zoo.stacks import find
 
 Feeds = dict[str, npt.NDArray[np.generic]]
+
+CELL = HighwayConfig().channels + RECORD
+"""Numbers that the memory keeps of a cell."""
 
 
 def inputs(rng: np.random.Generator, time_s: float = 0.4) -> Feeds:
     bus = np.zeros(18, np.float32)
     bus[:2], bus[16], bus[17] = rng.normal(0, 1, 2), rng.uniform(0, 6), rng.normal(0, 5)
     bus[7], bus[10:12], bus[15] = rng.uniform(0, 12), rng.normal(0, 1, 2), 0.1
-    memory = rng.normal(0, 0.3, (1, 768, 65)).astype(np.float32)
-    memory[..., -1] = rng.uniform(0.3, 1.0, (1, 768))  # how well each cell is known
+    memory = rng.normal(0, 0.3, (1, 768, CELL)).astype(np.float32)
+    # how well each cell is known, and how old that is
+    memory[..., -RECORD:] = rng.uniform(0.3, 1.0, (1, 768, RECORD))
     return {
         "img": rng.normal(0, 1, (1, 6, 3, 96, 160)).astype(np.float32),
         "lidar2img": CameraRig(96, 160).lidar2img[None],
@@ -35,23 +39,6 @@ def inputs(rng: np.random.Generator, time_s: float = 0.4) -> Feeds:
         "prev_bev": memory,
         "prev_memory": rng.uniform(0, 0.3, (1, 2)).astype(np.float32),
     }
-
-
-@pytest.fixture(scope="module")
-def model() -> Highway:
-    torch.manual_seed(3)
-    model = Highway().eval()
-    model.planner.anchors.copy_(torch.rand_like(model.planner.anchors) * 20)
-    # an untrained model is undecided: let no rounding decide for it
-    for head, gain in ((model.planner.score[-1], 100), (model.track.heat[-1], 5)):
-        assert isinstance(head, nn.Linear | nn.Conv2d)
-        head.weight.data *= gain
-    return model
-
-
-@pytest.fixture(scope="module")
-def exported(model: Highway, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(model, tmp_path_factory.mktemp("highway") / "highway.onnx")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -89,17 +76,31 @@ def test_memory_is_by_time_and_not_by_frames(model: Highway) -> None:
     still = motion_of(torch.zeros(1, 18), torch.zeros(1))
     memories = list[torch.Tensor]()
     for count in (4, 8):
-        memory = torch.zeros(1, 768, 65)
+        memory = torch.zeros(1, 768, CELL)
         for _ in range(count):
             recalled = encoder.recall(memory, still)
             _, memory = encoder.remember(now, recalled, torch.tensor([0.8 / count]))
         memories.append(memory)
-    assert torch.allclose(memories[0], memories[1], atol=1e-5)
+    few, many = (memory[..., :-1] for memory in memories)  # ages are of looks
+    assert torch.allclose(few, many, atol=1e-5)
+
+
+@pytest.mark.parametrize("elapsed_s", [0.3, 0.6])
+def test_memory_knows_how_old_it_is(model: Highway, elapsed_s: float) -> None:
+    encoder, channels = model.bev_encoder, model.config.channels
+    now = torch.randn(1, channels, 32, 24)
+    still = motion_of(torch.zeros(1, 18), torch.zeros(1))
+    nothing = encoder.recall(torch.zeros(1, 768, CELL), still)
+    _, memory = encoder.remember(now, nothing, torch.tensor([0.2]))
+    recalled = encoder.recall(memory, still)
+    joined, _ = encoder.remember(now, recalled, torch.tensor([elapsed_s]))
+    age = joined[:, 2 * channels]
+    assert torch.allclose(age, torch.full_like(age, elapsed_s), atol=1e-5)
 
 
 def test_memory_follows_the_ground_when_the_ego_moves(model: Highway) -> None:
     encoder = model.bev_encoder
-    memory = torch.zeros(1, 32, 24, 65)
+    memory = torch.zeros(1, 32, 24, CELL)
     memory[0, 10, 12] = 1.0  # 26 to 28 m ahead
     bus = torch.zeros(1, 18)
     bus[0, 1] = 4.0  # 4 m north
@@ -110,7 +111,7 @@ def test_memory_follows_the_ground_when_the_ego_moves(model: Highway) -> None:
 
 def test_memory_turns_with_the_ego(model: Highway) -> None:
     encoder = model.bev_encoder
-    memory = torch.zeros(1, 32, 24, 65)
+    memory = torch.zeros(1, 32, 24, CELL)
     memory[0, 18, 12] = 1.0  # x 10 to 12, y -2 to 0: straight ahead
     bus = torch.zeros(1, 18)
     bus[0, 17] = 90.0

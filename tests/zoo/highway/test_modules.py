@@ -1,0 +1,54 @@
+"""What belongs to which module of the driver, once it is exported."""
+
+from pathlib import Path
+
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.graph import provenance
+from me2e_compress.modules import detect
+from me2e_compress.passes import AblateModules, Context, FoldConstants, ImportNormalize
+
+MADE_BY = {
+    "plan": "planner",
+    "boxes": "track",
+    "scores": "track",
+    "futures": "motion",
+    "route": "map",
+    "occupancy": "occ",
+    "prev_bev_out": "bev_encoder",
+    "prev_memory_out": "planner",
+}
+
+
+@pytest.fixture(scope="module")
+def folded(exported: Path) -> ir.Model:
+    model = graph.load(exported)
+    context = Context(detect(model))
+    for step in (ImportNormalize(), FoldConstants(through_compute=False)):
+        model = step.run(model, context).model
+    return model
+
+
+def test_every_output_is_of_its_own_module(folded: ir.Model) -> None:
+    found = {
+        str(value.name): provenance.module_of(producer)
+        for value in folded.graph.outputs
+        if (producer := value.producer()) is not None
+    }
+    assert found == MADE_BY
+
+
+@pytest.mark.parametrize("module", ["track", "map", "motion", "occ"])
+def test_a_module_goes_with_its_outputs_and_nothing_else(
+    folded: ir.Model, module: str
+) -> None:
+    cut = AblateModules(drop=(module,), fill="zeros", drop_outputs=True)
+    made = cut.run(folded.clone(), Context(detect(folded))).model
+    left = [name for name, maker in MADE_BY.items() if maker != module]
+    assert [value.name for value in made.graph.outputs] == left
+    # the planner still knows what it was told, whoever is gone
+    (command,) = (value for value in made.graph.inputs if value.name == "command")
+    readers = {provenance.module_of(node) for node in command.consumers()}
+    assert "planner" in readers
