@@ -4,7 +4,7 @@ import importlib.util
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,8 +61,18 @@ def export(
             f"cannot export {stack} at opset {opset}: {OPSETS[0]} to {OPSETS[-1]} work"
         )
     model = build(stack, opset=opset, seed=seed, heads=heads)
-    graph = trace(spec, model, opset)
-    for key, value in spec.metadata(heads).items():
+    return save(trace(spec, model, opset), spec.metadata(heads), path)
+
+
+def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Path:
+    """Write what was traced and what it says of itself; give the path.
+
+    Args:
+        graph: Gets the metadata.
+        metadata: Properties by key.
+        path: The ``.onnx``; replaced in one step.
+    """
+    for key, value in metadata.items():
         graph.metadata_props.add(key=key, value=value)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import torch
 
-from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.zoo.export import trace
+from me2e_compress.zoo.export import save, trace
 from me2e_compress.zoo.highway.stack import Highway
 from me2e_compress.zoo.stacks import find
 
@@ -26,12 +25,7 @@ def write(model: Highway, path: Path) -> Path:
     spec = find("highway")
     # torch's stubs leave this form of `to` out
     model.eval().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    graph = trace(spec, model, OPSET)
-    for key, value in spec.metadata().items():
-        graph.metadata_props.add(key=key, value=value)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, graph.SerializeToString())
-    return path
+    return save(trace(spec, model, OPSET), spec.metadata(), path)
 
 
 def parameters(model: Highway) -> int:
