@@ -85,23 +85,6 @@ class DecoderLayer(nn.Module):
         return answer
 
 
-class SelfLayer(nn.Module):
-    """Self-attention and feed-forward, each after a LayerNorm."""
-
-    def __init__(self, channels: int, heads: int) -> None:
-        super().__init__()
-        self.attn = MultiHeadAttention(channels, heads)
-        self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(2)])
-        self.ffn = mlp(channels, 2 * channels, channels)
-
-    def forward(self, query: Tensor) -> Tensor:
-        """[B, Q, C] looks at itself."""
-        own = self.norms[0](query)
-        query = query + self.attn(own, own, own)
-        answer: Tensor = query + self.ffn(self.norms[1](query))
-        return answer
-
-
 def mlp(*widths: int) -> nn.Sequential:
     """Linear layers with ReLU between them."""
     layers: list[nn.Module] = []
