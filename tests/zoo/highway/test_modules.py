@@ -8,7 +8,10 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.graph import provenance
 from me2e_compress.modules import detect
-from me2e_compress.passes import AblateModules, Context, FoldConstants, ImportNormalize
+from me2e_compress.passes import Context
+from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.passes.fold_constants import FoldConstants
+from me2e_compress.passes.import_normalize import ImportNormalize
 
 MADE_BY = {
     "plan": "planner",
