@@ -8,7 +8,8 @@ TOML::
 
 Text, the same: ``ablate-modules{drop=[occ]}``; passes are parted by commas. Words
 inside the braces need no quotes. An option is a field of the pass's dataclass, in
-Python, in a recipe and in text alike.
+Python, in a recipe and in text alike. A file that a recipe names is relative to the
+folder of the recipe, one in a text to where you are.
 """
 
 import dataclasses
@@ -71,8 +72,9 @@ def load(name: str | Path) -> tuple[Pass, ...]:
     Raises:
         RecipeError: no such recipe, not TOML, or a pass or option nobody knows.
     """
-    path = Path(name)
+    path, beside = Path(name), Path()
     if path.is_file():
+        beside = path.parent
         text = path.read_text(encoding="utf-8")
     elif str(name) in shipped():
         source = resources.files("me2e_compress") / "recipes" / f"{name}.toml"
@@ -88,7 +90,7 @@ def load(name: str | Path) -> tuple[Pass, ...]:
     built: list[Pass] = []
     for entry in entries:
         options = dict(entry)
-        built.append(build(str(options.pop("name", "")), options))
+        built.append(_beside(build(str(options.pop("name", "")), options), beside))
     return tuple(built)
 
 
@@ -132,6 +134,18 @@ def build(name: str, options: Mapping[str, object]) -> Pass:
         where = ".".join(str(part) for part in first["loc"]) or "options"
         raise RecipeError(f"{name}: {where}: {first['msg']}") from error
     return made
+
+
+def _beside(current: Pass, folder: Path) -> Pass:
+    """Look for the files that a pass names in the folder of its recipe."""
+    if not dataclasses.is_dataclass(current):
+        return current
+    files = {
+        field.name: folder / value
+        for field in dataclasses.fields(current)
+        if isinstance(value := getattr(current, field.name), Path)
+    }
+    return dataclasses.replace(current, **files)
 
 
 def _options(name: str, body: str) -> dict[str, object]:

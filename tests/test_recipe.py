@@ -29,6 +29,7 @@ class Sample:
     ratio: float = 0.5
     strict: bool = False
     fill: str = "zeros"
+    means: Path | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         return PassResult(model, 0)
@@ -151,3 +152,17 @@ def test_a_third_party_pass_may_not_take_a_name(
     recipe.registry.cache_clear()
     with pytest.raises(RecipeError, match="entry point sample"):
         recipe.parse("sample")
+
+
+def test_a_file_that_a_recipe_names_lies_beside_the_recipe(tmp_path: Path) -> None:
+    (tmp_path / "r.toml").write_text(
+        '[[pass]]\nname = "sample"\nmeans = "sub/m.npz"\n'
+        '[[pass]]\nname = "sample"\nmeans = "/m.npz"\n'
+    )
+
+    beside, absolute = recipe.load(tmp_path / "r.toml")
+
+    assert beside == Sample(means=tmp_path / "sub" / "m.npz")
+    assert absolute == Sample(means=Path("/m.npz"))
+    assert recipe.parse("sample{means=m.npz}") == (Sample(means=Path("m.npz")),)
+    assert recipe.to_text([beside]) == f'sample{{means="{tmp_path}/sub/m.npz"}}'

@@ -55,7 +55,7 @@ class Int8Options:
             given,
             rules=self.rules or given.rules,
             target=self.target or given.target,
-            overrides=str(self.overrides) if self.overrides else given.overrides,
-            ranges=str(self.ranges) if self.ranges else given.ranges,
+            overrides=self.overrides or given.overrides,
+            ranges=self.ranges or given.ranges,
             method=self.method or given.method,
         )

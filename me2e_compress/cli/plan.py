@@ -57,7 +57,7 @@ def plan(
     options = QuantizeInt8(
         scheme=scheme,
         rules=rules,
-        overrides=None if overrides is None else str(overrides),
+        overrides=overrides,
     )
     found = read_plan(model, options, module_map)
     if output is not None:

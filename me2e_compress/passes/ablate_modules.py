@@ -1,6 +1,7 @@
 """Take whole modules out of a graph."""
 
 import dataclasses
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import onnx_ir as ir
@@ -57,7 +58,7 @@ class AblateModules:
     fill: Literal["zeros", "substitute", "means"] = "substitute"
     keep: tuple[str, ...] = ()
     drop_outputs: bool = False
-    means: str | None = None
+    means: Path | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Re-wire, cut, sweep.

@@ -1,6 +1,7 @@
 """Int8 made for TensorRT, for onnxruntime."""
 
 import dataclasses
+from pathlib import Path
 from typing import ClassVar
 
 import onnx_ir as ir
@@ -34,7 +35,7 @@ class LowerInt8:
     exact: ClassVar[bool] = False
     changes_interface: ClassVar[bool] = False
     method: str = "max-min"
-    ranges: str | None = None
+    ranges: Path | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Read the pairs, calibrate what they do not tell, write them anew.

@@ -16,7 +16,7 @@ def means_of(
     model: ir.Model,
     values: Sequence[ir.Value],
     frames: CalibrationSet | None,
-    file: str | None,
+    file: Path | None,
 ) -> tuple[dict[str, Array], str]:
     """Read means from a file, or measure them on frames.
 
@@ -37,7 +37,7 @@ def means_of(
         layout_of(value)
     names = [str(value.name) for value in values]
     if file is not None:
-        return load_means(Path(file), names), f"its mean in {file}"
+        return load_means(file, names), f"its mean in {file}"
     if frames is None:
         raise FramesError(
             "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"

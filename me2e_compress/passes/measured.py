@@ -18,7 +18,7 @@ def measured_ranges(
     context: Context,
     *,
     method: str,
-    saved: str | None,
+    saved: Path | None,
 ) -> Ranges:
     """Read the ranges of some tensors from a file, or measure them on the frames.
 
@@ -36,7 +36,7 @@ def measured_ranges(
     """
     frames = context.frames
     if saved is not None:
-        found = Ranges.load(Path(saved))
+        found = Ranges.load(saved)
         found.check(
             model=graph.digest(model),
             tensors=tensors,

@@ -65,9 +65,9 @@ class QuantizeInt8:
     without: tuple[str, ...] = ()
     target: str = "tensorrt"
     attention_limit: int = 512
-    overrides: str | None = None
+    overrides: Path | None = None
     method: str = "max-min"
-    ranges: str | None = None
+    ranges: Path | None = None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Plan, calibrate, place.
@@ -107,7 +107,7 @@ class QuantizeInt8:
         """Decide for every node of a graph whose shapes are inferred."""
         overrides = Overrides()
         if self.overrides is not None:
-            overrides = Overrides.load(Path(self.overrides))
+            overrides = Overrides.load(self.overrides)
         rules = rules_named(self.rules, self.attention_limit).without(self.without)
         return make_plan(model, self._scheme(context), rules, overrides)
 

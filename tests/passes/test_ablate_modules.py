@@ -253,7 +253,7 @@ def test_means_from_a_file_go_before_frames(
 ) -> None:
     file = tmp_path / "means.npz"
     np.savez(file, agents=np.array([[4, 9, 16, 25]], np.float32))
-    chosen = AblateModules(drop=("agents",), fill="means", means=str(file))
+    chosen = AblateModules(drop=("agents",), fill="means", means=file)
 
     result = chosen.run(stack, replace(context(), frames=recording))
 
@@ -269,7 +269,7 @@ def test_a_mean_is_never_made_up(stack: ir.Model) -> None:
 
 def test_a_file_of_means_goes_with_means_only(stack: ir.Model) -> None:
     with pytest.raises(RecipeError, match="means goes with fill=means only"):
-        AblateModules(drop=("agents",), means="m.npz").run(stack, context())
+        AblateModules(drop=("agents",), means=Path("m.npz")).run(stack, context())
 
 
 @pytest.mark.parametrize(
@@ -300,7 +300,7 @@ def test_means_of_another_graph(
 ) -> None:
     file = tmp_path / "means.npz"
     np.savez(file, **{name: array})  # type: ignore[arg-type]
-    chosen = AblateModules(drop=("agents",), fill="means", means=str(file))
+    chosen = AblateModules(drop=("agents",), fill="means", means=file)
 
     with pytest.raises(error, match=words):
         chosen.run(stack, context())

@@ -67,7 +67,7 @@ def test_saved_ranges_give_the_same_graph_without_frames(
     Calibrator().run(placed, unranged(placed), frames).save(path)
 
     measured = LowerInt8().run(placed, context).model
-    read = LowerInt8(ranges=str(path)).run(placed, Context(MODULES)).model
+    read = LowerInt8(ranges=path).run(placed, Context(MODULES)).model
 
     assert graph.digest(read) == graph.digest(measured)
 

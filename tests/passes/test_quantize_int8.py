@@ -140,7 +140,7 @@ def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> Non
     path = tmp_path / "overrides.toml"
     path.write_text('[[override]]\nmodule = "head"\ndtype = "float"\n')
 
-    notes = QuantizeInt8(overrides=str(path)).run(conv_attention(), context).notes
+    notes = QuantizeInt8(overrides=path).run(conv_attention(), context).notes
 
     assert "1 of 10 nodes int8; by rule: layer 1, override 3" in notes
 
@@ -162,7 +162,7 @@ def test_close_decisions_are_noted(context: Context) -> None:
         ({"without": ("speed",)}, RecipeError, "rule speed cannot be switched off"),
         ({"rules": "int4"}, RecipeError, "no rule set int4; there are paper, tensorrt"),
         ({"target": "qnn"}, RecipeError, "no target qnn; there are tensorrt"),
-        ({"overrides": "none.toml"}, RecipeError, "none.toml: no such file of over"),
+        ({"overrides": Path("none.toml")}, RecipeError, "none.toml: no such file"),
         ({"method": "median"}, RecipeError, "no calibration method median"),
     ],
 )
@@ -181,7 +181,7 @@ def test_saved_ranges_give_the_same_graph_without_frames(
     Calibrator().run(model, TENSORS, frames).save(path)
 
     measured = QuantizeInt8().run(conv_attention(), context).model
-    read = QuantizeInt8(ranges=str(path)).run(model, Context(MODULES)).model
+    read = QuantizeInt8(ranges=path).run(model, Context(MODULES)).model
 
     assert graph.digest(read) == graph.digest(measured)
 
@@ -193,7 +193,7 @@ def test_ranges_of_another_graph_are_refused(
     Calibrator().run(conv_attention(seed=1), TENSORS, frames).save(path)
 
     with pytest.raises(FramesError, match="ranges are stale: of graph"):
-        QuantizeInt8(ranges=str(path)).run(conv_attention(), Context(MODULES))
+        QuantizeInt8(ranges=path).run(conv_attention(), Context(MODULES))
 
 
 def test_frames_of_another_model_are_refused(tmp_path: Path) -> None:

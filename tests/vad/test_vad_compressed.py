@@ -68,7 +68,7 @@ def reference(folded: ir.Model) -> Session:
 @pytest.fixture(scope="module")
 def ranges(
     folded: ir.Model, context: Context, tmp_path_factory: pytest.TempPathFactory
-) -> str:
+) -> Path:
     """Ranges of everything that any scheme quantizes, measured once."""
     model = folded.clone()
     graph.infer_shapes(model)
@@ -78,7 +78,7 @@ def ranges(
     tensors = (*tensors_of(plan, model), *onnxruntime.tensors(plan, model))
     unique = tuple(dict.fromkeys(tensors))
     Calibrator(threads=2).run(model, unique, context.frames).save(path)
-    return str(path)
+    return path
 
 
 def seeing(result: ir.Model, context: Context) -> Session:
@@ -105,7 +105,7 @@ def test_schemes_shrink_the_file_and_keep_the_plan(
     reference: Session,
     context: Context,
     frames: CalibrationSet,
-    ranges: str,
+    ranges: Path,
 ) -> None:
     result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
     session = seeing(result.model, context)
@@ -125,7 +125,7 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     reference: Session,
     context: Context,
     frames: CalibrationSet,
-    ranges: str,
+    ranges: Path,
     tmp_path: Path,
 ) -> None:
     options = QuantizeInt8(target="onnxruntime", ranges=ranges)
@@ -148,7 +148,7 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["feature-ext", "prediction", "full"])
 def test_schemes_are_built_with_int8_kernels(
-    scheme: str, folded: ir.Model, context: Context, ranges: str
+    scheme: str, folded: ir.Model, context: Context, ranges: Path
 ) -> None:
     pytest.importorskip("tensorrt_rtx")
     result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
