@@ -16,7 +16,8 @@ from me2e_compress.cli.inspect import inspect
 from me2e_compress.cli.lint import lint
 from me2e_compress.cli.plan import plan
 from me2e_compress.cli.profile import profile
-from me2e_compress.cli.sensitivity import search, sensitivity
+from me2e_compress.cli.search import search
+from me2e_compress.cli.sensitivity import sensitivity
 from me2e_compress.errors import Me2eError
 
 app = typer.Typer(

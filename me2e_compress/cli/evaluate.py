@@ -55,7 +55,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on."""
-    picked, set_size = _routes(routes)
+    picked, set_size = routes_named(routes)
     shown = None if show is None else pick_routes(picked, show)
     driver = driver_of(policy, adapter)
     conditions = Conditions(
@@ -95,8 +95,12 @@ def _report(policy: str, scores: Scores, as_json: bool) -> None:
         console.print(scores_table(policy, scores))
 
 
-def _routes(text: str) -> tuple[tuple[Route, ...], int]:
-    """Return the routes asked for, and how many the set they are from has."""
+def routes_named(text: str) -> tuple[tuple[Route, ...], int]:
+    """Return the routes asked for, and how many the set they are from has.
+
+    Raises:
+        EvaluationError: no such route, or no file of routes.
+    """
     if text.endswith(".json"):
         routes = load_routes(Path(text))
         return routes, len(routes)

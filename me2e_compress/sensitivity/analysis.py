@@ -18,6 +18,7 @@ class Finding:
         module: its name.
         nodes: how many of its nodes are int8 then.
         score: of that variant.
+        driving: its closed-loop score; None where nothing is driven.
         blamed: groups of nodes, worst first, each with its loss as the only int8
             nodes of the graph; a group of one is a node found by bisection, a larger
             one costs that only together, or was left whole when the trials were used
@@ -27,6 +28,7 @@ class Finding:
     module: str
     nodes: int
     score: Score
+    driving: float | None = None
     blamed: tuple[tuple[tuple[str, ...], float], ...] = ()
 
 
@@ -38,11 +40,15 @@ class Sensitivity:
         findings: the modules that have int8 nodes, worst first.
         together: the score of all of them.
         trials: variants that were built and run.
+        float_driving: closed-loop score of the float model; None: nothing is driven.
+        driving: of all modules together; None: nothing is driven.
     """
 
     findings: tuple[Finding, ...]
     together: Score
     trials: int
+    float_driving: float | None = None
+    driving: float | None = None
 
 
 def analyse(
@@ -55,7 +61,8 @@ def analyse(
     """Score every module alone, then bisect it to the nodes that cost most.
 
     Half of a module's nodes is int8 at a time, then half of the guilty half, and so on:
-    a node among n is found in about 2 log2 n trials.
+    a node among n is found in about 2 log2 n trials. Modules are driven, where the
+    trials have a hook for that; halves of modules are not.
 
     Args:
         trials: judges variants.
@@ -73,10 +80,18 @@ def analyse(
         blamed: tuple[tuple[tuple[str, ...], float], ...] = ()
         if node_trials and score.loss > 0:
             blamed = _Bisection(trials, module, names, node_trials).run(score.loss)
-        findings.append(Finding(module, len(names), score, blamed))
+        driving = trials.driving(Choice((module,)))
+        findings.append(Finding(module, len(names), score, driving, blamed))
     findings.sort(key=lambda each: -each.score.loss)
-    together = trials.score(Choice(tuple(active)))
-    return Sensitivity(tuple(findings), together, trials.done)
+    every = Choice(tuple(active))
+    together = trials.score(every)
+    return Sensitivity(
+        tuple(findings),
+        together,
+        trials.done,
+        float_driving=trials.driving(Choice(())),
+        driving=trials.driving(every),
+    )
 
 
 def names_of(trials: Trials, module: str) -> tuple[str, ...]:

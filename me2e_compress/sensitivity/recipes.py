@@ -1,42 +1,52 @@
 """From what was found to a recipe."""
 
-from collections.abc import Callable
 from pathlib import Path
 
+from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.sensitivity.analysis import Sensitivity
-from me2e_compress.sensitivity.trials import Choice, Score, Trials
+from me2e_compress.sensitivity.trials import Choice, Trials
 
 
 def advise(
     trials: Trials,
     found: Sensitivity,
     limit: float,
-    tried: Callable[[Choice, Score], None] | None = None,
+    driving_limit: float | None = None,
 ) -> Choice:
     """Give the choice that keeps the loss within a limit, and floats little for it.
 
-    Starts with all modules in int8. Until the measured loss is within the limit, the
-    costliest module first gives up the nodes that are to blame, then all of them.
+    Starts with all modules in int8. Until the measured losses are within the limits,
+    the costliest module first gives up the nodes that are to blame, then all of them.
 
     Args:
         trials: judges variants.
         found: what :func:`analyse` found.
         limit: largest loss, in its unit.
-        tried: told each choice that was measured.
+        driving_limit: how far the closed-loop score may lie below the float model's,
+            asked once the loss is within its limit; None asks for no drive.
 
     Returns:
-        The choice; no module at all where none keeps the limit.
+        The choice; no module at all where none keeps the limits.
+
+    Raises:
+        EvaluationError: a limit of driving, and trials that have no hook for it.
     """
     for choice in _steps(trials, found):
         if not choice.modules:
             return choice
-        score = trials.score(choice)
-        if tried:
-            tried(choice, score)
-        if score.loss <= limit:
+        if trials.score(choice).loss > limit:
+            continue
+        if driving_limit is None or _driving_loss(trials, choice) <= driving_limit:
             return choice
     return Choice(())
+
+
+def _driving_loss(trials: Trials, choice: Choice) -> float:
+    whole, got = trials.driving(Choice(())), trials.driving(choice)
+    if whole is None or got is None:
+        raise EvaluationError("a limit of driving needs trials that are driven")
+    return whole - got
 
 
 def _steps(trials: Trials, found: Sensitivity) -> list[Choice]:
@@ -83,7 +93,7 @@ def write_recipe(
             f'target = "{target}"',
         ]
         if choice.floats:
-            options.append(f"overrides = {_string(str(overrides.resolve()))}")
+            options.append(f"overrides = {_string(overrides.name)}")
         lines.append("\n".join(options) + "\n")
     write_bytes(path, "\n".join(lines).encode())
     if not choice.floats or not choice.modules:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import TypeAlias
 
 import onnx_ir as ir
 
@@ -43,18 +44,20 @@ class Choice:
         )
 
 
+Drive: TypeAlias = Callable[[Choice, ir.Model], float]
+"""Gives the closed-loop score of a choice, whose graph it gets; larger is better."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Score:
     """How an int8 variant does.
 
     Attributes:
         fidelity: against the float model, on the frames.
-        driving: what the hook for driving gave; None where there is none.
         weight_bytes: of all its weights.
     """
 
     fidelity: Fidelity
-    driving: float | None
     weight_bytes: int
 
     @property
@@ -85,7 +88,7 @@ class Trials:
         target: how int8 is written. Fidelity is judged on what is written.
         ranges: of every tensor that any variant needs.
         frames: to judge on; read once for every variant.
-        drive: gives a score of closed-loop driving for a graph, larger is better.
+        drive: the hook for closed-loop scores; None where nothing is driven.
         threads: of onnxruntime; 0 takes all.
 
     Attributes:
@@ -103,7 +106,7 @@ class Trials:
         ranges: Ranges,
         frames: Frames,
         *,
-        drive: Callable[[ir.Model], float] | None = None,
+        drive: Drive | None = None,
         threads: int = 0,
     ) -> None:
         self.model = model
@@ -115,6 +118,7 @@ class Trials:
         self._drive = drive
         self._threads = threads
         self._known: dict[Choice, Score] = {}
+        self._driven: dict[Choice, float] = {}
         self.reference = Reference.of(
             Session(model, threads=threads, release=True), frames
         )
@@ -142,8 +146,15 @@ class Trials:
             session = Session(graph_of_choice, threads=self._threads, release=True)
             self._known[choice] = Score(
                 self.reference.compare(session),
-                None if self._drive is None else self._drive(graph_of_choice),
                 graph.size(graph_of_choice).weight_bytes,
             )
             self.done += 1
         return self._known[choice]
+
+    def driving(self, choice: Choice) -> float | None:
+        """Ask the hook for the closed-loop score of a choice; None without a hook."""
+        if self._drive is None:
+            return None
+        if choice not in self._driven:
+            self._driven[choice] = self._drive(choice, self.variant(choice))
+        return self._driven[choice]

@@ -16,6 +16,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.sensitivity import (
     Budget,
     Choice,
+    Drive,
     Trials,
     advise,
     analyse,
@@ -132,7 +133,8 @@ def test_the_advice_floats_the_culprit_and_nothing_else(tmp_path: Path) -> None:
 def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
     judge = trials(tmp_path, 3)
     choice = Choice(("backbone", "head"), ("/head/MatMul_3",))
-    path = tmp_path / "advised.toml"
+    path = tmp_path / "elsewhere" / "advised.toml"
+    path.parent.mkdir()
     overrides = write_recipe(path, choice, ("fold-constants",), "paper", "tensorrt")
 
     *_, int8 = recipe.load(path)
@@ -140,7 +142,8 @@ def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
         delicate(3), Context(MODULES, CalibrationSet(tmp_path / "frames"))
     ).model
 
-    assert overrides == tmp_path / "advised.overrides.toml"
+    assert overrides == path.with_name("advised.overrides.toml")
+    assert str(tmp_path) not in path.read_text()
     assert isinstance(int8, QuantizeInt8)
     made.metadata_props.clear()
     expected = judge.variant(choice)
@@ -155,22 +158,47 @@ def test_a_recipe_without_int8_has_no_int8(tmp_path: Path) -> None:
     assert [each.name for each in recipe.load(path)] == ["fold-constants"]
 
 
-def test_driving_is_asked_of_every_variant(tmp_path: Path) -> None:
-    judge = trials(tmp_path, 3)
-    assert judge.score(Choice(("head",))).driving is None
-    seen: list[ir.Model] = []
-
-    def drive(made: ir.Model) -> float:
-        seen.append(made)
-        return 42.0
-
-    driven = Trials(
+def driven(judge: Trials, drive: Drive) -> Trials:
+    return Trials(
         judge.model, MODULES, rules_named("paper"), TARGETS["tensorrt"],
         judge.ranges, judge.reference.frames, drive=drive, threads=1,
     )  # fmt: skip
 
-    assert driven.score(Choice(("head",))).driving == 42.0
-    assert [n.op_type for n in seen[0].graph].count("QuantizeLinear") > 0
+
+def test_modules_are_driven_once_and_halves_of_them_are_not(tmp_path: Path) -> None:
+    seen: list[Choice] = []
+
+    def drive(choice: Choice, made: ir.Model) -> float:
+        seen.append(choice)
+        int8 = [n.op_type for n in made.graph].count("QuantizeLinear")
+        return 100.0 - int8
+
+    judge = trials(tmp_path, 3)
+    found = analyse(driven(judge, drive), ("backbone", "head"))
+
+    modules = [("backbone",), ("head",), (), ("backbone", "head")]
+    assert seen == [Choice(names) for names in modules]
+    assert found.float_driving == 100.0
+    assert {each.module: each.driving for each in found.findings} == {
+        "backbone": 98.0,
+        "head": 96.0,
+    }
+    assert found.driving == 94.0
+    assert analyse(judge, ("backbone",)).findings[0].driving is None
+
+
+def test_the_advice_keeps_a_limit_of_driving(tmp_path: Path) -> None:
+    def drive(choice: Choice, made: ir.Model) -> float:
+        return 80.0 if "head" in choice.modules else 99.0
+
+    judge = trials(tmp_path, 3)
+    on_road = driven(judge, drive)
+    found = analyse(on_road, ("backbone", "head"), node_trials=0)
+
+    assert advise(on_road, found, 1e9, 19.0) == Choice(("backbone", "head"))
+    assert advise(on_road, found, 1e9, 18.9) == Choice(("backbone",))
+    with pytest.raises(EvaluationError, match="needs trials that are driven"):
+        advise(judge, found, 1e9, 1.0)
 
 
 def weight_bytes(made: ir.Model) -> float:
