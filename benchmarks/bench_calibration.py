@@ -2,6 +2,8 @@
 
     python -m benchmarks.bench_calibration OUT [--subjects resnet50,bev-head,vad-tiny]
         [--peer-python PYTHON] [--frames N]
+    python -m benchmarks.bench_calibration OUT --subjects vad-tiny --frames 256
+        --only max-min --limit-gb 6            a long calibration within 6 GB
 
 For each model, after the exact passes, over the same frames on the same threads: plain
 inference and our calibration, with onnxruntime's optimizations and without; our second
@@ -18,7 +20,6 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -57,7 +58,7 @@ LEVEL = {
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What one process took; None where it was stopped."""
+    """What one process took; no seconds where it was stopped."""
 
     cpu_s: float | None
     wall_s: float | None
@@ -73,7 +74,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--limit-gb", type=float, default=14)
     parser.add_argument("--peer-python", type=Path, default=Path(sys.executable))
-    parser.add_argument("--without", default="", help="rows to leave out, a comma list")
+    parser.add_argument("--without", default="", help="rows to leave out, parted by ;")
+    parser.add_argument("--only", default="", help="rows to measure, parted by ;")
     parser.add_argument("--run", help="what this process is to measure")
     chosen = parser.parse_args()
     if chosen.run:
@@ -95,14 +97,13 @@ def rows_of(
     """Measure everything, one process after the other."""
     rows: dict[str, Row | str] = {}
     common = ["--frames", str(count), "--threads", str(chosen.threads)]
-    left_out = [each.strip() for each in chosen.without.split(",")]
-    for name in OURS:
+    wanted = asked(chosen.only, chosen.without)
+    for name in filter(wanted.__contains__, OURS):
         command = [sys.executable, "-m", "benchmarks.bench_calibration"]
         command += [str(subject.folder), "--run", name, *common]
         rows[name] = watch(command, chosen.limit_gb)
     for name, tool in PEERS.items():
-        if name in left_out:
-            rows[name] = "left out"
+        if name not in wanted:
             continue
         python = chosen.peer_python if tool == "modelopt" else Path(sys.executable)
         if tool == "modelopt" and not has_modelopt(python):
@@ -113,6 +114,17 @@ def rows_of(
         command += [str(subject.model), str(subject.frames), str(output), *common]
         rows[name] = watch(command, chosen.limit_gb)
     return rows
+
+
+def asked(only: str, without: str) -> tuple[str, ...]:
+    """Name the rows to measure, in order."""
+    every = (*OURS, *PEERS)
+    first = [name.strip() for name in only.split(";") if name.strip()] or every
+    rest = [name.strip() for name in without.split(";") if name.strip()]
+    for name in (*first, *rest):
+        if name not in every:
+            raise SystemExit(f"no row {name!r}; there are {'; '.join(every)}")
+    return tuple(name for name in every if name in first and name not in rest)
 
 
 def watch(command: list[str], limit_gb: float) -> Row | str:
@@ -176,22 +188,27 @@ def show(subject: Subject, rows: dict[str, Row | str]) -> None:
     print("| run | tensors | CPU s | x plain | peak MB | x plain | + MB |")
     print("|---|---|---|---|---|---|---|")
     for name, row in rows.items():
-        plain = rows[LEVEL.get(name, "plain")]
-        if isinstance(row, str) or isinstance(plain, str):
+        if isinstance(row, str):
             print(f"| {name} | | {row} | | | | |")
             continue
+        plain = rows.get(LEVEL.get(name, "plain"))
+        cpu_s = plain.cpu_s if isinstance(plain, Row) else None
+        peak = plain.peak_mb if isinstance(plain, Row) else None
         print(
             f"| {name} | {row.tensors or ''} | {shown(row.cpu_s, '.1f')}"
-            f" | {ratio(row, plain, lambda each: each.cpu_s)}"
-            f" | {row.peak_mb:.0f} | {ratio(row, plain, lambda each: each.peak_mb)}"
-            f" | {row.peak_mb - plain.peak_mb:+.0f} |"
+            f" | {ratio(row.cpu_s, cpu_s)} | {row.peak_mb:.0f}"
+            f" | {ratio(row.peak_mb, peak)} | {more(row.peak_mb, peak)} |"
         )
-    print(f"\n{agreement(subject)}", flush=True)
+    if {"max-min, not optimized", "onnxruntime MinMax"} <= rows.keys():
+        print(f"\n{agreement(subject)}", flush=True)
 
 
-def ratio(row: Row, plain: Row, what: Callable[[Row], float | None]) -> str:
-    above, below = what(row), what(plain)
+def ratio(above: float | None, below: float | None) -> str:
     return "-" if above is None or below is None else f"{above / below:.2f}"
+
+
+def more(above: float | None, below: float | None) -> str:
+    return "-" if above is None or below is None else f"{above - below:+.0f}"
 
 
 def shown(value: float | None, form: str) -> str:
