@@ -122,7 +122,7 @@ HIGHWAY = Stack(
         "can_bus": (18,),
         "command": (1,),
         "timestamp": (1,),
-        "prev_bev": (1, 768, 65),
+        "prev_bev": (1, 768, 66),
         "prev_memory": (1, 2),
     },
     outputs=(

@@ -18,6 +18,9 @@ REACH = 0.2
 """How far an offset reaches, in half images."""
 SATURATION = 5.0
 """A cell seen for a fifth of the memory's time constant counts as remembered."""
+RECORD = 2
+"""Channels of the memory beside the features: how much of a cell was ever seen, and
+that times how long ago, seconds. Without the age a displacement is no velocity."""
 
 
 @dataclass
@@ -153,7 +156,7 @@ class BevEncoder(nn.Module):
         self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(2)])
         self.ffn = mlp(channels, 2 * channels, channels)
         self.temporal = nn.Sequential(
-            conv_block(2 * channels + 1, channels, 1), Residual(channels, channels)
+            conv_block(2 * channels + RECORD, channels, 1), Residual(channels, channels)
         )
         self.spatial = Residual(channels, channels)
         self.place = nn.Parameter(torch.randn(1, self.area.cells, channels) * 0.1)
@@ -174,11 +177,11 @@ class BevEncoder(nn.Module):
             lidar2img: [B, 6, 4, 4].
             can_bus: [B, 18], see the policy contract.
             elapsed_s: [B] since the last frame.
-            prev_bev: [B, N, C + 1].
+            prev_bev: [B, N, C + 2].
 
         Returns:
             ([B, C, rows, columns], the same as [B, N, C] with the place of each cell,
-            [B, N, C + 1] to keep).
+            [B, N, C + 2] to keep).
         """
         now = self.look(features, lidar2img)
         recalled = self.recall(prev_bev, motion_of(can_bus, elapsed_s))
@@ -200,7 +203,7 @@ class BevEncoder(nn.Module):
         return seen
 
     def recall(self, prev_bev: Tensor, motion: Motion) -> Tensor:
-        """The memory [B, N, C + 1] as seen from here: [B, C + 1, rows, columns]."""
+        """The memory [B, N, C + 2] as seen from here: [B, C + 2, rows, columns]."""
         cos, sin = motion.turn.cos()[:, None], motion.turn.sin()[:, None]
         x, y = self.centres[None, :, 0], self.centres[None, :, 1]
         there = torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
@@ -216,23 +219,26 @@ class BevEncoder(nn.Module):
 
         Args:
             now: [B, C, rows, columns].
-            recalled: [B, C + 1, rows, columns]; the last channel is how much of it
-                was ever seen, 1 at most.
+            recalled: [B, C + 2, rows, columns], see `RECORD`.
             elapsed_s: [B].
 
         Returns:
-            ([B, 2 C + 1, rows, columns] for `fuse`, [B, N, C + 1] to keep).
+            ([B, 2 C + 2, rows, columns] for `fuse`, [B, N, C + 2] to keep).
         """
-        mass = recalled[:, -1:]
-        mean = recalled[:, :-1] / mass.clamp(min=1e-3)
+        mass, aged = recalled[:, -2:-1], recalled[:, -1:]
+        elapsed = elapsed_s[:, None, None, None]
+        aged = aged + mass * elapsed
+        share = mass.clamp(min=1e-3)
         known = (mass * SATURATION).clamp(max=1.0)
-        keep = torch.exp(-elapsed_s / self.memory_s)[:, None, None, None]
-        seen = torch.cat([now, torch.ones_like(mass)], 1)
-        kept = recalled * keep + seen * (1 - keep)
-        return torch.cat([now, mean * known, known], 1), kept.flatten(2).transpose(1, 2)
+        keep = torch.exp(-elapsed / self.memory_s)
+        mean = torch.cat([recalled[:, :-2], aged], 1) / share * known
+        seen = torch.cat([now, torch.ones_like(mass), torch.zeros_like(mass)], 1)
+        old = torch.cat([recalled[:, :-1], aged], 1)
+        kept = old * keep + seen * (1 - keep)
+        return torch.cat([now, mean, known], 1), kept.flatten(2).transpose(1, 2)
 
     def fuse(self, joined: Tensor) -> Tensor:
-        """[B, 2 C + 1, rows, columns] to [B, C, rows, columns]."""
+        """[B, 2 C + 2, rows, columns] to [B, C, rows, columns]."""
         bev: Tensor = self.spatial(self.temporal(joined))
         return bev
 

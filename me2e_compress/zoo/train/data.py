@@ -1,6 +1,7 @@
 """Episodes in memory, and short sequences drawn from them."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,7 @@ from me2e_compress.zoo.highway.config import STEP_S
 from me2e_compress.zoo.train.episodes import decode
 from me2e_compress.zoo.train.frenet import project
 from me2e_compress.zoo.train.stored import KEPT, Array, Bytes, read
+from me2e_compress.zoo.train.waiting import creeps, stopping
 
 Floats = npt.NDArray[np.floating]
 Indices = npt.NDArray[np.int64]
@@ -25,6 +27,10 @@ VERY_DECISIVE_M = 2.0
 """Half a car's length: braking for somebody, or going around."""
 LINE_NEAR_M = 25.0
 """A stop line this near decides: braking at 2 m/s^2 from 10 m/s takes 25 m."""
+CHANGE_M = 1.0
+"""A plan that is this far from going on as now, on average, is a change of mind."""
+ASIDE_M = 0.5
+"""A plan that goes this far to the side, at its end, returns or goes around."""
 FOLLOW = 3
 """The command to follow the lane; turns come before it, lane changes behind it."""
 
@@ -38,8 +44,8 @@ class Sequences:
         strides: distances between them, in stored samples.
     """
 
-    length: int = 3
-    strides: tuple[int, ...] = (1, 2)
+    length: int = 4
+    strides: tuple[int, ...] = (1, 2, 3)
 
 
 class Episodes:
@@ -49,7 +55,7 @@ class Episodes:
         """Read episodes.
 
         Args:
-            files: one an episode.
+            files: one an episode; what is named twice is drawn twice as often.
             image_size: rows and columns of a camera that the model sees.
 
         Raises:
@@ -58,24 +64,38 @@ class Episodes:
         """
         if not files:
             raise TrainingError("there is no episode to learn from")
-        episodes = [read(file, image_size) for file in files]
+        times = Counter(files)
+        episodes = [read(file, image_size) for file in times]
         self.pictures = [one for each in episodes for one in each.pictures]
         self.tables: dict[str, Array] = {
             name: np.concatenate([each.arrays[name] for each in episodes])
             for name in KEPT
         }
         lengths = [len(each.pictures) for each in episodes]
+        self.times = np.repeat(list(times.values()), lengths)
         ends = np.cumsum(lengths)
         self.first = np.repeat(ends - lengths, lengths)
         self.last = np.repeat(ends - 1, lengths)
         self.moves = project(self.tables["plan"], self.tables["path"])
         self.moves[..., 1] -= self.tables["lateral_m"][:, None]
+        self._stop_for_others()
         shift = np.linalg.norm(self.tables["plan"] - self.tables["plan_alone"], axis=-1)
         self.shift_m: Floats = shift.mean(-1)
+
+    def _stop_for_others(self) -> None:
+        """Let those who creep in a junction stand."""
+        rows = creeps(self.moves, self.tables, self.tables["plan_alone"])
+        speed = self.tables["can_bus"][rows, 7]
+        self.moves[rows] = stopping(self.moves[rows], speed)
+        self.tables["plan"][rows] = stopping(self.tables["plan"][rows], speed)
 
     def __len__(self) -> int:
         """Count the samples."""
         return len(self.last)
+
+    def forget_pictures(self) -> None:
+        """Make room: from now on only the rows are asked for."""
+        self.pictures.clear()
 
     def departures(self) -> Floats:
         """[N, 6, 2] the expert's plans less going on at the speed of now."""
@@ -86,12 +106,16 @@ class Episodes:
 
     @cached_property
     def weights(self) -> Floats:
-        """How often each sample is drawn: more where actors, turns or lines decide."""
+        """How often each sample is drawn: more where something decides or changes."""
         command, signals = self.tables["command"], self.tables["signals"]
         line = (signals[..., 0] >= 0) & (np.abs(signals[..., 6]) < LINE_NEAR_M)
         weight = 1.0 + 2.0 * (self.shift_m > DECISIVE_M)
         weight += 1.0 * (self.shift_m > VERY_DECISIVE_M)
         weight += 1.0 * (command != FOLLOW) + 1.0 * line.any(1)
+        departures = np.abs(self.departures())
+        weight += 1.0 * (departures[..., 0].mean(1) > CHANGE_M)
+        weight += 1.0 * (departures[:, -1, 1] > ASIDE_M)
+        weight *= self.times
         return np.asarray(weight / weight.sum())
 
     def draw(self, rng: np.random.Generator, count: int, how: Sequences) -> Indices:

@@ -42,6 +42,7 @@ class Lessons:
         """From now on only the planner learns: ask the other modules once."""
         model.eval()
         self._cache = Cache.of(model, self.episodes, self.lidar2img)
+        self.episodes.forget_pictures()
 
     def losses(
         self, model: Highway, lamps: LampHead, rng: np.random.Generator

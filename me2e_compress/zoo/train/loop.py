@@ -54,9 +54,9 @@ def train(
         TrainingError: fewer episodes than processes, a file is not what it should be,
             another stage was begun in the folder, or a process died.
     """
-    if len(files) < what.workers or not held_out:
+    if len(set(files)) < what.workers or not held_out:
         raise TrainingError(
-            f"{len(files)} episodes and {len(held_out)} held out are too few for "
+            f"{len(set(files))} episodes and {len(held_out)} held out are too few for "
             f"{what.workers} processes"
         )
     folder.mkdir(parents=True, exist_ok=True)

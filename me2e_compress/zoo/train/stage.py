@@ -55,7 +55,7 @@ class Training:
     """
 
     steps: int
-    batch: int = 8
+    batch: int = 6
     workers: int = 4
     rate: float = 1.5e-3
     seed: int = 0
@@ -106,7 +106,8 @@ class Stage:
         what, size = task.what, task.config.image_size
         torch.manual_seed(what.seed)
         self.model, self.lamps = Highway(task.config), LampHead(task.config.channels)
-        episodes = Episodes(task.files[rank :: what.workers], size)
+        mine = set(list(dict.fromkeys(task.files))[rank :: what.workers])
+        episodes = Episodes([file for file in task.files if file in mine], size)
         self.held_out = Episodes(task.held_out, size) if rank == 0 else None
         self.lidar2img = torch.from_numpy(CameraRig(*size).lidar2img)
         self.lessons = Lessons(

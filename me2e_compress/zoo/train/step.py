@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from me2e_compress.zoo.highway.bev_encoder import motion_of
+from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of
 from me2e_compress.zoo.highway.stack import STOOD_S, Highway, Seen
 from me2e_compress.zoo.highway.world import Candidates, EgoState, World, world_of
 from me2e_compress.zoo.train.losses import (
@@ -30,7 +30,7 @@ WEIGHTS = {
     "score": 1.0,
     "box": 0.5,
     "class": 0.3,
-    "travel": 0.3,
+    "travel": 0.6,
     "mode": 0.2,
     "path": 0.5,
     "heading": 2.0,
@@ -189,13 +189,13 @@ def pixels_of(images: Array, rng: np.random.Generator, how: Augmentation) -> Ten
 
 
 def remember(model: Highway, now: Tensor, batch: dict[str, Array]) -> Tensor:
-    """Feed the memory forward: [B * L, C, ...] to [B * L, 2 C + 1, ...]."""
+    """Feed the memory forward: [B * L, C, ...] to [B * L, 2 C + 2, ...]."""
     encoder = model.bev_encoder
     times = torch.from_numpy(batch["time_us"].astype(np.float64) / 1e6).float()
     buses = torch.from_numpy(batch["can_bus"].astype(np.float32))
     sequences, length = times.shape
     looks = now.unflatten(0, (sequences, length))
-    memory = torch.zeros(sequences, encoder.area.cells, now.shape[1] + 1)
+    memory = torch.zeros(sequences, encoder.area.cells, now.shape[1] + RECORD)
     joined = []
     for t in range(length):
         elapsed = (

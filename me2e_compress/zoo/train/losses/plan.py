@@ -22,6 +22,13 @@ ASIDE = 2.0
 """A metre to the side counts as two along the route."""
 SOFT_M = 0.2
 """How much farther than the best a candidate may be and still count."""
+DOOMED = 0.5
+"""An overlap of the expert's plan with somebody, in its first two seconds, above which
+it is no example: it gave up, or the driver had brought it where nothing helps."""
+DOOMED_INSTANTS = 8
+"""Of a quarter of a second each."""
+STILL_M = 0.05
+"""A step shorter than this has no direction of its own."""
 DECISIVE = 2.0
 """Extra weight of samples where the actors change the plan."""
 
@@ -43,7 +50,8 @@ def plan_losses(
     to_plan = ((candidates.moves.detach() - aim).abs() * side).sum(-1) @ steps
     share = functional.softmax(-to_plan / SOFT_M, -1)
     weight = 1 + DECISIVE * (wanted.shift_m > 0.5).float()
-    weight = weight / weight.mean()
+    weight = weight * ~doomed(wanted)
+    weight = weight / weight.mean().clamp(min=1e-3)
     choice = -(share * candidates.logits.log_softmax(-1)).sum(-1)
     best = to_anchor.argmin(1)
     rows = torch.arange(len(best))
@@ -72,6 +80,29 @@ def true_harm(candidates: Candidates, wanted: Targets, area: BevArea) -> Tensor:
         area: of the bird's-eye view.
     """
     plans, headings = candidates.plans.detach(), candidates.headings.detach()
+    overlap = _overlap(plans, headings, wanted)
+    under = ground(discs_of(plans, headings), wanted.raster, area)
+    beside = (1 - under[..., 0] - under[..., 1]).clamp(min=0).amax(-1)
+    there, gap, state = wanted.signals[:, 0].unbind(-1)
+    closed = there * ((state == 0) | (state == 1))
+    past = beyond_lines(candidates.moves[..., 0].detach(), gap[:, None]).amax(2)[..., 0]
+    return overlap.amax(-1) + beside + past * closed[:, None]
+
+
+@torch.no_grad()
+def doomed(wanted: Targets) -> Tensor:
+    """[B] whether the expert's own plan meets somebody soon."""
+    plan = wanted.plan
+    step = torch.diff(plan, dim=1, prepend=torch.zeros_like(plan[:, :1]))
+    heading = torch.atan2(step[..., 1], step[..., 0])
+    heading = heading * (step.norm(dim=-1) > STILL_M)
+    overlap = _overlap(plan[:, None], heading[:, None], wanted)
+    soon: Tensor = overlap[:, 0, :DOOMED_INSTANTS].amax(-1) > DOOMED
+    return soon
+
+
+def _overlap(plans: Tensor, headings: Tensor, wanted: Targets) -> Tensor:
+    """[B, K, 12] with where everybody really was, every quarter of a second."""
     agents = wanted.agents
     columns = [1, 2, 5, 6, 3, 4, 7, 8]
     drift = agents[:, :, None, 7:9] * STEP_S * torch.arange(1, 1 + STEPS)[:, None]
@@ -83,12 +114,7 @@ def true_harm(candidates: Candidates, wanted: Targets, area: BevArea) -> Tensor:
         between_travel(travel[:, :, None]),
         torch.ones_like(agents[..., :1]),
     )
-    under = ground(discs_of(plans, headings), wanted.raster, area)
-    beside = (1 - under[..., 0] - under[..., 1]).clamp(min=0).amax(-1)
-    there, gap, state = wanted.signals[:, 0].unbind(-1)
-    closed = there * ((state == 0) | (state == 1))
-    past = beyond_lines(candidates.moves[..., 0].detach(), gap[:, None]).amax(2)[..., 0]
-    return overlap.amax(-1) + beside + past * closed[:, None]
+    return overlap
 
 
 def displacement(plans: Tensor, wanted: Targets) -> Tensor:

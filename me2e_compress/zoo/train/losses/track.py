@@ -12,8 +12,9 @@ from me2e_compress.zoo.train.targets import Targets
 
 HALO = 0.7
 """How far the eight cells around an agent's are forgiven."""
-SPEED_STEP_MPS = 5.0
-"""An error of the velocity counts in steps of this, beside metres of the place."""
+SPEED_STEP_MPS = 2.0
+"""An error of the velocity counts in steps of this, beside metres of the place: over
+the 3 s of a plan, 2 m/s are more than a car's length."""
 NEAR_M = 4.0
 """A query this far from an agent cannot be its."""
 
