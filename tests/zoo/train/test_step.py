@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from me2e_compress.evaluators.highway.cameras import CameraRig
+from me2e_compress.zoo.highway.bev_encoder import RECORD
 from me2e_compress.zoo.highway.stack import Highway
 from me2e_compress.zoo.stacks import HIGHWAY
 from me2e_compress.zoo.train.cache import Cache
