@@ -7,8 +7,6 @@ no QDQ, and of an Add only the residual branch has; every int8 reader of a tenso
 one pair, every float reader reads the tensor itself.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
@@ -22,11 +20,9 @@ from me2e_compress.calibration.plan import (
     tensors_of,
 )
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.weights import quantize_weight
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
-from me2e_compress.runtime.evaluate import evaluate_constants
-from me2e_compress.runtime.frames import Array
+from me2e_compress.targets.weights import Weight, weights_of
 
 MIN_OPSET = 13
 """The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
@@ -63,55 +59,34 @@ def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
         )
     copy = model.clone()
     nodes = {str(node.outputs[0].name): node for node in copy.graph}
-    computed = evaluate_constants(model, _computed_weights(nodes, plan))
-    writer = _Writer(copy.graph, share_scales(plan, ranges), computed)
+    weights = weights_of(model, plan.chosen)
+    writer = _Writer(copy.graph, share_scales(plan, ranges))
     for decision in plan.chosen:
-        writer.apply(nodes[decision.output], decision)
+        writer.apply(nodes[decision.output], decision, weights.get(decision.output))
     graph.sweep(copy)
     return copy
-
-
-def _computed_weights(nodes: Mapping[str, ir.Node], plan: QuantPlan) -> list[str]:
-    """Name the weights that are computed from initializers: transposed, sliced."""
-    weights = (
-        nodes[decision.output].inputs[decision.weight]
-        for decision in plan.chosen
-        if decision.weight is not None
-    )
-    return list(
-        dict.fromkeys(
-            str(weight.name)
-            for weight in weights
-            if weight is not None and weight.producer() is not None
-        )
-    )
 
 
 class _Writer:
     """Writes pairs into one graph, each tensor and each weight once."""
 
-    def __init__(
-        self, where: ir.Graph, ranges: Ranges, computed: Mapping[str, Array]
-    ) -> None:
+    def __init__(self, where: ir.Graph, ranges: Ranges) -> None:
         self._graph = where
-        self._computed = computed
         self._ranges = ranges
         self._activations: dict[str, ir.Value] = {}
         self._weights: dict[tuple[str, int], ir.Value] = {}
         self._zero: ir.Value | None = None
 
-    def apply(self, node: ir.Node, decision: Decision) -> None:
+    def apply(self, node: ir.Node, decision: Decision, weight: Weight | None) -> None:
         """Let one node read int8."""
         for index in decision.activations:
             value = node.inputs[index]
             if value is not None:
                 node.replace_input_with(index, self._activation(value, node))
-        if decision.weight is None or decision.axis is None:
-            return
-        weight = node.inputs[decision.weight]
-        if weight is not None:
-            fresh = self._weight(weight, decision.axis, node)
-            node.replace_input_with(decision.weight, fresh)
+        at = decision.weight
+        like = None if at is None else node.inputs[at]
+        if weight is not None and at is not None and like is not None:
+            node.replace_input_with(at, self._weight(weight, like, node))
 
     def _activation(self, value: ir.Value, reader: ir.Node) -> ir.Value:
         name = str(value.name)
@@ -134,31 +109,23 @@ class _Writer:
             self._activations[name] = dequantize.outputs[0]
         return self._activations[name]
 
-    def _weight(self, weight: ir.Value, axis: int, reader: ir.Node) -> ir.Value:
-        name = str(weight.name)
-        if (name, axis) not in self._weights:
-            integers, scales = quantize_weight(self._array(weight), axis)
+    def _weight(self, weight: Weight, like: ir.Value, reader: ir.Node) -> ir.Value:
+        key = weight.name, weight.axis
+        if key not in self._weights:
+            name, scales = weight.name, weight.scales
             inputs = [
-                self._constant(integers, f"{name}_int8"),
+                self._constant(weight.integers, f"{name}_int8"),
                 self._constant(scales, f"{name}_scale"),
                 self._constant(np.zeros(len(scales), np.int8), f"{name}_zero"),
             ]
-            dequantize = _node("DequantizeLinear", inputs, name, weight, reader)
-            dequantize.attributes.add(ir.AttrInt64("axis", axis))
+            dequantize = _node("DequantizeLinear", inputs, name, like, reader)
+            dequantize.attributes.add(ir.AttrInt64("axis", weight.axis))
             self._graph.insert_before(reader, dequantize)
-            self._weights[name, axis] = dequantize.outputs[0]
-        return self._weights[name, axis]
+            self._weights[key] = dequantize.outputs[0]
+        return self._weights[key]
 
     def _constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
         return graph.add_constant(self._graph, array, name)
-
-    def _array(self, weight: ir.Value) -> npt.NDArray[np.float32]:
-        name = str(weight.name)
-        if name in self._computed:
-            return self._computed[name].astype(np.float32)
-        if weight.const_value is None:
-            raise PreconditionError(f"{name} is planned as a weight, but is none")
-        return weight.const_value.numpy().astype(np.float32)
 
 
 def _node(

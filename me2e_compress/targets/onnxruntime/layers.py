@@ -5,10 +5,10 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.targets.onnxruntime.draft import Weight
 from me2e_compress.targets.onnxruntime.kernels import bias_of, biased_end
 from me2e_compress.targets.onnxruntime.products import write_gemm
 from me2e_compress.targets.onnxruntime.writer import Writer
+from me2e_compress.targets.weights import Weight
 
 BIAS_MAX = 2**30
 """Largest int32 bias: half the accumulator stays for the products, which need at most

@@ -7,8 +7,8 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
-from me2e_compress.targets.onnxruntime.draft import Weight
 from me2e_compress.targets.onnxruntime.kernels import channel_axis
+from me2e_compress.targets.weights import Weight
 
 QUANTIZE, DEQUANTIZE = "QuantizeLinear", "DequantizeLinear"
 Floats = npt.NDArray[np.float32]
