@@ -9,7 +9,8 @@ For each model, after the exact passes, over the same frames on the same threads
 inference and our calibration, with onnxruntime's optimizations and without; our second
 pass of histograms; onnxruntime's MinMax and Entropy; ModelOpt (which places QDQ in the
 same call), where PYTHON has it. CPU seconds and peak memory count loading the model,
-not importing packages. A process above --limit-gb is stopped, and the row says so.
+not importing packages. A process that takes more than --limit-gb, or leaves the
+machine less than 2 GB, is stopped, and the row says so.
 Where both run the nodes as they stand and the model has no state, the ranges are held
 against onnxruntime's, bit for bit.
 """
@@ -48,6 +49,8 @@ PEERS = {
     "onnxruntime Entropy": "onnxruntime-entropy",
     "ModelOpt max": "modelopt",
 }
+LEFT_GB = 2.0
+"""Memory of the machine that no process here may use up."""
 LEVEL = {
     "max-min": "plain",
     "entropy": "plain",
@@ -58,7 +61,7 @@ LEVEL = {
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What one process took; no seconds where it was stopped."""
+    """What one process took, or had taken so far; no seconds where it was stopped."""
 
     cpu_s: float | None
     wall_s: float | None
@@ -128,7 +131,7 @@ def asked(only: str, without: str) -> tuple[str, ...]:
 
 
 def watch(command: list[str], limit_gb: float) -> Row | str:
-    """Run a process; stop it where it takes more memory than it may."""
+    """Run a process; stop it where it takes more memory than it may, or there is."""
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -139,7 +142,8 @@ def watch(command: list[str], limit_gb: float) -> Row | str:
             peak = max(peak, seen.memory_info().rss / 2**20)
         except psutil.NoSuchProcess:
             break
-        if peak > limit_gb * 1024:
+        left = psutil.virtual_memory().available / 2**30
+        if peak > limit_gb * 1024 or left < LEFT_GB:
             process.kill()
             process.communicate()
             return Row(None, None, peak)

@@ -8,9 +8,11 @@ modules; the frames compared on are of another seed. Files stay in OUT and are n
 again. Latency is one frame, recurrent state at zeros: a process a file, in turn, round
 by round; least CPU and wall time over all rounds. Kernels are counted in the graph as
 onnxruntime's optimizer leaves it. MACs count as int8 where both operands come through
-a DequantizeLinear, whatever the kernel; ``compare`` tells the signal to noise ratio.
+a DequantizeLinear, whatever the kernel; what follows from constants alone is left out
+on both sides, since no frame computes it. ``compare`` tells the signal to noise ratio.
 
-A peer above --limit-gb is stopped, one that is not installed is skipped, with a line.
+A tool that takes more than --limit-gb, or leaves the machine less than 2 GB, is
+stopped; one that is not installed is skipped. The table says so.
 """
 
 import argparse
@@ -21,8 +23,11 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+import onnx_ir as ir
 
 from benchmarks import subjects
 from benchmarks.bench_calibration import has_modelopt, watch
@@ -34,6 +39,7 @@ from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.runtime.evaluate import constant_values
 from me2e_compress.runtime.race import race
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers
@@ -93,8 +99,8 @@ def main() -> None:
     for name in chosen.subjects.split(","):
         subject = subjects.make(name, chosen.out, chosen.frames)
         print(f"\n{name}, {chosen.frames} frames, {chosen.threads} threads", flush=True)
-        rows = measure(subject, files(subject, chosen), chosen)
-        show(rows)
+        done, missing = files(subject, chosen)
+        show(measure(subject, done, chosen), missing)
 
 
 def path_of(subject: subjects.Subject, name: str) -> Path:
@@ -104,20 +110,25 @@ def path_of(subject: subjects.Subject, name: str) -> Path:
     return subject.folder / f"int8 {name}.onnx".replace(" ", "-").replace(",", "")
 
 
-def files(subject: subjects.Subject, chosen: argparse.Namespace) -> list[str]:
-    """Let every tool write its file, and name those that did."""
-    done = [FLOAT]
+def files(
+    subject: subjects.Subject, chosen: argparse.Namespace
+) -> tuple[list[str], dict[str, str]]:
+    """Let every tool write its file; name those that did, and why others did not."""
+    done, missing = [FLOAT], {}
     left_out = [each.strip() for each in chosen.without.split(";")]
     for name in [*PEERS, *OURS]:
         if name in left_out:
             continue
-        path = path_of(subject, name)
+        path, took = path_of(subject, name), "it is there"
         if not path.is_file():
-            print(f"  {name}: {written(subject, name, chosen)}", flush=True)
+            took = written(subject, name, chosen)
+            print(f"  {name}: {took}", flush=True)
         if path.is_file():
             keep_metadata(subject.model, path)
             done.append(name)
-    return done
+        else:
+            missing[name] = took
+    return done, missing
 
 
 def keep_metadata(source: Path, path: Path) -> None:
@@ -146,7 +157,7 @@ def written(subject: subjects.Subject, name: str, chosen: argparse.Namespace) ->
     if isinstance(found, str):
         return found
     if found.cpu_s is None:
-        return f"stopped at {found.peak_mb:.0f} MB"
+        return f"stopped at {found.peak_mb / 1024:.1f} GB"
     return f"{found.cpu_s:.1f} s CPU, {found.peak_mb:.0f} MB peak"
 
 
@@ -201,10 +212,9 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
     """Measure what a file is: bytes, int8 layers and kernels, fidelity."""
     subject = subjects.at(chosen.out)
     path = path_of(subject, chosen.file)
-    model = graph.load(path)
-    graph.infer_shapes(model)
-    counts = [graph.macs(node) or 0 for node in int8_layers(model)]
-    total = graph.size(graph.load(subject.model)).macs
+    source, model = graph.load(subject.model), graph.load(path)
+    total = macs_of_a_frame(source, source.graph)
+    int8 = macs_of_a_frame(model, int8_layers(model))
     with tempfile.TemporaryDirectory() as folder:
         rewritten = Path(folder) / "rewritten.onnx"
         session = Session(path, threads=chosen.threads, rewritten=rewritten)
@@ -217,10 +227,17 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
         found = {each.name: each.sqnr_db for each in fidelity.outputs}
     return {
         "megabytes": path.stat().st_size / 1e6,
-        "int8_macs": sum(counts) / total if total else None,
+        "int8_macs": int8 / total if total else None,
         "kernels": sum(kernels[each] for each in KERNELS),
         "sqnr_db": found,
     }
+
+
+def macs_of_a_frame(model: ir.Model, nodes: Iterable[ir.Node]) -> int:
+    """Add up the MACs of some nodes, but those that are computed once, at loading."""
+    graph.infer_shapes(model)
+    once = constant_values(model)
+    return sum(graph.macs(node) or 0 for node in nodes if node.outputs[0] not in once)
 
 
 def clock(chosen: argparse.Namespace) -> dict[str, tuple[float, ...]]:
@@ -232,7 +249,7 @@ def clock(chosen: argparse.Namespace) -> dict[str, tuple[float, ...]]:
     return {"cpu_s": lap.cpu_s, "wall_s": lap.wall_s}
 
 
-def show(rows: dict[str, Row]) -> None:
+def show(rows: dict[str, Row], missing: dict[str, str]) -> None:
     plain = rows[FLOAT]
     print("\n| file | MB | int8 MACs | int8 kernels | CPU ms | x | wall ms | x |")
     print("|---|---|---|---|---|---|---|---|")
@@ -244,6 +261,8 @@ def show(rows: dict[str, Row]) -> None:
             f" | {cpu * 1e3:.1f} | {min(plain.cpu_s) / cpu:.2f}"
             f" | {wall * 1e3:.1f} | {min(plain.wall_s) / wall:.2f} |"
         )
+    for name, reason in missing.items():
+        print(f"| {name} | {reason} | | | | | | |")
     files = [name for name in rows if name != FLOAT]
     outputs = dict.fromkeys(each for name in files for each in rows[name].sqnr_db)
     print(f"\n| SQNR, dB | {' | '.join(files)} |")
