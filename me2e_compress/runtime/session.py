@@ -1,6 +1,5 @@
 """One graph, ready to run on the CPU."""
 
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import cast
@@ -9,11 +8,10 @@ import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
 
-from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.native import REFUSALS, InvalidArgument
+from me2e_compress.runtime.opening import Weights, open_file, open_graph
 from me2e_compress.runtime.recurrence import Port, recurrence
 from me2e_compress.runtime.supported import can_run
 
@@ -90,10 +88,16 @@ class Session:
         if rewritten is not None:
             options.optimized_model_filepath = str(rewritten)
             options.add_session_config_entry(_WEIGHTS_FILE, f"{rewritten.name}.data")
+            # Weights packed for the kernels are not what is written.
+            options.add_session_config_entry("session.disable_prepacking", "1")
         self._each_run = ort.RunOptions()
         if release:
             self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
-        self._ort = _open(model, options)
+        self._lent: Weights = {}
+        if isinstance(model, ir.Model):
+            self._ort, self._lent = open_graph(model, options)
+        else:
+            self._ort = open_file(model, options)
         self.inputs = _ports(self._ort.get_inputs())
         self.outputs = _ports(self._ort.get_outputs())
         self.metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
@@ -180,43 +184,6 @@ def run_once(model: ir.Model, feeds: Mapping[str, Array]) -> dict[str, Array]:
         FramesError: an input is missing or does not fit.
     """
     return Session(model, threads=1, optimize=False).run(feeds)
-
-
-def _open(model: ir.Model | Path, options: ort.SessionOptions) -> ort.InferenceSession:
-    if isinstance(model, ir.Model):
-        if reason := can_run(model):
-            raise GraphError(reason)
-        if _needs_file(model):
-            with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:
-                path = Path(folder) / "model.onnx"
-                graph.save(model, path)
-                return _build(str(path), options)
-        return _build(ir.to_proto(model).SerializeToString(), options)
-    if not model.is_file():
-        raise GraphError(f"{model}: no such file")
-    return _build(str(model), options)
-
-
-def _needs_file(model: ir.Model) -> bool:
-    weights = [
-        value.const_value
-        for each in model.graphs()
-        for value in each.initializers.values()
-        if value.const_value is not None
-    ]
-    return (
-        any(isinstance(tensor, ir.ExternalTensor) for tensor in weights)
-        or sum(tensor.nbytes for tensor in weights) > INLINE_LIMIT_BYTES
-    )
-
-
-def _build(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
-    try:
-        return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-    except REFUSALS as error:
-        raise GraphError(
-            f"onnxruntime cannot run this graph: {_line(error)}"
-        ) from error
 
 
 def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, Port]:

@@ -1,0 +1,100 @@
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import onnxruntime as ort
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.runtime.opening import open_graph
+from me2e_compress.runtime.session import Session
+from tests.nets import net
+
+TEXT = """
+<ir_version: 9, opset_import: ["" : 17]>
+block (float[1,8,9,9] x, float[16,8,3,3] w, float[16] b, float[16] m, float[16] v,
+       float[1296,40] l) => (float[1,40] y) <int64[2] flat = {1, -1}> {
+    c = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(x, w)
+    n = BatchNormalization(c, b, b, m, v)
+    f = Reshape(n, flat)
+    y = MatMul(f, l)
+}
+"""
+
+
+@pytest.fixture
+def weights() -> dict[str, np.ndarray]:
+    random = np.random.default_rng(7)
+    shapes = {"w": (16, 8, 3, 3), "b": (16,), "m": (16,), "v": (16,), "l": (1296, 40)}
+    return {name: random.uniform(0.5, 1.0, shape) for name, shape in shapes.items()}
+
+
+@pytest.fixture
+def model(weights: dict[str, np.ndarray]) -> ir.Model:
+    return net(TEXT, weights)
+
+
+def image() -> dict[str, np.ndarray]:
+    random = np.random.default_rng(8)
+    return {"x": random.normal(size=(1, 8, 9, 9)).astype(np.float32)}
+
+
+def test_lent_weights_give_what_the_file_gives(model: ir.Model, tmp_path: Path) -> None:
+    graph.save(model, tmp_path / "m.onnx")
+    from_file = Session(tmp_path / "m.onnx", threads=1)
+
+    lent = Session(model, threads=1)
+
+    assert np.array_equal(lent.run(image())["y"], from_file.run(image())["y"])
+
+
+def test_onnxruntime_fuses_lent_weights_and_leaves_them_as_they_are(
+    model: ir.Model, weights: dict[str, np.ndarray]
+) -> None:
+    _, lent = open_graph(model, ort.SessionOptions())
+
+    assert set(lent) == {"w", "l"}  # the others are too small to be worth it
+    for name in lent:
+        kept = graph.array_of(model.graph.initializers[name])
+        assert kept is not None
+        assert np.array_equal(kept, weights[name].astype(np.float32))
+
+
+def test_a_session_outlives_its_graph(model: ir.Model) -> None:
+    session = Session(model, threads=1)
+    first = session.run(image())["y"]
+    del model
+
+    assert np.array_equal(session.run(image())["y"], first)
+
+
+def test_weights_in_a_file_are_mapped_not_copied(
+    model: ir.Model, tmp_path: Path
+) -> None:
+    graph.save(model, tmp_path / "m.onnx", external=True)
+    mapped = graph.load(tmp_path / "m.onnx")
+    assert graph.is_external(mapped)
+
+    found = Session(mapped, threads=1).run(image())["y"]
+
+    assert np.array_equal(found, Session(model, threads=1).run(image())["y"])
+
+
+def test_weights_of_a_body_that_lie_in_a_file_are_found(tmp_path: Path) -> None:
+    big = ", ".join("1" for _ in range(600))
+    text = f"""
+    <ir_version: 9, opset_import: ["" : 17]>
+    fork (bool turn, float[600] x) => (float[600] y) {{
+        y = If (turn) <
+            then_branch = twice () => (float[600] t) <float[600] o = {{{big}}}>
+                {{ t = Add(x, o) }},
+            else_branch = same () => (float[600] e) {{ e = Identity(x) }}
+        >
+    }}
+    """
+    graph.save(ir.from_onnx_text(text), tmp_path / "m.onnx", external=True)
+    mapped = graph.load(tmp_path / "m.onnx")
+    assert graph.is_external(mapped)
+    feeds = {"turn": np.array(True), "x": np.zeros(600, np.float32)}
+
+    assert np.array_equal(Session(mapped).run(feeds)["y"], np.ones(600, np.float32))
