@@ -12,7 +12,8 @@ a DequantizeLinear, whatever the kernel; what follows from constants alone is le
 on both sides, since no frame computes it. ``compare`` tells the signal to noise ratio.
 
 A tool that takes more than --limit-gb, or leaves the machine less than 2 GB, is
-stopped; one that is not installed is skipped. The table says so.
+stopped; one that is not installed is skipped; a file that onnxruntime cannot run is not
+timed. The table says so.
 """
 
 import argparse
@@ -34,6 +35,7 @@ from benchmarks.bench_calibration import has_modelopt, watch
 from benchmarks.peer import peak_mb
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import GraphError
 from me2e_compress.metrics.fidelity import compare
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
@@ -48,6 +50,7 @@ FLOAT = "float"
 PEERS = {
     "onnxruntime int8": "onnxruntime",
     "onnxruntime uint8": "onnxruntime-uint8",
+    "onnxruntime uint8, one scale a weight": "onnxruntime-uint8-tensor",
     "ModelOpt": "modelopt",
 }
 OURS: dict[str, tuple[str, Pass]] = {
@@ -100,7 +103,7 @@ def main() -> None:
         subject = subjects.make(name, chosen.out, chosen.frames)
         print(f"\n{name}, {chosen.frames} frames, {chosen.threads} threads", flush=True)
         done, missing = files(subject, chosen)
-        show(measure(subject, done, chosen), missing)
+        show(measure(subject, done, missing, chosen), missing)
 
 
 def path_of(subject: subjects.Subject, name: str) -> Path:
@@ -187,12 +190,19 @@ def make(chosen: argparse.Namespace) -> dict[str, float]:
 
 
 def measure(
-    subject: subjects.Subject, names: list[str], chosen: argparse.Namespace
+    subject: subjects.Subject,
+    names: list[str],
+    missing: dict[str, str],
+    chosen: argparse.Namespace,
 ) -> dict[str, Row]:
-    """Weigh every file, then time them in turn."""
+    """Weigh every file, then time in turn those that run."""
     rows = {}
     for name in names:
-        rows[name] = Row(**ask(own(subject, "weigh", name, chosen)))
+        found = ask(own(subject, "weigh", name, chosen))
+        if "refused" in found:
+            missing[name] = f"does not run: {found['refused']}"
+        else:
+            rows[name] = Row(**found)
     for _ in range(chosen.rounds):
         for name, row in rows.items():
             lap = ask(own(subject, "time", name, chosen))
@@ -223,7 +233,10 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
     if chosen.file != FLOAT:
         frames = CalibrationSet(subject.held_out)
         reference = Session(subject.model, threads=chosen.threads, release=True)
-        fidelity = compare(reference, session, [frames[0], frames[1]])
+        try:
+            fidelity = compare(reference, session, [frames[0], frames[1]])
+        except GraphError as error:
+            return {"refused": str(error)}
         found = {each.name: each.sqnr_db for each in fidelity.outputs}
     return {
         "megabytes": path.stat().st_size / 1e6,

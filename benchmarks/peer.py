@@ -8,7 +8,8 @@ Prints one line of JSON: seconds of CPU and of the clock, largest resident set i
 Tools: ``onnxruntime-minmax`` (calibration alone; OUT is a JSON of ranges),
 ``onnxruntime-entropy`` (the same), ``onnxruntime`` (quantize_static, symmetric, one
 scale a channel), ``onnxruntime-uint8`` (the same, activations asymmetric uint8: its
-fastest) and ``modelopt`` (quantize, max, high precision float32).
+fastest), ``onnxruntime-uint8-tensor`` (the same, one scale a weight: what it can run
+where a MatMul is of rank 3) and ``modelopt`` (quantize, max, high precision float32).
 """
 
 import argparse
@@ -31,7 +32,7 @@ from onnxruntime.quantization import (
 from onnxruntime.quantization.calibrate import create_calibrator
 
 LAYERS = ["Conv", "ConvTranspose", "Gemm", "MatMul"]
-STATIC = ("onnxruntime", "onnxruntime-uint8")
+STATIC = ("onnxruntime", "onnxruntime-uint8", "onnxruntime-uint8-tensor")
 METHODS = {
     "onnxruntime-minmax": CalibrationMethod.MinMax,
     "onnxruntime-entropy": CalibrationMethod.Entropy,
@@ -108,7 +109,7 @@ def run(chosen: argparse.Namespace) -> None:
             chosen.output,
             reader,
             quant_format=QuantFormat.QDQ,
-            per_channel=True,
+            per_channel=not chosen.tool.endswith("-tensor"),
             activation_type=QuantType.QInt8 if symmetric else QuantType.QUInt8,
             extra_options={"ActivationSymmetric": symmetric, "WeightSymmetric": True},
         )
