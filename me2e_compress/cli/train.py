@@ -24,8 +24,10 @@ def train(
     ] = False,
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
-    from me2e_compress.zoo.train.course import run  # takes torch seconds to import
-    from me2e_compress.zoo.train.curriculum import FULL, SMALL
+    # takes torch seconds to import
+    from me2e_compress.zoo.train.course import NO_LATENCY, run
+    from me2e_compress.zoo.train.curriculum import FULL
+    from me2e_compress.zoo.train.small import LATENCY, SMALL
 
     told = ""
     with progress("train") as advance:
@@ -37,7 +39,8 @@ def train(
             told = news.what
             advance(news.done, news.total, news.what)
 
-        rounds = run(SMALL if small else FULL, output, workers, tell)
+        course, latency = (SMALL, LATENCY) if small else (FULL, NO_LATENCY)
+        rounds = run(course, output, workers, tell, latency)
     columns = ("round", "routes", "driving score, %", "success rate, %")
     shown = table("driven on fresh routes after every round", *columns)
     for which, each in enumerate(rounds):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.errors import TrainingError
+from me2e_compress.evaluators.latency import FixedLatency, LatencySource
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.runtime.atomic import write_json
@@ -24,6 +25,7 @@ from me2e_compress.zoo.train.options import difference
 from me2e_compress.zoo.train.stage import LOG
 
 MANIFEST = "course.json"
+NO_LATENCY = FixedLatency()
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,11 @@ Listener = Callable[[News], None]
 
 
 def run(
-    course: Course, folder: Path, workers: int, on_news: Listener = lambda news: None
+    course: Course,
+    folder: Path,
+    workers: int,
+    on_news: Listener = lambda news: None,
+    latency: LatencySource = NO_LATENCY,
 ) -> tuple[Trained, ...]:
     """Go the whole way, or what is left of it after an interruption.
 
@@ -73,6 +79,7 @@ def run(
             ``driver.onnx``.
         workers: processes, for driving and for training.
         on_news: told how far it is.
+        latency: what a decision costs in the trials.
 
     Returns:
         What came of each round; the last driver is the one that was asked for.
@@ -83,7 +90,7 @@ def run(
     """
     course = course.on(workers)
     claim(folder, course)
-    way = _Way(course, folder, workers, on_news)
+    way = _Way(course, folder, workers, on_news, latency)
     return tuple(way.go(number, each) for number, each in enumerate(course.rounds))
 
 
@@ -91,10 +98,15 @@ class _Way:
     """What the rounds hand on to each other."""
 
     def __init__(
-        self, course: Course, folder: Path, workers: int, on_news: Listener
+        self,
+        course: Course,
+        folder: Path,
+        workers: int,
+        on_news: Listener,
+        latency: LatencySource,
     ) -> None:
         self.course, self.folder, self.workers = course, folder, workers
-        self.on_news = on_news
+        self.on_news, self.latency = on_news, latency
         self.learned, self.held_out = list[Path](), list[Path]()
         self.start: Path | None = None
         self.driver: Path | None = None
@@ -148,7 +160,7 @@ class _Way:
         tell = self._teller("finding routes to try the driver on")
         routes = trial.routes_of(what, path, self.workers, tell)
         tell = self._teller(f"{label}: trying the driver")
-        return trial.drive(driver, routes, folder, self.workers, tell)
+        return trial.drive(driver, routes, folder, self.workers, tell, self.latency)
 
     def _teller(self, what: str) -> Callable[[int, int], None]:
         return lambda done, total: self.on_news(News(what, done, total))

@@ -18,6 +18,7 @@ from me2e_compress.evaluators.highway.routes import (
 )
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.evaluators.latency import LatencySource
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.zoo.train.curriculum import Trial
@@ -62,9 +63,14 @@ def routes_of(
 
 
 def drive(
-    driver: Path, routes: tuple[Route, ...], folder: Path, workers: int, on_done: Told
+    driver: Path,
+    routes: tuple[Route, ...],
+    folder: Path,
+    workers: int,
+    on_done: Told,
+    latency: LatencySource,
 ) -> Scores:
-    """Drive a trial at no latency, or what is left of it.
+    """Drive a trial, or what is left of it.
 
     Args:
         driver: the ``.onnx``.
@@ -72,9 +78,11 @@ def drive(
         folder: for the results.
         workers: processes.
         on_done: told how many routes of how many are driven.
+        latency: what a decision costs.
 
     Raises:
-        EvaluationError: the folder is of another driver, or a process was killed.
+        EvaluationError: the folder is of another driver or latency, or a process was
+            killed.
     """
 
     def tell(progress: Progress) -> None:
@@ -82,7 +90,7 @@ def drive(
 
     who = Driver(str(driver))
     evaluator = HighwayEvaluator(
-        Job(who, Conditions(image_size=image_size_of(who.open()))),
+        Job(who, Conditions(latency, image_size=image_size_of(who.open()))),
         routes,
         folder,
         len(routes),

@@ -5,7 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from me2e_compress.zoo.train.course import run
-from me2e_compress.zoo.train.curriculum import SMALL, Course, Round
+from me2e_compress.zoo.train.curriculum import Course, Round
+from me2e_compress.zoo.train.small import LATENCY, SMALL
 
 WORKERS = 2
 
@@ -21,4 +22,5 @@ def course_of(rounds: int) -> Course:
 
 
 if __name__ == "__main__":
-    run(course_of(int(sys.argv[2])), Path(sys.argv[1]), WORKERS)
+    course = course_of(int(sys.argv[2]))
+    run(course, Path(sys.argv[1]), WORKERS, latency=LATENCY)
