@@ -15,8 +15,6 @@ from me2e_compress.zoo.highway.planner import Planner
 from me2e_compress.zoo.highway.track import Track, Tracks
 from me2e_compress.zoo.highway.world import EgoState, World, gather
 
-MEMORY = 2
-"""Of the ego: when it last looked (s), how lately it stood (1 now, 0 never)."""
 STANDING_MPS = 0.1
 STOOD_S = 5.0
 """Time constant with which standing is forgotten."""
@@ -110,7 +108,8 @@ class Highway(nn.Module):
             command: int64 [1].
             timestamp: [1] seconds since the route began.
             prev_bev: [1, N, C + 2], zeros at the start.
-            prev_memory: [1, 2], zeros at the start.
+            prev_memory: [1, 2] when it last looked (s), how lately it stood (1 now,
+                0 never); zeros at the start.
 
         Returns:
             plan [1, 6, 2], boxes [1, A, 8], scores [1, A], futures [1, A, M, 6, 2],
