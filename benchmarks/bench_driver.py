@@ -8,18 +8,25 @@ Studies, one after the other: baselines (expert, blind, the driver), ablation (e
 module away, then pairs), schemes (float to int8, at no latency and at each model's own
 under one device scale), latency (fewer and fewer decisions a second), determinism (the
 driver twice, compared byte by byte). They share OUT, so what one has driven the next
-does not drive again, and a run that was stopped goes on. Tables go to OUT/<study>/ and
-to OUT/tables.md, for docs/benchmarks.md.
+does not drive again, and a run that was stopped goes on: every route is written when
+it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, scores.csv,
+routes.csv, study.json and report.html; the tables of all are in OUT/tables.md.
 """
 
 import argparse
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
+from benchmarks.driver_records import (
+    among_conditions,
+    losers,
+    routes_csv,
+    scores_csv,
+)
 from me2e_compress import recipe
 from me2e_compress.cli.frames import record
 from me2e_compress.cli.models import model_path
@@ -28,10 +35,10 @@ from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
 from me2e_compress.passes import Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.study import (
     Condition,
     Listener,
-    Outcome,
     Scheme,
     Study,
     Timing,
@@ -54,6 +61,7 @@ LATENCY_SAMPLES = 300
 COMMAND = ("python", "-m", "benchmarks.bench_driver")
 IDEAL = Condition("ideal", "none")
 DEVICE = Condition("device", "trace")
+SLOWER = tuple(Condition(f"fps-{fps}", f"fps:{fps}") for fps in FPS)
 
 
 @dataclass(frozen=True)
@@ -112,6 +120,10 @@ class Bench:
             Timing(LATENCY_SAMPLES, baseline_median_s=FLOAT_MEDIAN_S),
         )
 
+    def untimed(self, study: Study) -> Study:
+        """Drive only: neither a clock nor a plan on held-out frames is wanted."""
+        return replace(study, held_out=None, timing=Timing())
+
 
 def baselines(bench: Bench) -> Study:
     drivers = (Scheme("expert", "expert"), Scheme("blind", "blind"))
@@ -130,13 +142,12 @@ def schemes(bench: Bench) -> Study:
 
 
 def latency(bench: Bench) -> Study:
-    slower = [Condition(f"fps-{fps}", f"fps:{fps}") for fps in FPS]
-    return bench.study("Latency", (bench.float,), (IDEAL, *slower))
+    return bench.untimed(bench.study("Latency", (bench.float,), (IDEAL, *SLOWER)))
 
 
 def determinism(bench: Bench) -> Study:
     again = Scheme("float-again", bench.model)
-    return bench.study("Determinism", (bench.float, again))
+    return bench.untimed(bench.study("Determinism", (bench.float, again)))
 
 
 STUDIES: Mapping[str, Callable[[Bench], Study]] = {
@@ -178,23 +189,44 @@ def told() -> Listener:
     return Listener(on_progress, lambda line: print(f"warning: {line}", flush=True))
 
 
-def run(bench: Bench, name: str, workers: int) -> Outcome:
+def slowed(bench: Bench) -> str:
+    """Hold fewer decisions a second against no latency, and against the most."""
+    conditions, place = (IDEAL, *SLOWER), Workplace(bench.out)
+    tables = (
+        among_conditions(place, bench.float, conditions, to) for to in conditions[:2]
+    )
+    return "\n".join(table.markdown() for table in tables)
+
+
+BESIDES: Mapping[str, Callable[[Bench], str]] = {
+    "latency": slowed,
+    "determinism": same_bytes,
+}
+"""What a study's tables do not say."""
+
+
+def run(bench: Bench, name: str, workers: int) -> None:
     """Run one study and write its tables."""
-    study = STUDIES[name](bench)
+    study, folder = STUDIES[name](bench), bench.out / name
     outcome = run_study(study, bench.out, LocalEngine(workers), told())
-    write(outcome, bench.out / name, (*COMMAND, str(bench.out), "--only", name))
+    write(outcome, folder, (*COMMAND, str(bench.out), "--only", name))
     parts = [table.markdown() for table in all_tables(outcome)]
-    if name == "determinism":
-        parts.append(same_bytes(bench))
-    print("\n".join(parts))
-    return outcome
+    if name in BESIDES:
+        parts.append(BESIDES[name](bench))
+    if len(outcome.schemes) > 1:
+        parts.append(losers(outcome))
+    text = "\n".join(parts)
+    write_bytes(folder / MARKDOWN, f"# {study.title}\n\n{text}".encode())
+    write_bytes(folder / "scores.csv", scores_csv(outcome).encode())
+    write_bytes(folder / "routes.csv", routes_csv(outcome).encode())
+    print(text)
 
 
 def collect(out: Path) -> None:
     """Put the tables of all studies that were run into one file."""
     found = [out / name / MARKDOWN for name in STUDIES]
     texts = [path.read_text("utf-8") for path in found if path.is_file()]
-    (out / MARKDOWN).write_text("\n".join(texts), "utf-8")
+    write_bytes(out / MARKDOWN, "\n".join(texts).encode())
 
 
 def frames_of(

@@ -1,0 +1,152 @@
+"""What `bench_driver` keeps beside a study's own tables: CSV, and pairs of drives."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+
+from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.metrics.differences import Difference, difference
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.study import Condition, Outcome, Scheme
+from me2e_compress.study.cells import Cell, Table, estimate_cell
+from me2e_compress.study.drives import Drive
+from me2e_compress.study.workplace import Workplace
+
+Value = float | int | str | None
+Row = Mapping[str, Value]
+
+DIGITS = 4
+"""After the point, of means and intervals."""
+
+
+def scores_csv(outcome: Outcome) -> str:
+    """One row a scheme and condition; what was not measured is empty."""
+    return _csv([_scores(outcome, drive) for drive in outcome.drives])
+
+
+def routes_csv(outcome: Outcome) -> str:
+    """One row a scheme, condition and route."""
+    return _csv(
+        [
+            {
+                "scheme": drive.scheme,
+                "condition": drive.condition,
+                "route": each.route,
+                "driving_score_percent": each.driving_score,
+                "succeeded": int(each.succeeded),
+                "ending": each.ending,
+                "infractions": " ".join(kind for kind, _ in each.infractions),
+            }
+            for drive in outcome.drives
+            for each in drive.routes
+        ]
+    )
+
+
+def among_conditions(
+    workplace: Workplace, scheme: Scheme, conditions: Iterable[Condition], to: Condition
+) -> Table:
+    """One driver under several conditions minus itself under another one.
+
+    Args:
+        workplace: Where it was driven.
+        scheme: The driver.
+        conditions: All of them were driven.
+        to: The one that is subtracted.
+    """
+    reference = _episodes(workplace, scheme, to)
+    rows = [
+        (Cell(each.name), *_cells(difference(episodes, reference)))
+        for each in conditions
+        if each != to and (episodes := _episodes(workplace, scheme, each))
+    ]
+    return Table(
+        f"{scheme.name}: difference to {to.name} on the same routes",
+        ("condition", "DS, points", "SR, points", "routes better", "routes worse"),
+        tuple(rows),
+        "Mean over routes with its 95 % interval, paired bootstrap.",
+    )
+
+
+def losers(outcome: Outcome) -> str:
+    """Name the drives that are worse than the baseline's beyond doubt."""
+    sure = [
+        f"{drive.scheme} ({drive.condition})"
+        for drive in outcome.drives
+        if drive.difference is not None
+        and (high := drive.difference.driving_score.high) is not None
+        and high < 0.0
+    ]
+    names = ", ".join(sure) or "none"
+    return f"Driving score lost, the 95 % interval without zero: {names}.\n"
+
+
+def _cells(found: Difference) -> tuple[Cell, ...]:
+    return (
+        estimate_cell(found.driving_score, signed=True),
+        estimate_cell(found.success_rate, signed=True),
+        Cell(str(found.better)),
+        Cell(str(found.worse)),
+    )
+
+
+def _episodes(
+    workplace: Workplace, scheme: Scheme, condition: Condition
+) -> list[Episode]:
+    folder = ResultsFolder.open(workplace.results(scheme, condition))
+    return list(folder.episodes().values())
+
+
+def _scores(outcome: Outcome, drive: Drive) -> Row:
+    scheme = outcome.scheme(drive.scheme)
+    return {
+        "scheme": drive.scheme,
+        "condition": drive.condition,
+        **_means(drive.scores),
+        **_losses(drive.difference),
+        "size_mb": scheme.size_mb.value,
+        "latency_p50_ms": scheme.latency_ms[50].value,
+        "latency_p99_ms": scheme.latency_ms[99].value,
+        "plan_displacement_mean_m": scheme.fidelity.mean_m.value,
+        "plan_displacement_max_m": scheme.fidelity.max_m.value,
+        "plan_sqnr_db": scheme.fidelity.plan_sqnr_db.value,
+    }
+
+
+def _means(found: Scores | None) -> Row:
+    return {
+        "routes": None if found is None else found.routes,
+        **_ends("driving_score_percent", None if not found else found.driving_score),
+        **_ends("success_rate_percent", None if not found else found.success_rate),
+        **_ends("efficiency_percent", None if not found else found.efficiency),
+        **_ends("comfort", None if not found else found.comfort),
+    }
+
+
+def _losses(found: Difference | None) -> Row:
+    return {
+        **_ends("driving_score_difference", None if not found else found.driving_score),
+        **_ends("success_rate_difference", None if not found else found.success_rate),
+        "routes_better": None if found is None else found.better,
+        "routes_worse": None if found is None else found.worse,
+    }
+
+
+def _ends(name: str, found: Estimate | None) -> Row:
+    keys = (name, f"{name}_low", f"{name}_high")
+    if found is None:
+        return dict.fromkeys(keys)
+    ends = (found.value, found.low, found.high)
+    rounded = (None if each is None else round(each, DIGITS) for each in ends)
+    return dict(zip(keys, rounded, strict=True))
+
+
+def _csv(rows: list[Row]) -> str:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return text.getvalue()
