@@ -103,11 +103,14 @@ def held_out_of(files: Sequence[Path]) -> list[Path]:
     return list(files[HELD_OUT_FIRST::HELD_OUT_EVERY] or files[:1])
 
 
+_PLANNER = Training(steps=600, rate=1.2e-3, modules=("planner",))
 FULL = Course(
     (
-        Round(100, 14, 1.0, (Training(steps=1000),)),
-        Round(200, 4, 0.3, (Training(steps=900, rate=8e-4, seed=1),)),
-        Round(300, 4, 0.15, (Training(steps=700, rate=8e-4, seed=2),)),
+        Round(100, 14, 1.0, (Training(steps=1600), _PLANNER)),
+        Round(200, 4, 0.3, (Training(steps=600, rate=8e-4, seed=1), _PLANNER)),
+        Round(300, 4, 0.25, (Training(steps=600, rate=8e-4, seed=2), _PLANNER)),
+        Round(400, 4, 0.2, (Training(steps=800, rate=8e-4, seed=3), _PLANNER), (), 2),
+        Round(500, 4, 0.15, (Training(steps=600, rate=6e-4, seed=4), _PLANNER), (), 2),
     )
 )
 """A straight way to a driver such as the one that ships; hours on four cores."""

@@ -11,7 +11,8 @@ from me2e_compress.zoo.train.losses import LampHead
 from me2e_compress.zoo.train.step import Augmentation, run, run_planner
 
 CACHED = 4
-"""The planner alone learns from so many times more samples a step."""
+"""The planner alone learns from so many times more samples a step, a part at a time:
+what every candidate would meet is large, and is needed only until it is costed."""
 
 
 class Lessons:
@@ -71,7 +72,19 @@ class Lessons:
         """Losses of the planner on what the frozen modules once said."""
         count = self.batch * self.sequences.length * CACHED
         picked = self.episodes.draw(rng, count, Sequences(length=1))[:, 0]
-        rows = self.episodes.rows(picked)
         model.eval()
         model.planner.train()
-        return run_planner(model, cache.world(picked), rows, rng, self.augmentation)
+        parts = [
+            run_planner(
+                model,
+                cache.world(part),
+                self.episodes.rows(part),
+                rng,
+                self.augmentation,
+            )
+            for part in np.array_split(picked, CACHED)
+        ]
+        return {
+            name: torch.stack([part[name] for part in parts]).mean()
+            for name in parts[0]
+        }
