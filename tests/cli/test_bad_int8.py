@@ -1,0 +1,144 @@
+"""What int8 cannot be made of: one line that says so, and no file."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph
+from tests.cli.conftest import Command, write_frames
+
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def refused(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> Refused:
+    """Compress to int8 with these words more; give the line that refuses it."""
+
+    def run(*words: str | Path, model: str = "dense.onnx") -> str:
+        out = dense / "refused.onnx"
+        done = command(
+            *("compress", dense / model, "--map", dense / "map.toml", "-o", out),
+            *words,
+        )
+        error = capsys.readouterr().err
+        assert done == 1
+        assert error.count("\n") == 1
+        assert not out.exists()
+        return error
+
+    return run
+
+
+def test_no_frames(refused: Refused, dense: Path) -> None:
+    (dense / "empty").mkdir()
+
+    assert "never made up" in refused("--scheme", "full")
+    line = refused("--scheme", "full", "--frames", dense / "empty")
+    assert "empty: holds no .npz frames" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [("radar", (4, 4), "camera is missing"), ("camera", (2, 4), r"\[2, 4\]|\(2, 4\)")],
+)
+def test_frames_of_another_model(
+    refused: Refused, dense: Path, name: str, shape: tuple[int, int], message: str
+) -> None:
+    write_frames(dense / "other", **{name: np.zeros(shape, np.float32)})
+
+    assert re.search(message, refused("--scheme", "full", "--frames", dense / "other"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[[override]]\nnodes = "/radar/*"\ndtype = "float"',
+        '[[override]]\nmodule = "radar"\ndtype = "float"',
+        '[[override]]\nreads = "radar"\ndtype = "float"',
+        '[[concat]]\nnodes = "/radar/*"\nscale = "own"',
+    ],
+)
+def test_an_override_that_matches_nothing(
+    refused: Refused, dense: Path, text: str
+) -> None:
+    (dense / "o.toml").write_text(text)
+    words = ("--scheme", "full", "--frames", dense / "frames")
+
+    line = refused(*words, "--overrides", dense / "o.toml")
+
+    assert re.search(r"'?(/radar/\*|radar)'? matches none of 2 nodes", line)
+
+
+def test_a_cache_of_another_model(
+    command: Command, refused: Refused, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved, map_ = dense / "r.json", ("--map", dense / "map.toml")
+    command("calibrate", dense / "dense.onnx", dense / "frames", *map_, "-o", saved)
+    model = graph.load(dense / "dense.onnx")
+    model.graph[1].name = "/plan_head/Other"
+    graph.save(model, dense / "other.onnx")
+    capsys.readouterr()
+
+    words = ("--scheme", "full", "--ranges", saved)
+    assert "stale: of graph" in refused(*words, model="other.onnx")
+
+
+def test_a_cache_of_other_frames(
+    command: Command, refused: Refused, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved, map_ = dense / "r.json", ("--map", dense / "map.toml")
+    command("calibrate", dense / "dense.onnx", dense / "frames", *map_, "-o", saved)
+    write_frames(dense / "later", camera=np.ones((4, 4), np.float32))
+    capsys.readouterr()
+
+    words = ("--scheme", "full", "--ranges", saved, "--frames", dense / "later")
+    assert "stale: of frames" in refused(*words)
+
+
+@pytest.mark.parametrize("wanted", ["int4", "fp8"])
+def test_formats_that_are_not_made(refused: Refused, dense: Path, wanted: str) -> None:
+    frames = ("--frames", dense / "frames")
+    (dense / "o.toml").write_text(f'[[override]]\nop = "MatMul"\ndtype = "{wanted}"')
+    how = ("--scheme", "full", *frames)
+
+    assert f"no scheme {wanted}; " in refused("--scheme", wanted, *frames)
+    assert f"no rule set {wanted}; " in refused(*how, "--rules", wanted)
+    assert f"no target {wanted}; " in refused(*how, "--target", wanted)
+    assert f"no calibration method {wanted}; " in refused(*how, "--method", wanted)
+    line = refused(*how, "--overrides", dense / "o.toml")
+    assert f"dtype {wanted}: int8 and float are what there is" in line
+
+
+@pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
+def test_a_graph_that_is_quantized_already(
+    command: Command,
+    refused: Refused,
+    dense: Path,
+    target: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ("--scheme", "full", "--frames", dense / "frames")
+    map_ = ("--map", dense / "map.toml")
+    made = command(
+        *("compress", dense / "dense.onnx", *words, *map_, "--target", target),
+        *("-o", dense / "int8.onnx"),
+    )
+    capsys.readouterr()
+
+    assert made == 0
+    line = refused(*words, model="int8.onnx")
+    assert "quantized already: " in line
+    assert "give the float graph that it was made of" in line
+
+
+def test_a_recording_that_is_cut_short(refused: Refused, dense: Path) -> None:
+    shutil.copy(dense / "dense.onnx", dense / "frames" / "000001.npz")
+
+    line = refused("--scheme", "full", "--frames", dense / "frames")
+    assert "000001.npz: not a readable" in line
