@@ -122,7 +122,7 @@ class Bench:
 
     def untimed(self, study: Study) -> Study:
         """Drive only: neither a clock nor a plan on held-out frames is wanted."""
-        return replace(study, held_out=None, timing=Timing())
+        return replace(study, held_out=None, timing=Timing(LATENCY_SAMPLES))
 
 
 def baselines(bench: Bench) -> Study:
