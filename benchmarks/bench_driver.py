@@ -7,9 +7,9 @@
 Studies, one after the other: baselines (expert, blind, the driver), ablation (each
 module away), pairs (two away), schemes (float to int8, at no latency and at each
 model's own under one device scale), latency (fewer decisions a second), determinism
-(the driver twice, compared byte by byte). They share OUT, so what one has driven the next
-does not drive again, and a run that was stopped goes on: every route is written when
-it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, scores.csv,
+(the driver twice, compared byte by byte). They share OUT, so what one has driven the
+next does not drive again, and a run that was stopped goes on: every route is written
+when it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, scores.csv,
 routes.csv, study.json and report.html; the tables of all are in OUT/tables.md.
 """
 
