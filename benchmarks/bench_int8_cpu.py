@@ -9,7 +9,7 @@ again. Latency is one frame, recurrent state at zeros: a process a file, in turn
 by round; least CPU and wall time over all rounds. Kernels are counted in the graph as
 onnxruntime's optimizer leaves it. MACs count as int8 where both operands come through
 a DequantizeLinear, whatever the kernel; what follows from constants alone is left out
-on both sides, since no frame computes it. ``compare`` tells the signal to noise ratio.
+on both sides, since no frame changes it. ``compare`` tells the signal to noise ratio.
 
 A tool that takes more than --limit-gb, or leaves the machine less than 2 GB, is
 stopped; one that is not installed is skipped; a file that onnxruntime cannot run is not
