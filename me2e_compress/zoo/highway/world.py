@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from me2e_compress.zoo.highway.config import STEPS
-from me2e_compress.zoo.highway.map import RoadMap, Route, route_of
+from me2e_compress.zoo.highway.map import RoadMap, Route
 from me2e_compress.zoo.highway.motion import Futures
 from me2e_compress.zoo.highway.track import Tracks
 
@@ -98,31 +98,6 @@ class Candidates:
         """The plan with the highest score: [B, 6, 2]."""
         first = self.logits.argmax(1)[:, None, None, None]
         return self.plans.gather(1, first.expand(-1, -1, STEPS, 2)).squeeze(1)
-
-
-def world_of(
-    tracks: Tracks, road: RoadMap, futures: Futures, occupancy: Tensor, command: Tensor
-) -> World:
-    """Gather what the planner reads; the command picks the route.
-
-    The same numbers as `Highway.world`, outside of every module.
-
-    Args:
-        tracks: of the track module.
-        road: of the map module.
-        futures: of the motion module.
-        occupancy: [B, 6, H, W] logits of the occ module.
-        command: int64 [B].
-    """
-    return gather(
-        tracks,
-        road,
-        route_of(road, command),
-        road.raster.sigmoid(),
-        futures,
-        futures.logits.softmax(-1),
-        occupancy.sigmoid(),
-    )
 
 
 def gather(

@@ -7,7 +7,6 @@ from typing import Self
 
 from me2e_compress.errors import TrainingError
 from me2e_compress.zoo.highway.config import HighwayConfig
-from me2e_compress.zoo.train.data import Sequences
 from me2e_compress.zoo.train.stage import Training
 
 HELD_OUT_FIRST, HELD_OUT_EVERY = 7, 28
@@ -114,33 +113,3 @@ FULL = Course(
     )
 )
 """A straight way to a driver such as the one that ships; hours on four cores."""
-
-_FEW = ("ControlLoss", "DynamicObjectCrossing", "HighwayCutIn")
-_BRIEF = Training(
-    steps=4,
-    batch=1,
-    workers=2,
-    save_every=2,
-    check_every=2,
-    check_count=2,
-    sequences=Sequences(length=2),
-)
-SMALL = Course(
-    (
-        Round(100, 1, 1.0, (_BRIEF,), _FEW),
-        Round(
-            200,
-            1,
-            0.5,
-            (
-                replace(_BRIEF, steps=2, seed=1),
-                replace(_BRIEF, steps=2, seed=2, modules=("planner",)),
-            ),
-            _FEW,
-            repeat=2,
-        ),
-    ),
-    Trial(routes=2, scenarios=_FEW[:2]),
-    HighwayConfig(stages=(8, 8, 16, 16), anchors=16),
-)
-"""The same way in small: it learns nothing, but every part of it runs."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of
 from me2e_compress.zoo.highway.stack import STOOD_S, Highway, Seen
-from me2e_compress.zoo.highway.world import Candidates, EgoState, World, world_of
+from me2e_compress.zoo.highway.world import Candidates, EgoState, World
 from me2e_compress.zoo.train.losses import (
     LampHead,
     map_losses,
@@ -149,9 +149,7 @@ def run(
         bev = model.bev_encoder.fuse(remember(model, now.float(), batch))
         hints = _hints(wanted, model.config.area.cells, rng, how)
         seen = model.understand(bev, model.bev_encoder.tokens(bev), middle, hints)
-        world = world_of(
-            seen.tracks, seen.road, seen.futures, seen.occupancy, wanted.command
-        )
+        world = model.world(seen, wanted.command)
         world = _without_occ(world, rng, how)
         ego = _ego(flat, rng, how)
         candidates = model.planner.consider(_settled(world), ego, wanted.command)
