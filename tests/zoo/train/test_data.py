@@ -106,6 +106,15 @@ def test_decisive_samples_are_drawn_more(tmp_path: Path) -> None:
     assert (weights / weights[0]).tolist() == pytest.approx([1, 3, 4, 2])
 
 
+def test_a_file_named_twice_is_read_once_and_drawn_twice_as_often(
+    tmp_path: Path,
+) -> None:
+    once, twice = (write(tmp_path / f"{i}.npz", arrays_of(4, 1)) for i in range(2))
+    found = Episodes([once, twice, twice], SIZE)
+    assert len(found) == 8
+    np.testing.assert_allclose(found.weights[4:], 2 * found.weights[:4])
+
+
 def test_a_line_nearby_is_drawn_more(tmp_path: Path) -> None:
     arrays = arrays_of(3)
     arrays["signals"][:, 0, 6] = (15.0, 26.0, math.nan)

@@ -22,7 +22,7 @@ from me2e_compress.zoo.train.losses import (
     track_losses,
 )
 from me2e_compress.zoo.train.losses.focal import focal
-from me2e_compress.zoo.train.losses.plan import displacement, true_harm
+from me2e_compress.zoo.train.losses.plan import displacement, doomed, true_harm
 from me2e_compress.zoo.train.losses.track import match
 from me2e_compress.zoo.train.targets import Targets, targets_of
 from tests.zoo.train.made import arrays_of
@@ -245,6 +245,13 @@ def test_choosing_a_crash_costs(wanted: Targets) -> None:
 def test_harm_is_what_really_was_there(wanted: Targets) -> None:
     harm = true_harm(candidates(wanted, away_m=-18.0), wanted, AREA)
     assert harm[0].tolist() == pytest.approx([0, 1], abs=0.1)
+
+
+def test_a_plan_into_the_car_ahead_is_no_example(wanted: Targets) -> None:
+    assert doomed(wanted).tolist() == [False, False]
+    ahead = wanted.plan[0] + torch.tensor([18.0, 0.0])  # into the car 20 m ahead
+    into = replace(wanted, plan=torch.stack([ahead, wanted.plan[1]]))
+    assert doomed(into).tolist() == [True, False]
 
 
 def test_a_red_light_is_harm_beyond_its_line(wanted: Targets) -> None:
