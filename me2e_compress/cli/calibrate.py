@@ -81,8 +81,8 @@ def calibrate(
 ) -> None:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
-    A run that was killed goes on from OUTPUT.checkpoint; compress takes the ranges by
-    --ranges.
+    A run that was killed goes on from OUTPUT.checkpoint; compress takes the
+    ranges by --ranges.
     """
     observer(method)
     _check_sources(frames, shards, foreign, part)

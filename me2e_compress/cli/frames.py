@@ -35,8 +35,8 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    For vad-tiny a synthetic world is drawn; for highway, or any ONNX file that keeps
-    the policy contract, the expert drives fresh routes of highway-env.
+    For vad-tiny a synthetic world is drawn; for highway, or any ONNX file that
+    keeps the policy contract, the expert drives fresh routes of highway-env.
     """
     with progress("frames") as advance:
         record(

@@ -68,10 +68,10 @@ def sensitivity(
 ) -> None:
     """Measure what int8 costs per module and node, and write a recipe within a limit.
 
-    The loss is how far the plan moves, metres, mean over the frames; of a model whose
-    plan is not known, the noise of its worst output relative to the signal. With
-    --drive every module, all together and the float model drive the routes too; the
-    episodes stay in RECIPE.drives, and run again, it goes on from them.
+    The loss is how far the plan moves, metres, mean over the frames; of a model
+    whose plan is not known, the noise of its worst output relative to the signal.
+    With --drive every module, all together and the float model drive the routes
+    too; the episodes stay in RECIPE.drives, and run again, it goes on from them.
     """
     if drive is None and (drive_limit is not None or adapter is not None):
         raise RecipeError("--drive-limit and --adapter say how to drive: add --drive")
