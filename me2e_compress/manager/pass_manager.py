@@ -118,7 +118,12 @@ class _Books:
         if equivalence.passed(found) or probe is None:
             return
         current, guilty = _bisect(runnable, model, probe)
-        worst = max(found.errors, key=lambda name: found.errors[name])
+        judged = [
+            name
+            for name, error in found.errors.items()
+            if error > found.tolerances[name] and name not in found.unsteady
+        ]
+        worst = max(judged, key=lambda name: found.errors[name])
         error = VerificationError(
             f"{current.name} promises the same outputs and changed {worst} by"
             f" {found.errors[worst]:.3g} of its range"

@@ -49,6 +49,8 @@ class Verification:
         errors: output name -> max|a-b|/max|a|; empty if not measured.
         tolerances: output name -> what was allowed.
         skipped: why nothing was measured, or None.
+        unsteady: outputs that rounding alone moves as far on these inputs: they
+            differ, and that says nothing about the passes.
     """
 
     passes: tuple[str, ...]
@@ -56,6 +58,7 @@ class Verification:
     errors: dict[str, float]
     tolerances: dict[str, float]
     skipped: str | None = None
+    unsteady: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

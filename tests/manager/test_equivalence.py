@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from me2e_compress.manager.equivalence import relative
+from me2e_compress.manager.equivalence import Probe, relative
+from me2e_compress.runtime.frames import Frame
 
 FLOATS = hnp.arrays(
     np.float32,
@@ -51,3 +52,14 @@ def test_a_new_non_number_is_infinite() -> None:
 
 def test_empty_outputs_are_equal() -> None:
     assert relative(np.zeros((0, 3)), np.zeros((0, 3))) == 0.0
+
+
+@given(FLOATS, st.integers(0, 9))
+def test_a_nudge_moves_the_last_places_of_floats_only(a: np.ndarray, seed: int) -> None:
+    probe = Probe([Frame(0, True, {"x": a, "n": np.arange(3)})], "recorded")
+    (frame,) = probe.nudged(seed).frames
+    moved = np.abs(frame.arrays["x"].astype(np.float64) - a)
+    assert frame.arrays["x"].dtype == a.dtype
+    assert np.all(moved <= 8 * np.abs(np.spacing(a)).astype(np.float64))
+    assert np.all(moved > 0)
+    assert np.array_equal(frame.arrays["n"], np.arange(3))

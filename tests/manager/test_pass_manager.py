@@ -87,6 +87,37 @@ def test_a_lossy_pass_starts_a_new_stretch(chain: ir.Model, context: Context) ->
     assert all(check.errors == {"y": 0.0} for check in report.verifications)
 
 
+HARD = """
+<ir_version: 9, opset_import: ["" : 17]>
+hard (float[1,8] x) => (float[1,8] choice, float[1,8] steady)
+<float[8] w = {1.5, 2.1, 3.7, 4.3, 5.9, 6.1, 7.7, 8.3}, float k = {1e8}> {
+    ["/backbone/Mul"] a = Mul(x, w)
+    ["/plan_head/Mul"] b = Mul(a, k)
+    ["/plan_head/Sin"] c = Sin(b)
+    ["/plan_head/Sign"] choice = Sign(c)
+    ["/occ_head/Tanh"] steady = Tanh(a)
+}
+"""
+"""``choice`` hangs on the last places of ``x``."""
+
+
+def test_what_rounding_alone_decides_is_not_held_against_a_pass(
+    context: Context,
+) -> None:
+    report = run(ir.from_onnx_text(HARD), context, passes.Rounds())
+    (check,) = report.verifications
+    assert check.unsteady == ("choice",)
+    assert check.errors["choice"] > 1.0
+    assert 0.0 < check.errors["steady"] < check.tolerances["steady"]
+
+
+def test_what_is_steady_is_judged_beside_it(context: Context) -> None:
+    suspects = (passes.Rounds(), passes.TurnsTanhIntoSigmoid())
+    words = r"^turns-tanh-into-sigmoid promises .* changed steady by"
+    with pytest.raises(VerificationError, match=words):
+        run(ir.from_onnx_text(HARD), context, *suspects)
+
+
 def test_the_guilty_pass_is_found_among_others(
     chain: ir.Model, context: Context
 ) -> None:
