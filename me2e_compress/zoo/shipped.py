@@ -13,7 +13,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.zoo.stacks import STACKS
 
 WEIGHTS = Path(__file__).with_name("weights")
-"""One ``NAME.onnx`` and one ``NAME.json`` a model."""
+"""One ``NAME.onnx``, ``NAME.pt`` and ``NAME.json`` a model."""
 
 SHIPPED = tuple(stack.name for stack in STACKS.values() if stack.trained)
 """Names of the models."""
@@ -34,11 +34,13 @@ class TrainingData(pydantic.BaseModel):
 
 
 class ModelCard(pydantic.BaseModel):
-    """What is known of a shipped model; the file beside it must have its digest.
+    """What is known of a shipped model; the files beside it must have its digests.
 
     Attributes:
         sha256: of the ``.onnx``, lower-case hex.
         bytes: of the ``.onnx``.
+        checkpoint_sha256: of the ``.pt`` with the same weights in torch; None: there is
+            none.
         parameters: trained numbers in it.
         seed: of the initial weights and of everything drawn in training.
         data: what it learned from.
@@ -53,6 +55,7 @@ class ModelCard(pydantic.BaseModel):
 
     sha256: str = pydantic.Field(pattern="^[0-9a-f]{64}$")
     bytes: int = pydantic.Field(gt=0)
+    checkpoint_sha256: str | None = pydantic.Field(None, pattern="^[0-9a-f]{64}$")
     parameters: int = pydantic.Field(gt=0)
     seed: int
     data: TrainingData
@@ -103,10 +106,31 @@ def shipped(name: str, folder: Path | None = None) -> Path:
     return _checked(name, folder or WEIGHTS)
 
 
+def checkpoint(name: str, folder: Path | None = None) -> Path:
+    """Give the weights of a shipped model as training goes on from them.
+
+    It is a file of `me2e_compress.zoo.train.checkpoint.Start`.
+
+    Args:
+        name: one of `SHIPPED`.
+        folder: as in `shipped`.
+
+    Raises:
+        GraphError: no such model, or its checkpoint or card is missing or altered.
+    """
+    folder = folder or WEIGHTS
+    expected = card(name, folder).checkpoint_sha256
+    if expected is None:
+        raise GraphError(f"{name}: its card knows no checkpoint")
+    return _same(folder / f"{name}.pt", expected)
+
+
 @functools.cache
 def _checked(name: str, folder: Path) -> Path:
-    expected = card(name, folder).sha256
-    path = folder / f"{name}.onnx"
+    return _same(folder / f"{name}.onnx", card(name, folder).sha256)
+
+
+def _same(path: Path, expected: str) -> Path:
     try:
         found = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:

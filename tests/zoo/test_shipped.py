@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo import shipped as room
-from me2e_compress.zoo.shipped import ModelCard, card, copy, shipped
+from me2e_compress.zoo.shipped import ModelCard, card, checkpoint, copy, shipped
 from tests.stand_in import write_shipped
 
 
@@ -107,3 +107,26 @@ def test_a_copy_has_the_same_bytes(weights: Path, tmp_path: Path) -> None:
 def test_the_shipped_file_is_not_overwritten(weights: Path) -> None:
     with pytest.raises(GraphError, match="is the shipped model"):
         copy("highway", weights / "highway.onnx", weights)
+
+
+def test_the_checkpoint_is_the_one_of_the_card() -> None:
+    path = checkpoint("highway")
+
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert path.name == "highway.pt"
+    assert card("highway").checkpoint_sha256 == digest
+
+
+def test_an_altered_checkpoint_is_refused(weights: Path) -> None:
+    path = weights / "highway.json"
+    told = {**json.loads(path.read_text()), "checkpoint_sha256": "0" * 64}
+    path.write_text(json.dumps(told))
+    (weights / "highway.pt").write_bytes(b"other weights")
+
+    with pytest.raises(GraphError, match=r"highway\.pt: altered or incomplete: sha256"):
+        checkpoint("highway", weights)
+
+
+def test_a_card_without_a_checkpoint_says_so(weights: Path) -> None:
+    with pytest.raises(GraphError, match="highway: its card knows no checkpoint"):
+        checkpoint("highway", weights)

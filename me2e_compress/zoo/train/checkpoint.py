@@ -2,7 +2,7 @@
 
 import os
 import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +13,28 @@ from torch import Tensor, nn
 from me2e_compress.errors import TrainingError
 
 Weights = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What a stage begins with: of a `Checkpoint`, or of a file that holds no more.
+
+    Attributes:
+        mean: weights and buffers that drive.
+        lamps: of the extra head.
+    """
+
+    mean: Weights
+    lamps: Weights
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read the two of a checkpoint, or of the file that ships.
+
+        Raises:
+            TrainingError: it lacks one.
+        """
+        return cls(**_read(path, [field.name for field in fields(cls)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +64,7 @@ class Checkpoint:
         Raises:
             TrainingError: it is none.
         """
-        try:
-            found = torch.load(path, weights_only=True)
-            return cls(**{field.name: found[field.name] for field in fields(cls)})
-        except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
-            first = str(error).splitlines()[0] if str(error) else "it is empty"
-            raise TrainingError(f"{path}: not a checkpoint: {first}") from error
-        except (KeyError, IndexError, TypeError) as error:
-            raise TrainingError(
-                f"{path}: not a checkpoint of training: it lacks {error}"
-            ) from error
+        return cls(**_read(path, [field.name for field in fields(cls)]))
 
     def save(self, path: Path) -> None:
         """Write it in one step.
@@ -68,6 +81,19 @@ class Checkpoint:
         except (OSError, RuntimeError) as error:
             first = str(error).splitlines()[0]
             raise TrainingError(f"{path}: cannot be written: {first}") from error
+
+
+def _read(path: Path, names: Sequence[str]) -> dict[str, Any]:
+    try:
+        found = torch.load(path, weights_only=True)
+        return {name: found[name] for name in names}
+    except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
+        first = str(error).splitlines()[0] if str(error) else "it is empty"
+        raise TrainingError(f"{path}: not a checkpoint: {first}") from error
+    except (KeyError, IndexError, TypeError) as error:
+        raise TrainingError(
+            f"{path}: not a checkpoint of training: it lacks {error}"
+        ) from error
 
 
 def fit(module: nn.Module, weights: Weights, path: Path) -> None:

@@ -16,7 +16,7 @@ from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.export import write
 from me2e_compress.zoo.highway.stack import Highway
 from me2e_compress.zoo.train import trial
-from me2e_compress.zoo.train.checkpoint import Checkpoint, fit
+from me2e_compress.zoo.train.checkpoint import Start, fit
 from me2e_compress.zoo.train.curriculum import Course, Round, held_out_of
 from me2e_compress.zoo.train.episodes import Collection, collect
 from me2e_compress.zoo.train.log import Log
@@ -173,7 +173,7 @@ def load(checkpoint: Path, config: HighwayConfig) -> Highway:
         TrainingError: it is no checkpoint, or one of another model.
     """
     model = Highway(config)
-    fit(model, Checkpoint.load(checkpoint).mean, checkpoint)
+    fit(model, Start.load(checkpoint).mean, checkpoint)
     return model.eval()
 
 

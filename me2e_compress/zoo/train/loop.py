@@ -43,7 +43,8 @@ def train(
         config: sizes of the model.
         files: episodes to learn from; what is named twice is drawn twice as often.
         held_out: episodes that are only looked at.
-        start: checkpoint to begin with; None begins with random weights.
+        start: checkpoint to begin with, or the one that ships
+            (`me2e_compress.zoo.shipped.checkpoint`); None begins with random weights.
         folder: gets ``last.pt`` and ``log.jsonl``.
         on_step: told now and then how many steps of how many are done.
 

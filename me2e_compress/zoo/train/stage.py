@@ -15,7 +15,7 @@ from me2e_compress.evaluators.highway.cameras import CameraRig
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.stack import Highway
 from me2e_compress.zoo.train.check import validate
-from me2e_compress.zoo.train.checkpoint import Checkpoint, fit
+from me2e_compress.zoo.train.checkpoint import Checkpoint, Start, fit
 from me2e_compress.zoo.train.data import Episodes, Sequences
 from me2e_compress.zoo.train.descent import Descent, Mean
 from me2e_compress.zoo.train.frenet import anchors_of
@@ -76,7 +76,8 @@ class Task:
         config: sizes of the model.
         files: episodes to learn from.
         held_out: episodes that are only looked at.
-        start: checkpoint to begin with; None begins with random weights.
+        start: checkpoint to begin with, or what is left of one (`Start`); None begins
+            with random weights.
         folder: gets ``last.pt`` and ``log.jsonl``.
     """
 
@@ -126,7 +127,7 @@ class Stage:
 
     def _begin(self, episodes: Episodes) -> None:
         if self.task.start is not None:
-            found = Checkpoint.load(self.task.start)
+            found = Start.load(self.task.start)
             fit(self.model, found.mean, self.task.start)
             fit(self.lamps, found.lamps, self.task.start)
             return
