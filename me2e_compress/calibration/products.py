@@ -52,6 +52,19 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     return Extent(rows, columns, left[-1])
 
 
+def is_one_matrix(product: ir.Node) -> bool:
+    """Say whether a MatMul multiplies every row by one and the same matrix.
+
+    Its right operand is [K, N] then, or [1, ..., K, N] of no more dimensions than the
+    left one has: without the leading ones it gives the same.
+    """
+    left, right = product.inputs[0], static_shape(product.inputs[1])
+    if right is None or len(right) < 2:
+        return False
+    rank = 0 if left is None or left.shape is None else len(left.shape)
+    return len(right) == 2 or (math.prod(right[:-2]) == 1 and len(right) <= rank)
+
+
 def _sides(right: tuple[int, ...]) -> tuple[int, int]:
     """Give N and K of a right operand; a vector is one column."""
     return (right[-1], right[-2]) if len(right) > 1 else (1, math.prod(right))

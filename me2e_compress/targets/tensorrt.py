@@ -2,9 +2,10 @@
 
 The rules (TensorRT 10 developer guide, "Explicit quantization", and what its ONNX
 parser accepts): zero points are 0; activations have one scale a tensor, weights one a
-channel; weights are stored as int8 behind a DequantizeLinear; biases and outputs have
-no QDQ, and of an Add only the residual branch has; every int8 reader of a tensor shares
-one pair, every float reader reads the tensor itself.
+channel, batches of matrices one; weights are stored as int8 behind a
+DequantizeLinear; biases and outputs have no QDQ, and of an Add only the residual branch
+has; every int8 reader of a tensor shares one pair, every float reader reads the tensor
+itself.
 """
 
 import numpy as np
@@ -74,7 +75,7 @@ class _Writer:
         self._graph = where
         self._ranges = ranges
         self._activations: dict[str, ir.Value] = {}
-        self._weights: dict[tuple[str, int], ir.Value] = {}
+        self._weights: dict[tuple[str, int | None], ir.Value] = {}
         self._zero: ir.Value | None = None
 
     def apply(self, node: ir.Node, decision: Decision, weight: Weight | None) -> None:
@@ -116,10 +117,12 @@ class _Writer:
             inputs = [
                 self._constant(weight.integers, f"{name}_int8"),
                 self._constant(scales, f"{name}_scale"),
-                self._constant(np.zeros(len(scales), np.int8), f"{name}_zero"),
+                self._constant(np.zeros(scales.shape, np.int8), f"{name}_zero"),
             ]
             dequantize = _node("DequantizeLinear", inputs, name, like, reader)
-            dequantize.attributes.add(ir.AttrInt64("axis", weight.axis))
+            dequantize.outputs[0].shape = ir.Shape(weight.integers.shape)
+            if weight.axis is not None:
+                dequantize.attributes.add(ir.AttrInt64("axis", weight.axis))
             self._graph.insert_before(reader, dequantize)
             self._weights[key] = dequantize.outputs[0]
         return self._weights[key]

@@ -20,15 +20,16 @@ class Weight:
 
     Attributes:
         name: what its initializers are called after.
-        integers: int8, of the weight's shape.
-        scales: float32 [channels], or [1] for one step everywhere.
-        axis: which axis of the weight the channels run along.
+        integers: int8, of the weight's shape; of a MatMul's [1, ..., K, N] that is one
+            matrix for all its rows, [K, N].
+        scales: float32 [channels], or [] for one step everywhere.
+        axis: which axis of the integers the channels run along; None without channels.
     """
 
     name: str
     integers: npt.NDArray[np.int8]
     scales: npt.NDArray[np.float32]
-    axis: int
+    axis: int | None
 
 
 def weights_of(model: ir.Model, chosen: Iterable[Decision]) -> dict[str, Weight]:
@@ -60,14 +61,19 @@ def weights_of(model: ir.Model, chosen: Iterable[Decision]) -> dict[str, Weight]
     return {output: quantized[layer] for output, layer in layers.items()}
 
 
-def _planned(node: ir.Node, decision: Decision, index: int) -> tuple[ir.Value, int]:
+def _planned(
+    node: ir.Node, decision: Decision, index: int
+) -> tuple[ir.Value, int | None]:
+    """Give a weight and the axis of its channels; -1 is the last axis of a MatMul's."""
     weight, axis = node.inputs[index], decision.axis
-    if weight is None or axis is None:
+    if weight is None:
         raise PreconditionError(f"{decision.node} is planned as a layer without weight")
-    return weight, axis
+    return weight, -1 if axis is not None and node.op_type == "MatMul" else axis
 
 
-def _quantize(value: ir.Value, axis: int, computed: Mapping[str, Array]) -> Weight:
+def _quantize(
+    value: ir.Value, axis: int | None, computed: Mapping[str, Array]
+) -> Weight:
     name = str(value.name)
     if name in computed:
         array = computed[name]
@@ -75,5 +81,7 @@ def _quantize(value: ir.Value, axis: int, computed: Mapping[str, Array]) -> Weig
         array = value.const_value.numpy()
     else:
         raise PreconditionError(f"{name} is planned as a weight, but is none")
+    if axis == -1:
+        array, axis = array.reshape(array.shape[-2:]), 1
     integers, scales = quantize_weight(array.astype(np.float32), axis)
     return Weight(name, integers, scales, axis)

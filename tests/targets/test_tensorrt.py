@@ -36,6 +36,7 @@ SHAPES = {
     "conv": (6, 3, 3, 3), "bias": (6,), "up": (6, 2, 2, 2), "right": (4, 7),
     "turned": (7, 4),
 }  # fmt: skip
+PARTS = ("int8", "scale", "zero")
 AXES = {"conv": 0, "up": 1, "right": 1, "turned": 0}
 
 
@@ -260,3 +261,49 @@ def test_what_a_concat_joins_is_on_one_scale() -> None:
     assert [float(each) for each in scales if each is not None] == [
         np.float32(4 / 127)
     ] * 2
+
+
+BATCHED = """
+<ir_version: 9, opset_import: ["" : 17]>
+batched (float[3,4,32] x, float[2,32] t, float[1,32,16] one, float[3,32,16] many,
+         float[1,32,8] lends) => (float[3,4,16] a, float[3,4,16] b, float[1,2,8] c) {
+    a = MatMul(x, one)
+    b = MatMul(x, many)
+    c = MatMul(t, lends)
+}
+"""
+
+
+def batched() -> ir.Model:
+    generator = np.random.default_rng(5)
+    shapes = {"one": (1, 32, 16), "many": (3, 32, 16), "lends": (1, 32, 8)}
+    return net(BATCHED, {n: generator.standard_normal(s) for n, s in shapes.items()})
+
+
+def test_one_matrix_has_scales_by_column_and_a_batch_of_them_one_scale() -> None:
+    stored = placed(batched()).graph.initializers
+
+    shapes = {
+        name: tuple(graph.static_shape(stored[f"{name}_{what}"]) for what in PARTS)
+        for name in ("one", "many", "lends")
+    }
+    assert shapes == {
+        "one": ((32, 16), (16,), (16,)),
+        "many": ((3, 32, 16), (), ()),
+        "lends": ((1, 32, 8), (), ()),
+    }
+
+
+def test_products_by_batches_run_with_all_of_onnxruntimes_fusions() -> None:
+    generator = np.random.default_rng(6)
+    fed = {
+        "x": generator.standard_normal((3, 4, 32)).astype(np.float32),
+        "t": generator.standard_normal((2, 32)).astype(np.float32),
+    }
+
+    got, want = run_once(placed(batched()), fed), run_once(batched(), fed)
+
+    for name, exact in want.items():
+        assert got[name].shape == exact.shape
+        off = got[name].astype(np.float64) - exact.astype(np.float64)
+        assert np.abs(off).max() < 0.6

@@ -29,7 +29,8 @@ class Decision:
         activations: which inputs get an activation scale. Of an Add it is one, the
             residual branch: the other comes out of a convolution that it is fused with.
         weight: which input is stored as int8; None where none is.
-        axis: of the weight's per-channel scales.
+        axis: of the weight's per-channel scales; None for one scale in all, as
+            a batch of matrices has.
         borderline: what was close about it; empty if nothing was.
     """
 

@@ -14,6 +14,7 @@ from me2e_compress.calibration.plan.decision import (
 from me2e_compress.calibration.plan.groups import find_groups
 from me2e_compress.calibration.plan.overrides import NONE, Overrides, Pins
 from me2e_compress.calibration.plan.residual import residuals
+from me2e_compress.calibration.products import is_one_matrix
 from me2e_compress.calibration.rules import (
     AttentionLength,
     Facts,
@@ -104,7 +105,7 @@ def _decide(
         reason=reason,
         activations=activations,
         weight=weight,
-        axis=None if weight is None else channel_axis(node),
+        axis=None if weight is None else _scale_axis(node),
         borderline=close,
     )
 
@@ -146,3 +147,14 @@ def channel_axis(node: ir.Node) -> int:
     weight = node.inputs[1]
     rank = 2 if weight is None or weight.shape is None else len(weight.shape)
     return rank - 1
+
+
+def _scale_axis(node: ir.Node) -> int | None:
+    """Give the axis of a weight's scales; None where it has one scale in all.
+
+    Kernels apply the scales of output channels to the result of one product: that of a
+    MatMul by a batch of matrices, or by a vector, has no such channels.
+    """
+    if node.op_type == "MatMul" and not is_one_matrix(node):
+        return None
+    return channel_axis(node)

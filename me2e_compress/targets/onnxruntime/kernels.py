@@ -6,7 +6,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.graph import static_shape
+from me2e_compress.calibration.products import is_one_matrix
 
 MOVES = frozenset(
     {
@@ -35,9 +35,12 @@ def is_layer(node: ir.Node) -> bool:
         return _is_plain_gemm(node)
     if node.op_type != "MatMul":
         return False
-    left, right = node.inputs[0], static_shape(node.inputs[1])
-    rank = 0 if left is None or left.shape is None else len(left.shape)
-    return rank >= 2 and right is not None and len(right) == 2
+    return rank_of(node.inputs[0]) >= 2 and is_one_matrix(node)
+
+
+def rank_of(value: ir.Value | None) -> int:
+    """Give how many dimensions a value has; 0 where that is not known."""
+    return 0 if value is None or value.shape is None else len(value.shape)
 
 
 def _is_plain_gemm(node: ir.Node) -> bool:
@@ -53,7 +56,8 @@ def _is_plain_gemm(node: ir.Node) -> bool:
 def channel_axis(node: ir.Node) -> int:
     """Give the axis of a weight that its scales must run along.
 
-    Conv [M, C/g, ...]: 0. Gemm [K, N]: 1, or 0 where it is transposed. MatMul: 1.
+    Conv [M, C/g, ...]: 0. Gemm [K, N]: 1, or 0 where it is transposed. MatMul [K, N]:
+    1, leading ones not counted.
     """
     if node.op_type == "Gemm":
         return 0 if node.attributes.get_int("transB", 0) else 1
@@ -85,8 +89,7 @@ def biased_end(product: ir.Node) -> ir.Node | None:
     """Give the Add that puts a bias on a MatMul, if nothing else reads the product."""
     value = product.outputs[0]
     readers = list(value.consumers())
-    left = product.inputs[0]
-    rank = 0 if left is None or left.shape is None else len(left.shape)
+    rank = rank_of(product.inputs[0])
     if value.is_graph_output() or len(readers) != 1 or readers[0].op_type != "Add":
         return None
     addition = readers[0]

@@ -62,7 +62,8 @@ def with_bias(
     scales = np.maximum(weight.scales, least).astype(np.float32)
     if (scales > weight.scales).any():
         shape = [1] * weight.integers.ndim
-        shape[weight.axis] = -1
+        if weight.axis is not None:
+            shape[weight.axis] = -1
         ratio = (weight.scales / scales).reshape(shape)
         coarse = np.rint(weight.integers * ratio).astype(np.int8)
         weight = Weight(f"{weight.name}_coarse", coarse, scales, weight.axis)

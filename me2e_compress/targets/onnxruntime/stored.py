@@ -42,7 +42,13 @@ def step_of(node: ir.Node) -> Floats:
 
 
 def weight_of(layer: ir.Node) -> Weight | None:
-    """Read the weight of a layer; None if it is not quantized.
+    """Read the weight of a layer; None if it is not quantized for its kernel.
+
+    A MatMul by [1, ..., K, N] reads [K, N]. onnxruntime's own quantizer, and so
+    ModelOpt, puts scales along axis 1 of such a weight, which is K: no kernel takes it.
+
+    Args:
+        layer: one that has an int8 kernel.
 
     Raises:
         PreconditionError: it is quantized, but not on the symmetric int8 grid with one
@@ -58,6 +64,10 @@ def weight_of(layer: ir.Node) -> Weight | None:
     if integers is None:
         return None
     along = node.attributes.get_int("axis", 1) % integers.ndim
+    if layer.op_type == "MatMul" and integers.ndim > 2:
+        if step.size > 1 and along != integers.ndim - 1:
+            return None
+        integers, along = integers.reshape(integers.shape[-2:]), axis
     if step.size > 1 and (along != axis or step.shape != (integers.shape[axis],)):
         raise PreconditionError(
             f"{node.name} has scales of shape {list(step.shape)} along axis {along},"

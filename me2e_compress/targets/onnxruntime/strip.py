@@ -7,6 +7,7 @@ from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.rewrite import can_replace
 from me2e_compress.targets.onnxruntime.draft import Draft
+from me2e_compress.targets.onnxruntime.kernels import is_layer
 from me2e_compress.targets.onnxruntime.stored import (
     DEQUANTIZE,
     QUANTIZE,
@@ -21,7 +22,8 @@ LAYERS = ("Conv", "Gemm", "MatMul")
 def draft_of_qdq(model: ir.Model) -> Draft:
     """Copy a quantized graph without the pairs of its activations.
 
-    A layer is to be int8 if both its input and its weight came through a pair: weights
+    A layer is to be int8 if both its input and its weight came through a pair, and
+    there is a kernel for it: weights
     stored as int8 or, as ModelOpt writes them, in float behind a QuantizeLinear. Biases
     that are stored as int32 become float again.
 
@@ -46,12 +48,12 @@ def draft_of_qdq(model: ir.Model) -> Draft:
         for node in copy.graph
         if node.op_type in LAYERS and _maker(node.inputs[0]) in pairs
     ]
-    weights = {node: weight_of(node) for node in layers}
     for node in layers:
         bias = bias_of(node)
         if bias is not None:
             name = f"{node.inputs[2].name}_stored" if node.inputs[2] else ""
             node.replace_input_with(2, graph.add_constant(copy.graph, bias, name))
+    weights = {node: weight_of(node) for node in layers if is_layer(node)}
     for node, value in pairs.items():
         if can_replace(node.outputs[0], value):
             graph.replace_value(node.outputs[0], value)

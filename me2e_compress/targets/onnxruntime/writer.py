@@ -66,7 +66,7 @@ class Writer:
         name: str,
         integers: npt.NDArray[np.generic],
         scales: npt.NDArray[np.float32],
-        axis: int,
+        axis: int | None,
         reader: ir.Node,
     ) -> ir.Value:
         """Store integers and give the float tensor they stand for, before its reader.
@@ -75,14 +75,14 @@ class Writer:
             name: what the new names begin with.
             integers: int8 or int32.
             scales: float32 [channels], or a scalar for one step everywhere.
-            axis: which axis of the integers the channels run along.
+            axis: which axis of the integers the channels run along; None without.
             reader: the node that will read it.
         """
         zeros = np.zeros(scales.shape, integers.dtype)
         stored = self.constant(integers, f"{name}_{integers.dtype}")
         steps = self.constant(scales, f"{name}_scale")
         inputs = [stored, steps, self.constant(zeros, f"{name}_zero")]
-        axes = {"axis": axis} if scales.ndim else None
+        axes = None if axis is None else {"axis": axis}
         label = f"{reader.name or reader.outputs[0].name}/{name}_float"
         node = self.node("DequantizeLinear", inputs, label, [reader], axes)
         node.outputs[0].shape = ir.Shape(integers.shape)

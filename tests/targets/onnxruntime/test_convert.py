@@ -16,6 +16,8 @@ from tests.targets.onnxruntime.lowered import (
     Feeds,
     block,
     calibrated,
+    drawn,
+    feeds,
     kernels,
     linear,
     lowered,
@@ -201,3 +203,44 @@ def test_a_float_graph_is_refused() -> None:
 def test_a_lowered_graph_is_refused() -> None:
     with pytest.raises(PreconditionError, match="quantizes to uint8"):
         convert(lowered(block()))
+
+
+BATCHED = """
+<ir_version: 9, opset_import: ["" : 17]>
+batched (float[3,4,32] x, float[%s] w) => (float[3,4,16] y) { y = MatMul(x, w) }
+"""
+
+
+@pytest.mark.parametrize(("size", "int8"), [((1, 32, 16), 1), ((3, 32, 16), 0)])
+def test_products_by_batches_of_matrices_are_lowered_as_far_as_kernels_go(
+    size: tuple[int, ...], int8: int
+) -> None:
+    text = BATCHED % ",".join(map(str, size))
+    model, fed = drawn(text, {"w": size}), feeds(4, x=(3, 4, 32))
+    source = placed(model, fed)
+
+    result = converted(source, fed)
+
+    assert kernels(result)["MatMulIntegerToFloat"] == int8
+    assert sqnr_db(ran(model, fed)["y"], ran(result, fed)["y"]) > 30
+
+
+def test_a_matrix_with_scales_along_its_rows_stays_float() -> None:
+    text = (
+        PAIRED.replace(
+            "float[4,6] x) => (float[4,3] y)", "float[1,4,6] x) => (float[1,4,3] y)"
+        )
+        .replace("float[6,3] w", "float[1,6,3] w")
+        .replace(
+            "float[3] ws = {0.01, 0.02, 0.03}", "float[6] ws = {1., 1., 1., 1., 1., 1.}"
+        )
+        .replace("int8[3] wz = {0, 0, 0}", "int8[6] wz = {0, 0, 0, 0, 0, 0}")
+    )
+    source = ir.from_onnx_text(text)
+    x = np.random.default_rng(0).uniform(-0.3, 0.3, (1, 4, 6)).astype(np.float32)
+
+    result = convert(source)
+
+    assert kernels(result)["MatMul"] == 1
+    want, got = ran(source, {"x": x}, optimize=False), ran(result, {"x": x})
+    assert sqnr_db(want["y"], got["y"]) > 20

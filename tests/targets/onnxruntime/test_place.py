@@ -17,6 +17,8 @@ from tests.targets.onnxruntime.lowered import (
     TOKENS,
     block,
     calibrated,
+    drawn,
+    feeds,
     kernels,
     linear,
     lowered,
@@ -144,3 +146,19 @@ def test_a_missing_range_is_named() -> None:
 
     with pytest.raises(FramesError, match=r"4 tensors have no range.* a2.*calibrated"):
         place(model, plan, some)
+
+
+def test_a_matrix_with_leading_ones_is_one_matrix_with_a_bias() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    biased (float[2,4,32] x, float[1,32,16] w, float[16] b) => (float[2,4,16] y) {
+        m = MatMul(x, w)
+        y = Add(m, b)
+    }
+    """
+    model, fed = drawn(text, {"w": (1, 32, 16), "b": (16,)}), feeds(2, x=(2, 4, 32))
+
+    result = calibrated(model, fed)
+
+    assert kernels(result)["QGemm"] == 1
+    assert sqnr_db(ran(model, fed)["y"], ran(result, fed)["y"]) > 30
