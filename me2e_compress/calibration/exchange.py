@@ -18,6 +18,9 @@ from me2e_compress.calibration.ranges import IMPORTED, Ranges
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 
+TABLE_FILES = ("calibration.flatbuffers", "calibration.json", "calibration.cache")
+"""What an onnxruntime table is made of, in a folder."""
+
 _VERSION = "TRT-101000"
 """What the cache claims to be written by; TensorRT 10 reads caches of this form."""
 

@@ -12,6 +12,7 @@ from me2e_compress import graph, recipe
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.exchange import (
+    TABLE_FILES,
     read_foreign,
     write_onnxruntime_table,
     write_tensorrt_cache,
@@ -24,6 +25,7 @@ from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.cli.console import console, print_json, progress
 from me2e_compress.cli.job import run_on
 from me2e_compress.cli.models import model_path
+from me2e_compress.cli.output import check_folder, check_output
 from me2e_compress.errors import FramesError, PreconditionError, RecipeError
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
@@ -86,6 +88,11 @@ def calibrate(
     """
     observer(method)
     _check_sources(frames, shards, foreign, part)
+    checkpoint = output.with_name(output.name + ".checkpoint")
+    read = (model, frames, recipe_name, module_map, foreign, *(shards or ()))
+    check_output([output, checkpoint, tensorrt_cache], read)
+    if onnxruntime_table is not None:
+        check_folder(onnxruntime_table, read, TABLE_FILES)
     passes = _before_int8(recipe.load(recipe_name))
     ready, tensors = prepare(model, module_map, passes)
     if foreign is not None:
@@ -96,7 +103,6 @@ def calibrate(
         found.check(model=graph.digest(ready), tensors=tensors, method=method)
     else:
         chosen = _choose(model, frames or Path(), count, seed, part)
-        checkpoint = output.with_name(output.name + ".checkpoint")
         calibrator = Calibrator(method, threads, checkpoint=checkpoint)
         with progress("calibrate") as advance:
             seen = calibrator.collect(

@@ -13,8 +13,9 @@ from me2e_compress.cli.console import (
     print_json,
 )
 from me2e_compress.cli.int8 import Int8Options
-from me2e_compress.cli.job import check_output, choose, run, write
+from me2e_compress.cli.job import choose, run, write, written
 from me2e_compress.cli.models import model_path
+from me2e_compress.cli.output import check_output, files_of
 from me2e_compress.cli.tables import notes, steps_table, verification_table
 
 
@@ -63,9 +64,10 @@ def compress(
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report."""
     source = model_path(model)
-    check_output(source, output)
     int8 = Int8Options(scheme, rules, target, overrides, ranges, method)
     chosen = choose(recipe_name, passes, int8)
+    read = (source, recipe_name, frames, module_map, *files_of(chosen))
+    check_output(written(output), read)
     report = run(source, chosen, frames, module_map, seed, verify_frames, output.parent)
     report_path = write(report, source, output)
     if as_json:

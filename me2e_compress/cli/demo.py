@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli.console import console
 from me2e_compress.cli.extras import need_closed_loop
+from me2e_compress.cli.output import check_folder
 from me2e_compress.zoo.shipped import SHIPPED
 
 
@@ -29,6 +30,7 @@ def demo(
     The trained driver is compressed and drives before and after; vad-tiny, at its
     published size and with random weights, is compressed, compared and timed.
     """
+    check_folder(out, ())
     out.mkdir(parents=True, exist_ok=True)
     if stack in SHIPPED:
         need_closed_loop("what the demo drives with")

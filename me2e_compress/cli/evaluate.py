@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from me2e_compress.cli.console import console, errors, number, print_json, progress
 from me2e_compress.cli.drivers import driver_of
+from me2e_compress.cli.output import check_folder
 from me2e_compress.cli.score import scores_table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.cameras import Weather
@@ -17,6 +18,7 @@ from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
 from me2e_compress.evaluators.highway.render import render
+from me2e_compress.evaluators.highway.results import MANIFEST
 from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
@@ -55,6 +57,8 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on."""
+    trace = latency.removeprefix("trace:")
+    check_folder(output, (policy, routes, trace, adapter), (MANIFEST,))
     picked, set_size = routes_named(routes)
     shown = None if show is None else pick_routes(picked, show)
     driver = driver_of(policy, adapter)

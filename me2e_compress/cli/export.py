@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from me2e_compress.cli.console import console, file_bytes, megabytes
+from me2e_compress.cli.output import check_output
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
@@ -28,6 +29,8 @@ def export(
     ] = None,
 ) -> None:
     """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver."""
+    if output.parent.is_dir():  # else it is made
+        check_output([output], ())
     if stack in shipped.SHIPPED:
         _refuse(stack, {"--seed": seed, "--heads": heads}, opset)
         shipped.copy(stack, output)

@@ -10,6 +10,7 @@ from me2e_compress.calibration.recording import write_recording
 from me2e_compress.cli.console import console, progress
 from me2e_compress.cli.extras import need_closed_loop
 from me2e_compress.cli.models import model_path
+from me2e_compress.cli.output import check_folder
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.zoo.frames import frames as synthetic
 from me2e_compress.zoo.stacks import STACKS, find
@@ -38,6 +39,7 @@ def frames(
     For vad-tiny a synthetic world is drawn; for highway, or any ONNX file that
     keeps the policy contract, the expert drives fresh routes of highway-env.
     """
+    check_folder(output, (stack,))
     with progress("frames") as advance:
         record(
             stack,

@@ -9,23 +9,11 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.plan import plan_of, save_plan
 from me2e_compress.cli.console import progress
 from me2e_compress.cli.int8 import Int8Options
-from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.errors import RecipeError
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
 from me2e_compress.runtime.atomic import write_json
-
-
-def check_output(model: Path, output: Path) -> None:
-    """Refuse before any work what could not be written, or would harm the input.
-
-    Raises:
-        GraphError: the output is the input, or its folder does not exist.
-    """
-    if output.exists() and model.exists() and output.samefile(model):
-        raise GraphError(f"{output} is the input: choose another name for the output")
-    if not output.parent.is_dir():
-        raise GraphError(f"{output}: no such folder {output.parent}")
 
 
 def choose(
@@ -77,6 +65,13 @@ def run(
 def run_on(model: ir.Model, passes: tuple[Pass, ...], modules: ModuleMap) -> ir.Model:
     """Run passes on a graph in memory, without frames and unverified."""
     return PassManager(passes, verify_frames=0).run(model, Context(modules)).model
+
+
+def written(output: Path) -> tuple[Path, ...]:
+    """Name the files that :func:`write` may write."""
+    names = (output.name, output.name + ".data")
+    beside = (f"{output.stem}.plan.json", f"{output.stem}.report.json")
+    return tuple(output.with_name(name) for name in (*names, *beside))
 
 
 def write(report: Report, source: Path, output: Path) -> Path:

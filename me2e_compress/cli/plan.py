@@ -22,6 +22,7 @@ from me2e_compress.calibration.rules import WEIGHTED
 from me2e_compress.cli.console import console, print_json, table
 from me2e_compress.cli.job import run_on
 from me2e_compress.cli.models import model_path
+from me2e_compress.cli.output import check_output
 from me2e_compress.errors import PreconditionError
 from me2e_compress.modules import map_of
 from me2e_compress.passes import Context
@@ -54,6 +55,7 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
+    check_output([output], (model, overrides, module_map, against))
     options = QuantizeInt8(
         scheme=scheme,
         rules=rules,

@@ -8,6 +8,7 @@ import typer
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.cli.console import console, number, print_json, progress, table
 from me2e_compress.cli.models import model_path
+from me2e_compress.cli.output import check_output
 from me2e_compress.runtime.latency_trace import PERCENTILES, LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
@@ -23,9 +24,11 @@ def profile(
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace."""
+    source = model_path(model)
+    check_output([output], (source, frames))
     with progress("profile") as advance:
         trace = measure(
-            model_path(model),
+            source,
             CalibrationSet(frames),
             samples=samples,
             warm_up=warm_up,

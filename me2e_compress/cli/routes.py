@@ -7,6 +7,7 @@ import typer
 from rich.table import Table
 
 from me2e_compress.cli.console import console, errors, print_json, progress
+from me2e_compress.cli.output import check_output
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.admission import Verdict, examine
@@ -39,6 +40,7 @@ def routes(
         return
     if output is None:
         raise typer.BadParameter("a new set needs -o ROUTES.json", param_hint="-o")
+    check_output([output], ())
     names = _names(scenarios)
     harvests = list[Harvest]()
     with progress("admitting") as advance:

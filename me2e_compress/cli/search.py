@@ -59,6 +59,7 @@ def search(
     setting = Setting(
         model, frames, scheme, rules, runs_on, ranges, module_map, count, threads
     )
+    setting.check_output(output)
     trials, modules = setting.trials()
     budget = (
         Budget(max_mb * 1e6, "bytes of weights", lambda g: graph.size(g).weight_bytes)

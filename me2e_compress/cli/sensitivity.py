@@ -14,6 +14,7 @@ from me2e_compress.cli.console import (
     progress,
     table,
 )
+from me2e_compress.cli.output import check_folder
 from me2e_compress.cli.road import drives_of, on_routes
 from me2e_compress.cli.trials import (
     Count,
@@ -78,8 +79,10 @@ def sensitivity(
     setting = Setting(
         model, frames, scheme, rules, target, ranges, module_map, count, threads
     )
+    setting.check_output(output, adapter, drive)
     on_road = None
     if drive is not None:
+        check_folder(drives_of(output), (frames,))
         on_road = on_routes(drive, model, drives_of(output), adapter, workers)
     trials, modules = setting.trials(on_road)
     with progress("modules") as advance:

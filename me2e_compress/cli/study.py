@@ -12,10 +12,11 @@ from rich.table import Table as Shown
 from me2e_compress.cli.console import console, errors, print_json, progress, table
 from me2e_compress.cli.evaluate import engine_of
 from me2e_compress.cli.models import model_path
-from me2e_compress.study import Listener, load_study, run_study
+from me2e_compress.cli.output import Given, check_folder, files_of
+from me2e_compress.study import Listener, Study, load_study, run_study
 from me2e_compress.study.cells import Cell, Table
 from me2e_compress.study.tables import all_tables
-from me2e_compress.study.write import write
+from me2e_compress.study.write import HTML, JSON, MARKDOWN, write
 
 WIDE = 120
 """Columns that a terminal must have for intervals beside the numbers."""
@@ -34,6 +35,7 @@ def study(
 ) -> None:
     """Drive schemes under conditions and compare them; run it again to go on."""
     asked = load_study(definition, model_path, routes)
+    check_folder(output, _read(definition, asked), (JSON, MARKDOWN, HTML))
     with listener() as told:
         found = run_study(asked, output, engine_of(engine, workers, address), told)
     written = write(found, output, _words(definition, output, routes))
@@ -43,6 +45,14 @@ def study(
     for each in all_tables(found):
         console.print(shown(each))
     console.print(f"{written.report}, {written.tables} and {written.record} are yours.")
+
+
+def _read(definition: Path, asked: Study) -> Iterator[Given]:
+    """Give the files and folders that a study reads."""
+    yield from (definition, asked.frames, asked.held_out)
+    for each in asked.schemes:
+        yield from (each.policy, each.module_map, each.adapter, each.trace)
+        yield from files_of(each.passes)
 
 
 def _words(definition: Path, output: Path, routes: str | None) -> tuple[str, ...]:

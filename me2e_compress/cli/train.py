@@ -7,6 +7,7 @@ import typer
 from rich.markup import escape
 
 from me2e_compress.cli.console import console, errors, number, progress, table
+from me2e_compress.cli.output import check_folder
 from me2e_compress.metrics.measure import Estimate
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ def train(
     from me2e_compress.zoo.train.curriculum import FULL
     from me2e_compress.zoo.train.small import LATENCY, SMALL
 
+    check_folder(output, ())
     told = ""
     with progress("train") as advance:
 

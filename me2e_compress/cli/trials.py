@@ -17,6 +17,7 @@ from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.cli.calibrate import prepare
 from me2e_compress.cli.console import console, progress
 from me2e_compress.cli.models import model_path
+from me2e_compress.cli.output import Given, check_output
 from me2e_compress.modules import map_of
 from me2e_compress.sensitivity import Choice, Drive, Trials, write_recipe
 from me2e_compress.targets import target_named
@@ -50,6 +51,12 @@ class Setting:
     module_map: str | None
     count: int
     threads: int
+
+    def check_output(self, output: Path, *inputs: Given) -> None:
+        """Refuse, before any work, a recipe that could not be written or does harm."""
+        read = (self.model, self.frames, self.ranges, self.module_map, *inputs)
+        overrides = output.with_name(output.stem + ".overrides.toml")
+        check_output([output, overrides], read)
 
     def trials(self, drive: Drive | None = None) -> tuple[Trials, tuple[str, ...]]:
         """Prepare the graph, calibrate once, and name the modules to try."""

@@ -1,0 +1,101 @@
+"""Outputs, looked at before any work: what cannot be written, or would do harm."""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import GraphError
+from me2e_compress.passes import Pass
+
+Given: TypeAlias = str | Path | None
+"""An input as the user names it; a word that is no file or folder harms nothing."""
+
+
+def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> None:
+    """Refuse files that could not be written, or would harm an input.
+
+    Args:
+        outputs: the files that a command writes.
+        inputs: the files and folders of frames that it reads; of a model the files
+            with its weights count too.
+
+    Raises:
+        GraphError: an output is an input, a frame of a recording, a folder or named
+            twice, or its folder does not exist.
+    """
+    named = dict[Path, Path]()
+    read = [Path(each) for each in inputs if each is not None]
+    for output in filter(None, outputs):
+        if not output.parent.is_dir():
+            raise GraphError(f"{output}: no such folder {output.parent}")
+        if output.is_dir():
+            raise GraphError(f"{output} is a folder: name a file for the output")
+        if named.setdefault(output.resolve(), output) is not output:
+            raise GraphError(f"{output} is named for two outputs: choose another name")
+        for given in read:
+            _keep(output, given)
+
+
+def check_folder(
+    folder: Path, inputs: Iterable[Given], files: Sequence[str] = ()
+) -> None:
+    """Refuse a folder that could not be made, or whose files would harm an input.
+
+    Args:
+        folder: that a command writes into; it may be missing.
+        inputs: as in :func:`check_output`.
+        files: what it writes there, by name.
+
+    Raises:
+        GraphError: it is a file or an input, or one of the files is an input.
+    """
+    read = list(inputs)
+    if folder.exists() and not folder.is_dir():
+        raise GraphError(f"{folder} is a file: name a folder for the output")
+    if not folder.is_dir():
+        return
+    for given in (Path(each) for each in read if each is not None):
+        if given.is_dir() and folder.samefile(given):
+            raise GraphError(f"{folder} is the input: choose another folder")
+    check_output([folder / name for name in files], read)
+
+
+def files_of(passes: Iterable[Pass]) -> Iterator[Path]:
+    """Give the files that the options of passes name."""
+    for each in passes:
+        if dataclasses.is_dataclass(each):
+            values = (getattr(each, field.name) for field in dataclasses.fields(each))
+            yield from (value for value in values if isinstance(value, Path))
+
+
+def _keep(output: Path, given: Path) -> None:
+    """Refuse an output that would change an input."""
+    if given.is_dir():
+        inside = output.resolve().parent == given.resolve()
+        if inside and (output.suffix == ".npz" or output.name == "scenes.json"):
+            raise GraphError(
+                f"{output} would be a frame of the input: choose another name"
+            )
+    elif output.exists() and given.is_file():
+        if output.samefile(given):
+            raise GraphError(
+                f"{output} is the input: choose another name for the output"
+            )
+        if any(output.samefile(file) for file in _weights(given)):
+            raise GraphError(f"{output} holds the weights of {given}: not written")
+
+
+def _weights(given: Path) -> Iterator[Path]:
+    """Give the files that hold the external weights of a model; none of other files."""
+    try:
+        model = graph.load(given)
+    except GraphError:  # no model, or one that is refused before anything is written
+        return
+    for each in model.graphs():
+        for value in each.initializers.values():
+            if isinstance(value.const_value, ir.ExternalTensor):
+                yield Path(value.const_value.path)
