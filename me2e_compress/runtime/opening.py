@@ -21,6 +21,7 @@ from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.runtime.native import REFUSALS
 from me2e_compress.runtime.supported import can_run
 
+_INT8_STAYS = "session.qdqisint8allowed"
 LENT_BYTES = 1024
 """Smaller tensors are left in the graph: shape inference reads those."""
 
@@ -116,8 +117,19 @@ def _needs_file(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> bool:
 
 
 def _build(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
+    """Open a graph; where that fails, without the step that makes int8 uint8.
+
+    From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
+    ``output_dtype`` is not that of their zero point, and then refuses them.
+    """
+    providers = ["CPUExecutionProvider"]
     try:
-        return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        return ort.InferenceSession(source, options, providers=providers)
     except REFUSALS as error:
-        line = " ".join(str(error).split())
-        raise GraphError(f"onnxruntime cannot run this graph: {line}") from error
+        refusal = error
+    options.add_session_config_entry(_INT8_STAYS, "1")
+    try:
+        return ort.InferenceSession(source, options, providers=providers)
+    except REFUSALS:
+        line = " ".join(str(refusal).split())
+        raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal

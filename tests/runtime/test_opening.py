@@ -98,3 +98,32 @@ def test_weights_of_a_body_that_lie_in_a_file_are_found(tmp_path: Path) -> None:
     feeds = {"turn": np.array(True), "x": np.zeros(600, np.float32)}
 
     assert np.array_equal(Session(mapped).run(feeds)["y"], np.ones(600, np.float32))
+
+
+@pytest.mark.parametrize("opset", [17, 20, 21, 22])
+def test_int8_activations_run_at_every_opset(opset: int) -> None:
+    """From 21 on, onnxruntime's own step from int8 to uint8 breaks this graph."""
+    text = f"""
+    <ir_version: 10, opset_import: ["" : {opset}]>
+    layer (float[1,8,32] x, int8[32,64] w, float[64] b) => (float[1,8,64] y)
+    <float s = {{0.05}}, int8 z = {{0}}> {{
+        q = QuantizeLinear(x, s, z)
+        a = DequantizeLinear(q, s, z)
+        c = DequantizeLinear(w, s, z)
+        m = MatMul(a, c)
+        y = Add(m, b)
+    }}
+    """
+    random = np.random.default_rng(opset)
+    w, b = random.integers(-127, 128, (32, 64)).astype(np.int8), random.normal(size=64)
+    x = random.uniform(-3, 3, (1, 8, 32)).astype(np.float32)
+    model = net(text, {"b": b})
+    port = next(value for value in model.graph.inputs if value.name == "w")
+    model.graph.inputs.remove(port)
+    port.const_value = ir.tensor(w, name="w")
+    model.graph.register_initializer(port)
+
+    found = Session(model, threads=1).run({"x": x})["y"]
+
+    grid = np.round(x.astype(np.float64) / 0.05) * 0.05
+    assert found == pytest.approx(grid @ (0.05 * w) + b, abs=0.02)
