@@ -60,7 +60,7 @@ class LowerInt8:
         layers = onnxruntime.int8_layers(lowered)
         return PassResult(
             lowered,
-            len(layers),
+            len(layers) or int(graph.digest(lowered) != graph.digest(model)),
             (
                 f"{len(layers)} layers in int8 for onnxruntime",
                 f"{len(missing)} tensors calibrated besides those of the graph",

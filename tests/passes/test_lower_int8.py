@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from me2e_compress import graph
@@ -15,7 +16,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers, unranged
 from tests.frames import record
-from tests.nets import MODULES, conv_attention, image
+from tests.nets import MODULES, conv_attention, image, net
 
 
 @pytest.fixture
@@ -82,3 +83,20 @@ def test_without_frames_there_is_no_calibration(context: Context) -> None:
 def test_a_float_graph_is_refused(context: Context) -> None:
     with pytest.raises(PreconditionError, match="no quantized activation"):
         LowerInt8().run(conv_attention(), context)
+
+
+def test_pairs_without_a_kernel_are_taken_out(context: Context) -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    batched (float[1,3,8,8] image, float[1,3,8,4] w) => (float[1,3,8,4] y) {
+        y = MatMul(image, w)
+    }
+    """
+    weight = np.random.default_rng(0).standard_normal((1, 3, 8, 4))
+    model = net(text, {"w": weight})
+
+    manager = PassManager((QuantizeInt8(), LowerInt8()), verify_frames=0)
+    report = manager.run(model, context)
+
+    assert [step.changes for step in report.steps] == [1, 1]
+    assert "0 layers in int8 for onnxruntime" in report.steps[1].notes
