@@ -1,9 +1,11 @@
 """The file that drives: given, or made by passes once and kept."""
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 
+from google.protobuf.message import DecodeError
 from pydantic import BaseModel, ValidationError
 
 from me2e_compress import __version__, graph
@@ -12,7 +14,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap, map_of
-from me2e_compress.passes import Context
+from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.spec import to_text
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.study.definition import Scheme, Study
@@ -48,7 +50,7 @@ def contend(
     """Find or make a scheme's driver, and open it once.
 
     Raises:
-        StudyError: No such model.
+        StudyError: No such model, or a file that a pass reads is missing.
         EvaluationError: It cannot drive.
         Me2eError: A pass refused the graph or broke.
     """
@@ -72,13 +74,29 @@ def contend(
 
 def _told_beside(model: Path, sha256: str) -> tuple[str, str] | None:
     """Read source and passes from the report beside a file, if it is of this file."""
-    path = model.with_name(f"{model.stem}.report.json")
+    report = _report_of(model)
+    if report is None or report.output.sha256 != sha256:
+        return None
+    return report.source.file, report.pipeline
+
+
+def _unaltered(model: Path) -> bool:
+    """Whether a file is the one that its report was written of."""
     try:
-        report = _Report.model_validate_json(path.read_bytes())
+        return _told_beside(model, graph.sha256_of(model)) is not None
+    except (OSError, DecodeError):
+        return False
+
+
+def _report_of(model: Path) -> "_Report | None":
+    try:
+        return _Report.model_validate_json(_report_path(model).read_bytes())
     except (OSError, ValidationError):
         return None
-    same = report.output.sha256 == sha256
-    return (report.source.file, report.pipeline) if same else None
+
+
+def _report_path(model: Path) -> Path:
+    return model.with_name(f"{model.stem}.report.json")
 
 
 class _File(BaseModel):
@@ -95,13 +113,17 @@ class _Report(BaseModel):
 def _compressed(
     study: Study, scheme: Scheme, workplace: Workplace, listener: Listener
 ) -> Path:
-    """Apply the passes, unless the same was done before; the report is written last."""
+    """Apply the passes, unless the same was done before; the report is written last.
+
+    What is there is taken if it is still the file that its report was written of.
+    """
     source = Path(scheme.policy)
     frames = None if study.frames is None else CalibrationSet(study.frames)
     path = workplace.model(scheme, _key(scheme, source, frames, study.seed))
-    report_path = path.with_name(f"{path.stem}.report.json")
-    if path.is_file() and report_path.is_file():
-        return path
+    if path.is_file() and _report_path(path).is_file():
+        if _unaltered(path):
+            return path
+        listener.on_warning(f"{path}: not what its report is of: made again")
     loaded = graph.load(source)
     if frames is not None:
         frames.check(loaded)
@@ -114,7 +136,7 @@ def _compressed(
         lambda done, total, words: listener.on_progress(stage, done, total, words),
     )
     graph.save(report.model, path)
-    write_json(report_path, report.record(source, path), indent=2)
+    write_json(_report_path(path), report.record(source, path), indent=2)
     return path
 
 
@@ -128,5 +150,24 @@ def _key(scheme: Scheme, source: Path, frames: CalibrationSet | None, seed: int)
         "" if frames is None else frames.fingerprint,
         "" if modules is None else repr(ModuleMap.load(modules)),
         str(seed),
+        *(_content(scheme, file) for file in _files_of(scheme.passes)),
     )
     return hashlib.sha256("\n".join(decisive).encode()).hexdigest()
+
+
+def _files_of(passes: tuple[Pass, ...]) -> Iterator[Path]:
+    """List the files that passes read, in the order of their options."""
+    for current in filter(is_dataclass, passes):
+        for field in fields(current):
+            value = getattr(current, field.name)
+            if isinstance(value, Path):
+                yield value
+
+
+def _content(scheme: Scheme, file: Path) -> str:
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise StudyError(
+            f"scheme {scheme.name}: {file}: cannot be read: {error.strerror}"
+        ) from error

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph, recipe
-from me2e_compress.errors import FramesError
+from me2e_compress.errors import FramesError, StudyError
 from me2e_compress.manager import PassManager
-from me2e_compress.study import Scheme, Study
+from me2e_compress.study import Listener, Scheme, Study
 from me2e_compress.study.models import Contender, contend
 from me2e_compress.study.workplace import SILENT, Workplace
 from tests.cli.conftest import write_frames
@@ -102,6 +102,76 @@ def test_what_decides_the_model_decides_its_name(
         study = dataclasses.replace(study, schemes=(other,))
 
     assert made(study, tmp_path).model != first.model
+
+
+@pytest.mark.parametrize("damage", ["weights", "cut", "report"])
+def test_an_altered_model_is_made_again(
+    study: Study, tmp_path: Path, damage: str
+) -> None:
+    warnings = list[str]()
+    first = made(study, tmp_path)
+    assert first.model is not None
+    if damage == "weights":
+        write_model(first.model, seed=3)
+    elif damage == "cut":
+        first.model.write_bytes(first.model.read_bytes()[:-9])
+    else:
+        first.model.with_name(f"{first.model.stem}.report.json").write_text("{}")
+
+    listener = Listener(on_warning=warnings.append)
+    again = contend(study, study.schemes[0], Workplace(tmp_path), listener)
+
+    assert again == first
+    assert graph.sha256_of(first.model) == first.sha256
+    assert warnings == [f"{first.model}: not what its report is of: made again"]
+
+
+def with_means(study: Study, file: Path) -> Study:
+    passes = recipe.parse(
+        f'ablate-modules{{drop=[map],drop_outputs=true,fill=means,means="{file}"}}'
+    )
+    scheme = dataclasses.replace(study.schemes[0], passes=passes)
+    return dataclasses.replace(study, schemes=(scheme,), baseline=scheme.name)
+
+
+def write_means(study: Study, file: Path, value: float) -> None:
+    """One number everywhere that the map module is read."""
+    loaded = graph.load(Path(study.schemes[0].policy))
+    graph.infer_shapes(loaded)
+    means = {
+        str(output.name): np.full(shape, value, np.float32)
+        for node in loaded.graph
+        for output in node.outputs
+        if (shape := graph.static_shape(output)) is not None
+    }
+    np.savez(file, allow_pickle=False, **means)
+
+
+def test_a_file_that_a_pass_reads_decides_the_model(
+    study: Study, tmp_path: Path
+) -> None:
+    file = tmp_path / "means.npz"
+    asked = with_means(study, file)
+    write_means(asked, file, 1.0)
+    first = made(asked, tmp_path)
+    assert made(asked, tmp_path) == first
+
+    write_means(asked, file, 2.0)
+    second = made(asked, tmp_path)
+
+    assert second.model != first.model
+    assert second.sha256 != first.sha256
+
+
+def test_a_file_that_a_pass_reads_and_that_is_gone(
+    study: Study, tmp_path: Path
+) -> None:
+    asked = with_means(study, tmp_path / "gone.npz")
+
+    with pytest.raises(
+        StudyError, match=r"minus-occ: \S+gone\.npz: cannot be read: No"
+    ):
+        made(asked, tmp_path)
 
 
 def test_passes_that_need_frames_say_so(study: Study, tmp_path: Path) -> None:
