@@ -113,7 +113,8 @@ class Ranges:
                 f"ranges are stale: of graph {self.model[:12]}, not {model[:12]};"
                 f" {again}"
             )
-        asked = observer(method).text
+        own = method == self.method == IMPORTED
+        asked = IMPORTED if own else observer(method).text
         if self.method not in (asked, IMPORTED):
             raise FramesError(f"ranges are of method {self.method}, asked for {asked}")
         wanted = self.source if source is None else source

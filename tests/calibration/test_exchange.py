@@ -14,7 +14,7 @@ from me2e_compress.calibration.exchange import (
 )
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import FramesError
+from me2e_compress.errors import FramesError, RecipeError
 
 NAMES = ("/head/MatMul output", "a: b", "image")
 
@@ -98,6 +98,11 @@ def test_imported_ranges_fit_any_method_but_one_graph(tmp_path: Path) -> None:
     found = read_foreign(tmp_path / "c", "digest", NAMES)
 
     found.check(model="digest", tensors=NAMES, method="entropy", source="others")
+    found.check(model="digest", tensors=NAMES, method=found.method)
     with pytest.raises(FramesError, match="of graph digest, not elsewhere"):
         found.check(model="elsewhere", tensors=NAMES, method="entropy")
+    with pytest.raises(RecipeError, match="no calibration method fp8"):
+        found.check(model="digest", tensors=NAMES, method="fp8")
+    with pytest.raises(RecipeError, match="no calibration method imported"):
+        ranges().check(model="digest", tensors=NAMES, method="imported")
     assert np.isfinite(list(found.tensors.values())).all()

@@ -54,6 +54,23 @@ def test_saved_ranges_are_taken_and_stale_ones_refused(
     assert "stale: of graph other" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("line", ["sensitivity", "search --max-mb 1"])
+def test_ranges_of_another_tool_are_taken(
+    command: Command, dense: Path, line: str
+) -> None:
+    place = ("--map", dense / "map.toml")
+    model, frames = dense / "dense.onnx", dense / "frames"
+    cache, saved = dense / "trt.cache", dense / "ranges.json"
+    ours = ("calibrate", model, frames, *place, "-o", saved)
+    command(*ours, "--tensorrt-cache", cache)
+    command("calibrate", model, "--import", cache, *place, "-o", saved)
+    name, *how = line.split()
+
+    words = (*how, "--ranges", saved, *place, "-o", dense / "r.toml")
+    assert command(name, model, frames, *words) == 0
+    assert json.loads(saved.read_text())["method"] == "imported"
+
+
 @pytest.mark.parametrize(
     ("budget", "int8"), [(("--max-mb", "1"), False), (("--max-mb", "0.0004"), True)]
 )
