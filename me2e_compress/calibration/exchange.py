@@ -14,7 +14,7 @@ from onnxruntime.quantization.calibrate import TensorData
 from onnxruntime.quantization.quant_utils import write_calibration_table
 
 from me2e_compress.calibration.observers import QUANT_MAX, MaxMin, scale_of
-from me2e_compress.calibration.ranges import IMPORTED, Ranges
+from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 
@@ -93,7 +93,7 @@ def _parse(
             raise FramesError(
                 f"{path}: line {number} is no name and number: {line[:60]!r}"
             ) from error
-        if not parted or not 0 <= found[name] < np.inf:
+        if not parted or not 0 <= found[name] <= LARGEST:
             raise FramesError(f"{path}: line {number} is no range: {line[:60]!r}")
     return found
 

@@ -17,6 +17,9 @@ OUTLIER_CREST = 64
 reported: its int8 step then exceeds half its root mean square, so that most elements
 round to 0, 1 or 2 steps."""
 
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest end of a range: elements are float32."""
+
 IMPORTED = "imported"
 """Method of ranges that another tool measured; on which frames, is not known."""
 
@@ -74,7 +77,8 @@ class Ranges:
         """Read what :meth:`save` wrote.
 
         Raises:
-            FramesError: no such file, or not saved ranges.
+            FramesError: no such file, or not saved ranges: an end that is no float32
+                number, or a low end above the high one.
         """
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
@@ -84,6 +88,12 @@ class Ranges:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"]) or "file"
             raise FramesError(f"{path}: not ranges: {where}: {first['msg']}") from error
+        for name, (low, high) in found.tensors.items():
+            if not -LARGEST <= low <= high <= LARGEST:  # NaN too
+                raise FramesError(
+                    f"{path}: not ranges: {name} has {low:g} to {high:g}; a range is"
+                    " two float32 numbers, the lower one first"
+                )
         return found
 
     def check(

@@ -78,6 +78,8 @@ def test_the_table_of_onnxruntime_holds_the_magnitudes(tmp_path: Path) -> None:
         ("TRT-8501-X\nimage: 7fc00000", "line 2 is no range"),
         ("image", "line 1 is no name"),
         ("image -2", "line 1 is no range"),
+        ("image inf", "line 1 is no range"),
+        ("image 1e39", "line 1 is no range"),
         ("other 2", "a cache of another model: it lacks image and 0 more of 1"),
     ],
 )

@@ -53,6 +53,14 @@ def test_the_scale_covers_the_larger_side(
     assert scale_of(low, high) == np.float32(scale)
 
 
+@pytest.mark.parametrize("end", [np.nan, np.inf])
+def test_what_is_no_number_has_no_step(end: float) -> None:
+    with pytest.raises(FramesError, match="has no int8 step"):
+        scale_of(-end, 1.0)
+    with pytest.raises(FramesError, match="has no int8 step"):
+        scale_of(-1.0, end)
+
+
 def test_max_min_is_static() -> None:
     lows, highs = MaxMin().ranges(extremes((-1, 2), (-3, 1), (0, 0)))
 

@@ -1,5 +1,6 @@
 """What int8 cannot be made of: one line that says so, and no file."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -99,6 +100,34 @@ def test_a_cache_of_other_frames(
 
     words = ("--scheme", "full", "--ranges", saved, "--frames", dense / "later")
     assert "stale: of frames" in refused(*words)
+
+
+@pytest.mark.parametrize(
+    ("ends", "found"),
+    [
+        ([float("nan"), 1], "nan to 1"),
+        ([-1, float("inf")], "-1 to inf"),
+        ([-1e39, 1], "-1e+39 to 1"),
+        ([2, 1], "2 to 1"),
+    ],
+)
+def test_ranges_that_are_none(
+    command: Command,
+    refused: Refused,
+    dense: Path,
+    capsys: pytest.CaptureFixture[str],
+    ends: list[float],
+    found: str,
+) -> None:
+    saved, map_ = dense / "r.json", ("--map", dense / "map.toml")
+    command("calibrate", dense / "dense.onnx", dense / "frames", *map_, "-o", saved)
+    content = json.loads(saved.read_text())
+    content["tensors"] |= {"a": ends}
+    saved.write_text(json.dumps(content))
+    capsys.readouterr()
+
+    line = refused("--scheme", "full", "--ranges", saved)
+    assert f"r.json: not ranges: a has {found}; " in line
 
 
 @pytest.mark.parametrize("wanted", ["int4", "fp8"])
