@@ -21,11 +21,13 @@ class LatencyTrace:
         model_sha256: Of the model that ran.
         machine: Processor and number of threads, in words.
         samples_us: Microseconds, one an inference, without the warm-up.
+        frames: Fingerprint of the recording that the model saw; None: not known.
     """
 
     model_sha256: str
     machine: str
     samples_us: tuple[int, ...]
+    frames: str | None = None
 
     def percentile_us(self, percent: float) -> int:
         """Return the smallest sample that so many percent do not exceed."""
@@ -38,9 +40,11 @@ class LatencyTrace:
 
     def to_json(self) -> dict[str, Any]:
         """Return p50, p90, p99 and max beside the samples."""
+        frames = {} if self.frames is None else {"frames": self.frames}
         return {
             "model_sha256": self.model_sha256,
             "machine": self.machine,
+            **frames,
             **{f"p{p}_us": self.percentile_us(p) for p in PERCENTILES},
             "max_us": self.max_us,
             "samples_us": list(self.samples_us),
@@ -76,7 +80,8 @@ class LatencyTrace:
             raise EvaluationError(
                 f"{path}: not a latency trace: {where}: {first['msg']}"
             ) from error
-        return cls(record.model_sha256, record.machine, tuple(record.samples_us))
+        samples_us = tuple(record.samples_us)
+        return cls(record.model_sha256, record.machine, samples_us, record.frames)
 
 
 class _Record(BaseModel):
@@ -84,4 +89,5 @@ class _Record(BaseModel):
 
     model_sha256: str
     machine: str
+    frames: str | None = None
     samples_us: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]

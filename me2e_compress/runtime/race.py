@@ -122,11 +122,16 @@ def traces_in_turn(
             _advance(runs[name], RE_WARM + block)
             kept[name] += session.taken_us[-block:]
             on_sample(done * len(models) + place * block, samples * len(models), name)
-    machine = f"{processor()}, onnxruntime on {threads or 'all'} threads, in turn"
+    machine = machine_in_turn(threads)
     return {
         name: LatencyTrace(graph.sha256_of(path), machine, tuple(kept[name]))
         for name, path in models.items()
     }
+
+
+def machine_in_turn(threads: int) -> str:
+    """Name what `traces_in_turn` measures on: processor and threads, in words."""
+    return f"{processor()}, onnxruntime on {threads or 'all'} threads, in turn"
 
 
 def _advance(runs: Iterator[object], count: int) -> None:

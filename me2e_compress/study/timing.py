@@ -1,7 +1,7 @@
 """Latency of every model of a study, and the device that it stands for."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError
@@ -11,7 +11,7 @@ from me2e_compress.evaluators.latency import (
     parse_latency,
 )
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.race import traces_in_turn
+from me2e_compress.runtime.race import machine_in_turn, traces_in_turn
 from me2e_compress.study.definition import Condition, Scheme, Study
 from me2e_compress.study.models import Contender
 from me2e_compress.study.workplace import Listener, Workplace
@@ -59,34 +59,60 @@ def time_all(
     """Take the traces that are given or kept, and measure the others in turn.
 
     What is measured together shares its noise. A trace that is kept is of the same
-    model and has as many samples; one that is not is measured again.
+    model, machine, threads and frames, and has as many samples; one that is not is
+    measured again. Files written before traces named their frames are taken to be of
+    the same ones. Without a kept trace of the baseline nothing that is kept can stand
+    beside what is measured now: then all are measured again.
 
     Raises:
         EvaluationError: A trace cannot be read or written, or the baseline's median,
             which sets the device scale, is zero.
     """
+    frames = None if study.held_out is None else CalibrationSet(study.held_out)
+    seen = None if frames is None else frames.fingerprint
     traces = dict[str, LatencyTrace]()
-    missing = list[Contender]()
     for each in contenders:
-        kept = _kept(study, each, workplace, listener)
+        kept = _kept(study, each, seen, workplace, listener)
         if kept is not None:
             traces[each.scheme.name] = kept
-        elif each.model is not None:
-            missing.append(each)
-    if study.held_out is None:
+    if frames is None:
         return Clock(traces, _scale(study, traces), "no held-out frames were given")
     baseline = next(each for each in contenders if each.scheme is study.reference)
     yardstick = None if baseline.scheme.trace else traces.get(study.baseline)
-    measured = _measured(study, missing, baseline, yardstick, listener)
-    for each in missing:
-        name = each.scheme.name
-        measured[name].save(workplace.trace(each.scheme))
-        traces[name] = measured[name]
+    missing = _missing(contenders, traces, yardstick, workplace, listener)
+    measured = _measured(study, frames, missing, baseline, yardstick, listener)
+    # the baseline last: a kill before leaves none that old ones could stand beside
+    for each in sorted(missing, key=lambda one: one is baseline):
+        trace = replace(measured[each.scheme.name], frames=seen)
+        trace.save(workplace.trace(each.scheme))
+        traces[each.scheme.name] = trace
     return Clock(traces, _scale(study, traces), "not a model")
+
+
+def _missing(
+    contenders: Sequence[Contender],
+    traces: Mapping[str, LatencyTrace],
+    yardstick: LatencyTrace | None,
+    workplace: Workplace,
+    listener: Listener,
+) -> list[Contender]:
+    """List what is to be measured: all, where new traces cannot stand beside old."""
+    ours = [each for each in contenders if each.model and not each.scheme.trace]
+    missing = [each for each in ours if each.scheme.name not in traces]
+    if yardstick is not None or not missing:
+        return missing
+    for each in ours:
+        if each not in missing:
+            path = workplace.trace(each.scheme)
+            listener.on_warning(
+                f"{path}: no trace of the baseline is kept beside it: measured again"
+            )
+    return ours
 
 
 def _measured(
     study: Study,
+    frames: CalibrationSet,
     missing: Sequence[Contender],
     baseline: Contender,
     kept: LatencyTrace | None,
@@ -97,13 +123,13 @@ def _measured(
     Where the baseline's trace is kept, the others are put on its scale: machines are
     slower on some days than on others.
     """
-    if study.held_out is None or not missing:
+    if not missing:
         return {}
     name = baseline.scheme.name
     timed = missing if kept is None else (baseline, *missing)
     found = traces_in_turn(
         {each.scheme.name: each.model for each in timed if each.model is not None},
-        CalibrationSet(study.held_out),
+        frames,
         samples=study.timing.samples,
         threads=study.timing.threads,
         on_sample=lambda done, total, words: listener.on_progress(
@@ -117,15 +143,16 @@ def _measured(
 
 
 def _paced(trace: LatencyTrace, pace: float) -> LatencyTrace:
-    return LatencyTrace(
-        trace.model_sha256,
-        trace.machine,
-        tuple(round(sample * pace) for sample in trace.samples_us),
-    )
+    samples_us = tuple(round(sample * pace) for sample in trace.samples_us)
+    return replace(trace, samples_us=samples_us)
 
 
 def _kept(
-    study: Study, each: Contender, workplace: Workplace, listener: Listener
+    study: Study,
+    each: Contender,
+    frames: str | None,
+    workplace: Workplace,
+    listener: Listener,
 ) -> LatencyTrace | None:
     if each.scheme.trace is not None:
         return LatencyTrace.load(each.scheme.trace)
@@ -133,10 +160,27 @@ def _kept(
     if each.model is None or not path.is_file():
         return None
     trace = LatencyTrace.load(path)
-    same = trace.model_sha256 == each.sha256
-    if same and len(trace.samples_us) == study.timing.samples:
+    other = _other(trace, each, frames, study)
+    if other is None:
         return trace
-    listener.on_warning(f"{path}: of another model or length: measured again")
+    then = "left out" if study.held_out is None else "measured again"
+    listener.on_warning(f"{path}: of {other}: {then}")
+    return None
+
+
+def _other(
+    trace: LatencyTrace, each: Contender, frames: str | None, study: Study
+) -> str | None:
+    """Say what a trace is of that this study does not measure; None: the same."""
+    wanted, machine = study.timing.samples, machine_in_turn(study.timing.threads)
+    if trace.model_sha256 != each.sha256:
+        return "another model"
+    if len(trace.samples_us) != wanted:
+        return f"{len(trace.samples_us)} samples, not {wanted}"
+    if trace.machine != machine:
+        return f"another machine ({trace.machine}; this is {machine})"
+    if None not in (trace.frames, frames) and trace.frames != frames:
+        return "other frames"
     return None
 
 

@@ -1,12 +1,17 @@
+import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.latency import FixedLatency, TraceLatency
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.race import machine_in_turn
 from me2e_compress.study import Condition, Listener, Scheme, Study, Timing, timing
 from me2e_compress.study.models import contend
 from me2e_compress.study.timing import Clock, time_all
@@ -15,6 +20,7 @@ from tests.study.conftest import BLIND, IDEAL, Make
 
 DEVICE = Condition("device", "trace")
 SAMPLES = (100, 110, 120, 130, 140)
+HERE = machine_in_turn(1)
 
 
 def clock_of(study: Study, folder: Path, listener: Listener = SILENT) -> Clock:
@@ -35,7 +41,7 @@ def paced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         factor = 2 ** (len(days) - 1)
         samples = tuple(factor * each for each in SAMPLES)
         return {
-            name: LatencyTrace(sha256_of(path), "here", samples)
+            name: LatencyTrace(sha256_of(path), HERE, samples)
             for name, path in models.items()
         }
 
@@ -96,18 +102,103 @@ def test_a_model_that_joins_later_is_put_on_the_scale_of_the_others(
     assert clock.traces["fast"].samples_us == SAMPLES
 
 
-def test_a_trace_of_another_model_is_measured_again(
-    ours: Study, paced: list[list[str]], tmp_path: Path
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"model_sha256": "0" * 64}, "another model"),
+        ({"samples_us": SAMPLES[:4]}, "4 samples, not 5"),
+        ({"machine": "an Orin"}, f"another machine (an Orin; this is {HERE})"),
+        ({"frames": "0" * 32}, "other frames"),
+    ],
+)
+def test_a_trace_of_something_else_is_measured_again(
+    ours: Study,
+    paced: list[list[str]],
+    tmp_path: Path,
+    change: dict[str, Any],
+    words: str,
 ) -> None:
     warnings = list[str]()
     clock_of(ours, tmp_path)
     stale = tmp_path / "traces" / "fast.json"
-    LatencyTrace("0" * 64, "there", SAMPLES).save(stale)
+    replace(LatencyTrace.load(stale), **change).save(stale)
 
     clock_of(ours, tmp_path, Listener(on_warning=warnings.append))
 
     assert paced[1:] == [["slow", "fast"]]
-    assert warnings == [f"{stale}: of another model or length: measured again"]
+    assert warnings == [f"{stale}: of {words}: measured again"]
+
+
+def test_more_threads_are_measured_again(
+    ours: Study, paced: list[list[str]], tmp_path: Path
+) -> None:
+    clock_of(ours, tmp_path)
+
+    clock_of(replace(ours, timing=replace(ours.timing, threads=2)), tmp_path)
+
+    assert len(paced) == 2
+
+
+def test_a_trace_says_what_frames_it_is_of(
+    ours: Study, paced: list[list[str]], tmp_path: Path
+) -> None:
+    assert ours.held_out is not None
+
+    clock_of(ours, tmp_path)
+
+    kept = LatencyTrace.load(tmp_path / "traces" / "fast.json")
+    assert kept.frames == CalibrationSet(ours.held_out).fingerprint
+    assert len(paced) == 1
+
+
+def test_a_trace_from_before_frames_were_named_is_kept(
+    ours: Study, paced: list[list[str]], tmp_path: Path
+) -> None:
+    clock_of(ours, tmp_path)
+    for path in (tmp_path / "traces").iterdir():
+        record = json.loads(path.read_bytes())
+        del record["frames"]
+        path.write_text(json.dumps(record))
+
+    clock_of(ours, tmp_path)
+
+    assert len(paced) == 1
+
+
+def test_without_a_trace_of_the_baseline_all_are_measured_again(
+    ours: Study, paced: list[list[str]], tmp_path: Path
+) -> None:
+    warnings = list[str]()
+    clock_of(ours, tmp_path)
+    (tmp_path / "traces" / "slow.json").unlink()
+
+    clock = clock_of(ours, tmp_path, Listener(on_warning=warnings.append))
+
+    assert paced[1:] == [["slow", "fast"]]
+    assert clock.milliseconds("fast", 50) == pytest.approx(240.0)
+    stale = tmp_path / "traces" / "fast.json"
+    assert warnings == [
+        f"{stale}: no trace of the baseline is kept beside it: measured again"
+    ]
+
+
+@pytest.mark.usefixtures("paced")
+def test_a_kill_while_traces_are_written_leaves_no_baseline(
+    ours: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save, saved = LatencyTrace.save, list[str]()
+
+    def killed(trace: LatencyTrace, path: Path) -> None:
+        if saved:
+            raise KeyboardInterrupt
+        saved.append(path.stem)
+        save(trace, path)
+
+    monkeypatch.setattr(LatencyTrace, "save", killed)
+    with pytest.raises(KeyboardInterrupt):
+        clock_of(ours, tmp_path)
+
+    assert saved == ["fast"]
 
 
 def test_a_trace_that_is_given_is_taken(
