@@ -13,7 +13,7 @@ from me2e_compress.calibration.checkpoint import Checkpoint, Standing
 from me2e_compress.calibration.gauges import Counts, Extremes, Gauge
 from me2e_compress.calibration.observers import observer
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.statistics import BINS, Statistics
+from me2e_compress.calibration.statistics import BINS, Statistics, no_element
 from me2e_compress.calibration.stream import Readings, Recording, gauged, stream
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
@@ -196,6 +196,7 @@ def _refuse_what_is_no_number(
         FramesError: names the first such tensors and the frame.
     """
     bad = np.isnan(readings).any(1) | np.isinf(readings[:, :2]).any(1)
+    bad &= ~no_element(readings)
     if not bad.any():
         return
     names = [tensors[at] for at in np.flatnonzero(bad).tolist()]

@@ -33,6 +33,7 @@ class Extremes:
 
     The mean square tells a tensor whose range a few elements make. It also finds every
     NaN, which onnxruntime's ReduceMin and ReduceMax overlook unless it comes first.
+    A tensor without elements gives infinity, minus infinity and 0.
     """
 
     width: int = 3
@@ -40,17 +41,19 @@ class Extremes:
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
         """Reduce the whole tensor three times."""
         one = _shared(where, np.array([1], np.int64), "one")
+        least = _shared(where, np.array(1, np.float32), "least")
         low, high, total = (
             ir.node(op, [value], {"keepdims": 0})
             for op in ("ReduceMin", "ReduceMax", "ReduceSumSquare")
         )
         size = ir.node("Size", [value])
         count = _cast(size.outputs[0], ir.DataType.FLOAT)
-        mean = ir.node("Div", [total.outputs[0], count.outputs[0]])
+        some = ir.node("Max", [count.outputs[0], least])
+        mean = ir.node("Div", [total.outputs[0], some.outputs[0]])
         flat = [
             ir.node("Reshape", [each.outputs[0], one]) for each in (low, high, mean)
         ]
-        nodes = [low, high, total, size, count, mean, *flat]
+        nodes = [low, high, total, size, count, some, mean, *flat]
         return nodes, [each.outputs[0] for each in flat]
 
 

@@ -144,7 +144,7 @@ def _outliers(seen: Statistics) -> dict[str, float]:
     """Give the crest factors that are too large, each to three digits."""
     if not seen.tensors:
         return {}
-    root = np.sqrt(seen.gauges[:, :, 2].astype(np.float64).mean(axis=0))
+    root = np.sqrt(seen.mean_squares.astype(np.float64).mean(axis=0))
     crest = seen.reach / np.where(root > 0, root, np.inf)
     return {
         name: float(f"{factor:.3g}")

@@ -1,6 +1,7 @@
 """What was seen of every tensor on every frame: enough for any range, in a few MB."""
 
 import dataclasses
+import functools
 import io
 import itertools
 import zipfile
@@ -34,7 +35,8 @@ class Statistics:
         source: fingerprint of the recording.
         tensors: their names.
         frames: places in the recording of the frames that were seen.
-        gauges: float32 [frames, tensors, 3]: smallest and largest element, mean square.
+        gauges: float32 [frames, tensors, 3]: smallest and largest element, mean square;
+            infinity, minus infinity and 0 where a tensor had no element.
         counts: int64 [tensors, bins] over all frames: how many magnitudes lie in each
             bin of [0, 2^exponent); None where no histogram was asked for.
     """
@@ -46,20 +48,40 @@ class Statistics:
     gauges: Floats
     counts: npt.NDArray[np.int64] | None = None
 
+    @functools.cached_property
+    def readings(self) -> Floats:
+        """The gauges, where a tensor had no element those of the frame before.
+
+        Before its first element those of the first frame that had one; 0 if none had.
+        """
+        empty = no_element(self.gauges)
+        if not empty.any():
+            return self.gauges
+        rows = np.arange(len(self.frames))[:, None]
+        last = np.maximum.accumulate(np.where(empty, -1, rows), axis=0)
+        taken = np.where(last < 0, np.argmin(empty, axis=0), last)
+        filled = self.gauges[taken, np.arange(len(self.tensors))]
+        return np.where(empty.all(axis=0)[:, None], np.float32(0), filled)
+
     @property
     def lows(self) -> Floats:
         """The smallest elements: float32 [frames, tensors]."""
-        return self.gauges[:, :, 0]
+        return self.readings[:, :, 0]
 
     @property
     def highs(self) -> Floats:
         """The largest elements: float32 [frames, tensors]."""
-        return self.gauges[:, :, 1]
+        return self.readings[:, :, 1]
+
+    @property
+    def mean_squares(self) -> Floats:
+        """The mean squares: float32 [frames, tensors]."""
+        return self.readings[:, :, 2]
 
     @property
     def reach(self) -> Floats:
         """The largest magnitudes over all frames: float32 [tensors]."""
-        ends = np.abs(self.gauges[:, :, :2])
+        ends = np.abs(self.readings[:, :, :2])
         return np.asarray(ends.max(axis=(0, 2), initial=0), np.float32)
 
     @property
@@ -116,6 +138,15 @@ class Statistics:
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise FramesError(f"{path}: not saved statistics ({error})") from error
+
+
+def no_element(gauges: Floats) -> npt.NDArray[np.bool_]:
+    """Say of which tensors there was no element to measure.
+
+    Args:
+        gauges: float32 [..., 3], as :class:`Statistics` keeps them.
+    """
+    return (gauges[..., 0] == np.inf) & (gauges[..., 1] == -np.inf)
 
 
 def merge(parts: Sequence[Statistics]) -> Statistics:
