@@ -14,6 +14,7 @@ from me2e_compress.graph.files import (
 )
 from me2e_compress.graph.interface import Port, interface
 from me2e_compress.graph.measure import Size, macs, node_count, size
+from me2e_compress.graph.names import fresh_name, value_names
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.graph.rewrite import (
     add_constant,
@@ -32,6 +33,7 @@ __all__ = [
     "array_of",
     "digest",
     "file_bytes",
+    "fresh_name",
     "infer_shapes",
     "interface",
     "is_external",
@@ -45,4 +47,5 @@ __all__ = [
     "sort",
     "static_shape",
     "sweep",
+    "value_names",
 ]

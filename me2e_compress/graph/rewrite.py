@@ -5,6 +5,8 @@ import numpy.typing as npt
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
+from me2e_compress.graph.names import fresh_name, value_names
+
 
 def array_of(value: ir.Value | None) -> npt.NDArray[np.generic] | None:
     """Give the array of an initializer or Constant; None if the value is computed."""
@@ -19,13 +21,21 @@ def array_of(value: ir.Value | None) -> npt.NDArray[np.generic] | None:
 
 
 def add_constant(
-    graph: ir.Graph, array: npt.NDArray[np.generic], name: str
+    graph: ir.Graph,
+    array: npt.NDArray[np.generic],
+    name: str,
+    names: set[str] | None = None,
 ) -> ir.Value:
-    """Register an initializer under this name, or ``name_1``, ... where it is taken."""
-    unique, count = name, 0
-    while unique in graph.initializers:
-        count += 1
-        unique = f"{name}_{count}"
+    """Register an initializer under this name, or ``name_1``, ... where it is taken.
+
+    Args:
+        graph: where.
+        array: what it holds.
+        name: what to call it, if that is free.
+        names: those that are taken, the new one is entered; None to look at the whole
+            graph, which whoever adds thousands had better do once.
+    """
+    unique = fresh_name(name, value_names(graph) if names is None else names)
     flat = np.ascontiguousarray(array).reshape(array.shape)
     tensor = ir.tensor(flat, name=unique)
     value = ir.Value(

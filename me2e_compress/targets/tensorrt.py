@@ -77,6 +77,7 @@ class _Writer:
         self._activations: dict[str, ir.Value] = {}
         self._weights: dict[tuple[str, int | None], ir.Value] = {}
         self._zero: ir.Value | None = None
+        self._names = graph.value_names(where)
 
     def apply(self, node: ir.Node, decision: Decision, weight: Weight | None) -> None:
         """Let one node read int8."""
@@ -97,9 +98,9 @@ class _Writer:
             if self._zero is None:
                 self._zero = self._constant(np.array(0, np.int8), "int8_zero")
             pair = [scale, self._zero]
-            quantize = _node("QuantizeLinear", [value, *pair], name, value, reader)
+            quantize = self._node("QuantizeLinear", [value, *pair], name, value, reader)
             quantize.outputs[0].type = ir.TensorType(ir.DataType.INT8)
-            dequantize = _node(
+            dequantize = self._node(
                 "DequantizeLinear", [quantize.outputs[0], *pair], name, value, reader
             )
             producer = value.producer()
@@ -119,7 +120,7 @@ class _Writer:
                 self._constant(scales, f"{name}_scale"),
                 self._constant(np.zeros(scales.shape, np.int8), f"{name}_zero"),
             ]
-            dequantize = _node("DequantizeLinear", inputs, name, like, reader)
+            dequantize = self._node("DequantizeLinear", inputs, name, like, reader)
             dequantize.outputs[0].shape = ir.Shape(weight.integers.shape)
             if weight.axis is not None:
                 dequantize.attributes.add(ir.AttrInt64("axis", weight.axis))
@@ -128,14 +129,19 @@ class _Writer:
         return self._weights[key]
 
     def _constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-        return graph.add_constant(self._graph, array, name)
+        return graph.add_constant(self._graph, array, name, self._names)
 
-
-def _node(
-    op: str, inputs: list[ir.Value], name: str, like: ir.Value, reader: ir.Node
-) -> ir.Node:
-    node = ir.node(op, inputs, name=f"{name}_{op}")
-    output = node.outputs[0]
-    output.name, output.shape, output.type = node.name, like.shape, like.type
-    provenance.inherit(node, [reader], by=BY)
-    return node
+    def _node(
+        self,
+        op: str,
+        inputs: list[ir.Value],
+        name: str,
+        like: ir.Value,
+        reader: ir.Node,
+    ) -> ir.Node:
+        unique = graph.fresh_name(f"{name}_{op}", self._names)
+        node = ir.node(op, inputs, name=unique)
+        output = node.outputs[0]
+        output.name, output.shape, output.type = unique, like.shape, like.type
+        provenance.inherit(node, [reader], by=BY)
+        return node

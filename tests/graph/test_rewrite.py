@@ -29,6 +29,14 @@ def test_a_constant_takes_a_free_name(driver: ir.Model) -> None:
     assert (first.name, second.name) == ("c", "c_1")
 
 
+def test_a_constant_is_not_called_like_a_tensor(driver: ir.Model) -> None:
+    taken = [str(driver.graph[0].outputs[0].name), str(driver.graph.inputs[0].name)]
+
+    made = [graph.add_constant(driver.graph, np.zeros(2), name) for name in taken]
+
+    assert [value.name for value in made] == [f"{name}_1" for name in taken]
+
+
 def test_the_array_of_a_computed_value_is_not_known(driver: ir.Model) -> None:
     assert graph.array_of(driver.graph[0].outputs[0]) is None
 

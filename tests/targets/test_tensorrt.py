@@ -307,3 +307,26 @@ def test_products_by_batches_run_with_all_of_onnxruntimes_fusions() -> None:
         assert got[name].shape == exact.shape
         off = got[name].astype(np.float64) - exact.astype(np.float64)
         assert np.abs(off).max() < 0.6
+
+
+TIED = """
+<ir_version: 9, opset_import: ["" : 17]>
+tied (float[8,8] x, float[8,8] w) => (float[8,8] y) {
+    x_scale = Gemm(x, w)
+    x_DequantizeLinear = Relu(x_scale)
+    int8_zero = Gemm<transB=1>(x_DequantizeLinear, w)
+    y = Relu(int8_zero)
+}
+"""
+
+
+def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
+    weights = {"w": np.random.default_rng(7).standard_normal((8, 8))}
+    x = np.random.default_rng(8).standard_normal((8, 8)).astype(np.float32)
+    model = net(TIED, weights)
+
+    result = placed(model, reach=12)
+
+    onnx.checker.check_model(ir.to_proto(result), full_check=True)
+    got, want = run_once(result, {"x": x})["y"], run_once(model, {"x": x})["y"]
+    assert np.abs(got.astype(np.float64) - want.astype(np.float64)).max() < 2

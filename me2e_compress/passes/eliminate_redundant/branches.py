@@ -4,9 +4,14 @@ from collections.abc import Mapping
 
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, provenance, replace_value
+from me2e_compress.graph import (
+    array_of,
+    fresh_name,
+    provenance,
+    replace_value,
+    value_names,
+)
 from me2e_compress.graph.rewrite import can_replace
-from me2e_compress.passes.edits import graphs_of
 from me2e_compress.passes.fold_constants.inference import branch_fits
 
 
@@ -45,37 +50,20 @@ def inline_branch(
 
 
 def _move(branch: ir.Graph, node: ir.Node, graph: ir.Graph, by: str) -> None:
-    names = _names(graph)
+    names = value_names(graph)
     weights = list(branch.initializers.values())
     nodes = list(branch)
     branch.outputs.clear()
     branch.initializers.clear()
     branch.remove(nodes)
     for value in weights:
-        value.name = _fresh(value.name or "weight", names)
+        value.name = fresh_name(value.name or "weight", names)
         if value.const_value is not None:
             value.const_value.name = value.name
         graph.register_initializer(value)
     for inner in nodes:
         for value in inner.outputs:
             if value.name:
-                value.name = _fresh(value.name, names)
+                value.name = fresh_name(value.name, names)
         provenance.inherit(inner, (inner, node), by=by)
     graph.insert_before(node, nodes)
-
-
-def _names(graph: ir.Graph) -> set[str]:
-    names = {value.name or "" for value in graph.inputs}
-    for body in graphs_of(graph):
-        names.update(body.initializers)
-        names.update(value.name or "" for node in body for value in node.outputs)
-    return names
-
-
-def _fresh(name: str, names: set[str]) -> str:
-    unique, count = name, 0
-    while unique in names:
-        count += 1
-        unique = f"{name}_{count}"
-    names.add(unique)
-    return unique

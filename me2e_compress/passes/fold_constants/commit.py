@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import add_constant, provenance, replace_value
+from me2e_compress.graph import add_constant, provenance, replace_value, value_names
 from me2e_compress.passes.edits import Array, put
 from me2e_compress.passes.fold_constants.choice import Choice
 
@@ -18,7 +18,10 @@ def commit(
     A folded tensor takes the name of the value it replaces. A graph output cannot be
     an initializer for every runtime: an Identity hands it on. Gives the initializers.
     """
-    stored = _Store(graph)
+    leave = {
+        value.name for one in choice.gone for n in one.nodes for value in n.outputs
+    }
+    stored = _Store(graph, value_names(graph) - leave)
     place = {
         value: (one, index)
         for one in choice.gone
@@ -43,8 +46,9 @@ def commit(
 class _Store:
     """Gives equal arrays one initializer."""
 
-    def __init__(self, graph: ir.Graph) -> None:
+    def __init__(self, graph: ir.Graph, names: set[str]) -> None:
         self.graph = graph
+        self.names = names
         self.known: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
 
     def add(self, array: Array, name: str) -> ir.Value:
@@ -52,7 +56,7 @@ class _Store:
         content = hashlib.blake2b(data, digest_size=16)
         key = (str(array.dtype), array.shape, content.digest())
         if key not in self.known:
-            self.known[key] = add_constant(self.graph, array, name)
+            self.known[key] = add_constant(self.graph, array, name, self.names)
         return self.known[key]
 
 

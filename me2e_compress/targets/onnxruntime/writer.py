@@ -23,15 +23,16 @@ class Writer:
     def __init__(self, where: ir.Graph) -> None:
         self.graph = where
         self._constants: dict[tuple[str, bytes], ir.Value] = {}
-        self._names = {value.name for node in where for value in node.outputs}
-        self._names |= {value.name for value in where.inputs}
+        self._names = graph.value_names(where)
 
     def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
         """Give the initializer that holds an array, a new one if there is none."""
         kind = f"{array.dtype}{array.shape}"
         key = (kind, hashlib.sha256(array.tobytes()).digest())
         if key not in self._constants:
-            self._constants[key] = graph.add_constant(self.graph, array, name)
+            self._constants[key] = graph.add_constant(
+                self.graph, array, name, self._names
+            )
         return self._constants[key]
 
     def node(
@@ -51,11 +52,7 @@ class Writer:
             sources: the nodes whose heir it is, the leading one first.
             attributes: integers.
         """
-        unique, count = name, 0
-        while unique in self._names:
-            count += 1
-            unique = f"{name}_{count}"
-        self._names.add(unique)
+        unique = graph.fresh_name(name, self._names)
         node = ir.node(op, inputs, attributes or {}, name=unique)
         node.outputs[0].name = unique
         provenance.inherit(node, sources, by=BY)

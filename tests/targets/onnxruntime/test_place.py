@@ -162,3 +162,22 @@ def test_a_matrix_with_leading_ones_is_one_matrix_with_a_bias() -> None:
 
     assert kernels(result)["QGemm"] == 1
     assert sqnr_db(ran(model, fed)["y"], ran(result, fed)["y"]) > 30
+
+
+def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    clash (float[1,4,8,8] x, float[8,4,1,1] w, float[8,8,1,1] x_float)
+        => (float[1,8,8,8] y) {
+        x_scale = Conv(x, w)
+        x_uint8 = Relu(x_scale)
+        y = Conv(x_uint8, x_float)
+    }
+    """
+    model = drawn(text, {"w": (8, 4, 1, 1), "x_float": (8, 8, 1, 1)})
+    fed = feeds(2, x=(1, 4, 8, 8))
+
+    result = calibrated(model, fed)
+
+    onnx.checker.check_model(ir.to_proto(result), full_check=True)
+    assert sqnr_db(ran(model, fed)["y"], ran(result, fed)["y"]) > 30
