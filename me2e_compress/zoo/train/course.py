@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-
 from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.latency import FixedLatency, LatencySource
 from me2e_compress.graph import sha256_of
@@ -23,6 +21,7 @@ from me2e_compress.zoo.train.log import Log
 from me2e_compress.zoo.train.loop import train
 from me2e_compress.zoo.train.options import difference
 from me2e_compress.zoo.train.stage import LOG
+from me2e_compress.zoo.train.stored import samples_in
 
 MANIFEST = "course.json"
 NO_LATENCY = FixedLatency()
@@ -85,7 +84,8 @@ def run(
         What came of each round; the last driver is the one that was asked for.
 
     Raises:
-        TrainingError: the folder is of another course, or a part failed.
+        TrainingError: the folder is of another course, an episode is damaged, or a
+            part failed.
         EvaluationError: episodes or results of something else are in the way.
     """
     course = course.on(workers)
@@ -212,9 +212,9 @@ def claim(folder: Path, course: Course) -> None:
 
 
 def frames_in(files: Iterable[Path]) -> int:
-    """How many samples different episodes hold, six camera images each."""
-    total = 0
-    for file in sorted(set(files)):
-        with np.load(file) as content:
-            total += len(content["time_us"])
-    return total
+    """How many samples different episodes hold, six camera images each.
+
+    Raises:
+        TrainingError: a file is not an episode.
+    """
+    return sum(samples_in(file) for file in sorted(set(files)))

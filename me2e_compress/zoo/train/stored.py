@@ -61,7 +61,7 @@ def read(file: Path, image_size: tuple[int, int]) -> Stored:
     Raises:
         TrainingError: it is not an episode, or its cameras are laid out otherwise.
     """
-    arrays = _arrays(file)
+    arrays = _arrays(file, (*KEPT, "jpeg_offsets", "jpeg"))
     offsets, data = arrays.pop("jpeg_offsets"), arrays.pop("jpeg")
     pictures = [data[begin:end].copy() for begin, end in pairwise(offsets)]
     for name, shape in KEPT.items():
@@ -82,9 +82,17 @@ def read(file: Path, image_size: tuple[int, int]) -> Stored:
     return Stored(arrays, pictures)
 
 
-def _arrays(file: Path) -> dict[str, Array]:
+def samples_in(file: Path) -> int:
+    """How many samples an episode holds.
+
+    Raises:
+        TrainingError: it is not an episode.
+    """
+    return int(_arrays(file, ("time_us",))["time_us"].size)
+
+
+def _arrays(file: Path, names: tuple[str, ...]) -> dict[str, Array]:
     """What is read of a file; nothing is known of it yet but the names."""
-    names = (*KEPT, "jpeg_offsets", "jpeg")
     try:
         with file.open("rb") as source:
             content = np.load(source)

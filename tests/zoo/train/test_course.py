@@ -29,6 +29,7 @@ from me2e_compress.zoo.train.episodes.collection import Collection, tasks_of
 from me2e_compress.zoo.train.log import Log
 from me2e_compress.zoo.train.small import LATENCY, SMALL
 from me2e_compress.zoo.train.stage import Training
+from tests.zoo.train.made import arrays_of, write
 from tests.zoo.train.small import WORKERS
 
 pytestmark = pytest.mark.xdist_group("small-course")
@@ -222,6 +223,21 @@ def test_other_workers_are_another_course(tmp_path: Path) -> None:
 def test_more_workers_than_it_trains_with_do_not_matter(tmp_path: Path) -> None:
     claim(tmp_path, FULL.on(4))
     claim(tmp_path, FULL.on(8))
+
+
+def test_frames_of_an_episode_named_twice_count_once(tmp_path: Path) -> None:
+    file = write(tmp_path / "0.npz", arrays_of(3))
+    other = write(tmp_path / "1.npz", arrays_of(2))
+    assert frames_in([file, other, file]) == 5
+
+
+@pytest.mark.parametrize("kept", [0, 100, -40])
+def test_a_truncated_episode_is_named(tmp_path: Path, kept: int) -> None:
+    file = write(tmp_path / "0.npz", arrays_of(2))
+    file.write_bytes(file.read_bytes()[:kept])
+    with pytest.raises(TrainingError, match=r"0\.npz: not an episode: ") as caught:
+        frames_in([file])
+    assert "\n" not in str(caught.value)
 
 
 ONE = Round(1, 1, 1.0, (Training(steps=1),))
