@@ -60,6 +60,9 @@ class TraceLatency:
             bursts, and start over at the end; else draw them with replacement.
         scale: Speed ratio between the recording device and the one imagined.
         seed: Of the draws; each route has its own stream, whatever drives before it.
+
+    Raises:
+        EvaluationError: A negative seed.
     """
 
     samples_us: tuple[int, ...]
@@ -67,6 +70,11 @@ class TraceLatency:
     scale: float = 1.0
     seed: int = 0
     measures: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        """Refuse a seed that nothing can be drawn with, before anything drives."""
+        if self.seed < 0:
+            raise EvaluationError(f"latency: seed {self.seed}: must be 0 or more")
 
     def on_route(self, route: str) -> Charge:
         """Charge what the trace says next."""
@@ -116,8 +124,8 @@ def parse_latency(
         seed: For a trace.
 
     Raises:
-        EvaluationError: Another word, a frame rate or a scale that is not positive, or
-            a file that is no trace.
+        EvaluationError: Another word, a frame rate or a scale that is not positive, a
+            negative seed, or a file that is no trace.
     """
     if not 0.0 < scale < float("inf"):
         raise EvaluationError(f"latency scale {scale}: must be a positive number")

@@ -138,8 +138,8 @@ class Study:
         seed: Of bootstraps, of passes and of draws from traces.
 
     Raises:
-        StudyError: Nothing to drive, a name twice, a baseline that is no scheme, or a
-            trace asked for without frames to measure it on.
+        StudyError: Nothing to drive, a name twice, a baseline that is no scheme, a
+            negative seed, or a trace asked for without frames to measure it on.
     """
 
     title: str
@@ -164,6 +164,8 @@ class Study:
             )
         if not self.routes:
             raise StudyError(f"{self.title}: there is no route to drive")
+        if self.seed < 0:
+            raise StudyError(f"seed {self.seed}: must be 0 or more")
         untimed = [each for each in self.schemes if each.is_model and not each.trace]
         traced = [each.name for each in self.conditions if each.traced]
         if traced and untimed and self.held_out is None:

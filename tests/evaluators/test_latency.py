@@ -54,6 +54,14 @@ def test_a_trace_is_drawn_by_seed_and_route(trace: Path) -> None:
     assert first != charges(parse_latency(f"trace:{trace}", seed=2), "a")
 
 
+@pytest.mark.parametrize("in_order", [False, True])
+def test_a_negative_seed_is_refused_before_anything_drives(
+    trace: Path, in_order: bool
+) -> None:
+    with pytest.raises(EvaluationError, match="latency: seed -1: must be 0 or more"):
+        parse_latency(f"trace:{trace}", in_order=in_order, seed=-1)
+
+
 def test_a_route_does_not_depend_on_what_drove_before() -> None:
     source = TraceLatency(SAMPLES)
     alone = charges(source, "a")

@@ -16,6 +16,7 @@ from tests.study.conftest import IDEAL, Make
         ({"conditions": (IDEAL, IDEAL)}, "2 conditions are named ideal"),
         ({"baseline": "quick"}, "'quick' is no scheme; there are blind, slow, again"),
         ({"routes": ()}, "no route to drive"),
+        ({"seed": -1}, "seed -1: must be 0 or more"),
         (
             {"conditions": (Condition("device", "trace"),), "held_out": None},
             "condition device: the latency of slow is measured on held-out frames",
