@@ -44,11 +44,16 @@ def has_subgraph(node: ir.Node) -> bool:
 
 
 def single_reader(value: ir.Value) -> ir.Node | None:
-    """Give the one node that reads a value, once; None if others do, or outputs."""
+    """Give the one node that reads a value, once; None if others do, or outputs.
+
+    Nor is it one where it stands in another graph than the value's maker, in the body
+    of an If or Loop: that runs seldom, or often, and what it makes stays inside.
+    """
     uses = value.uses()
     if len(uses) != 1 or value.is_graph_output():
         return None
-    return next(iter(uses)).node
+    node, made = next(iter(uses)).node, value.producer()
+    return node if made is None or made.graph is node.graph else None
 
 
 def is_read(value: ir.Value) -> bool:

@@ -304,3 +304,21 @@ def test_swish_is_written_when_asked_for() -> None:
     model = read(opset(24) + body("a = Sigmoid(x) y = Mul(x, a)"))
     apply(FuseBasic(swish=True), model)
     assert ops(model) == ["Swish"]
+
+
+def test_nothing_is_fused_into_a_body() -> None:
+    text = """
+    g (float[4,8] x, bool seen) => (float[4,6] y) {
+        m = MatMul(x, w)
+        c = Mul(m, two)
+        y = If (seen) <then_branch = then () => (float[4,6] t) { t = Add(m, b) },
+                       else_branch = other () => (float[4,6] e) { e = Mul(c, two) }>
+    }
+    """
+    weights = {"w": normal(8, 6), "b": normal(6), "two": np.float32(2)}
+    model = read(opset(17) + text, **weights)
+
+    result = apply(FuseBasic(), model)
+
+    assert result.changes == 0
+    assert ops(model) == ["MatMul", "Mul", "If"]

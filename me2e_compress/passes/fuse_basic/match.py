@@ -41,7 +41,7 @@ def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
 
 
 def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
-    """Give the maker of a value that nothing else reads."""
+    """Give the maker of a value that one node reads, of the same graph."""
     node = maker(value, *op_types)
     if node is None or value is None or single_reader(value) is None:
         return None

@@ -88,11 +88,10 @@ def is_bias(value: ir.Value | None, rank: int) -> bool:
 def biased_end(product: ir.Node) -> ir.Node | None:
     """Give the Add that puts a bias on a MatMul, if nothing else reads the product."""
     value = product.outputs[0]
-    readers = list(value.consumers())
+    addition = _sole_reader(product)
     rank = rank_of(product.inputs[0])
-    if value.is_graph_output() or len(readers) != 1 or readers[0].op_type != "Add":
+    if addition is None or addition.op_type != "Add":
         return None
-    addition = readers[0]
     others = [each for each in addition.inputs if each is not value]
     return addition if len(others) == 1 and is_bias(others[0], rank) else None
 
@@ -111,15 +110,19 @@ def end_of(node: ir.Node) -> ir.Value:
 
     A ReLU costs nothing where its uint8 grid begins at zero: quantization clips.
     """
+    reader = _sole_reader(node)
+    if reader is not None and is_clip_at_zero(reader):
+        return reader.outputs[0]
+    return node.outputs[0]
+
+
+def _sole_reader(node: ir.Node) -> ir.Node | None:
+    """Give the one reader of what a node answers, if it stands in the same graph."""
     value = node.outputs[0]
     readers = list(value.consumers())
-    if (
-        len(readers) == 1
-        and not value.is_graph_output()
-        and is_clip_at_zero(readers[0])
-    ):
-        return readers[0].outputs[0]
-    return value
+    if len(readers) != 1 or value.is_graph_output():
+        return None
+    return readers[0] if readers[0].graph is node.graph else None
 
 
 def is_clip_at_zero(node: ir.Node) -> bool:

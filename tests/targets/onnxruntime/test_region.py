@@ -2,8 +2,18 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.calibration.plan import make_plan
+from me2e_compress.targets.onnxruntime import tensors
 from tests.nets import net
-from tests.targets.onnxruntime.lowered import calibrated, feeds, kernels
+from tests.targets.onnxruntime.lowered import (
+    FULL,
+    calibrated,
+    feeds,
+    kernels,
+    lowered,
+    ran,
+    sqnr_db,
+)
 
 NECK = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -64,3 +74,48 @@ def test_a_sum_that_no_layer_reads_stays_float() -> None:
     found = kernels(calibrated(model, FED))
 
     assert (found["QLinearAdd"], found["Add"]) == (0, 1)
+
+
+BODY = """
+<ir_version: 9, opset_import: ["" : 17]>
+body (float[1,4,8,8] fine, float[6,4,1,1] w1, float[6,6,1,1] w2)
+    => (float[1,6,8,8] y) {
+    c = Conv(fine, w1)
+    total = ReduceSum<keepdims=0>(fine)
+    seen = Greater(total, total)
+    chosen = If (seen) <then_branch = then () => (float[1,6,8,8] t) {
+        t = Relu(c)
+    }, else_branch = other () => (float[1,6,8,8] e) { e = Conv(fine, w1) }>
+    y = Conv(chosen, w2)
+}
+"""
+
+
+def test_a_relu_in_a_body_is_no_part_of_the_convolution_before_it() -> None:
+    generator = np.random.default_rng(0)
+    shapes = {"w1": (6, 4, 1, 1), "w2": (6, 6, 1, 1)}
+    weights = {name: generator.standard_normal(size) for name, size in shapes.items()}
+    model, fed = net(BODY, weights), feeds(3, fine=(1, 4, 8, 8))
+
+    assert tensors(make_plan(model, FULL), model) == ("fine", "chosen", "c", "y")
+    want, got = ran(model, fed)["y"], ran(calibrated(model, fed), fed)["y"]
+    assert sqnr_db(want, got) > 25
+
+
+def test_a_bias_in_a_body_is_none_of_the_product_before_it() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    body (float[4,8] x, bool seen, float[8,6] w, float[6] b) => (float[4,6] y) {
+        m = MatMul(x, w)
+        y = If (seen) <then_branch = then () => (float[4,6] t) { t = Add(m, b) },
+                       else_branch = other () => (float[4,6] e) { e = MatMul(x, w) }>
+    }
+    """
+    generator = np.random.default_rng(1)
+    weights = {"w": generator.standard_normal((8, 6)), "b": np.ones(6)}
+
+    found = lowered(net(text, weights), 4.0)
+
+    assert [n.op_type for n in found.graph if n.op_type in ("Gemm", "MatMul")] == [
+        "MatMul"
+    ]
