@@ -19,6 +19,7 @@ import tomllib
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import pydantic
@@ -73,22 +74,23 @@ def load(name: str | Path) -> tuple[Pass, ...]:
         RecipeError: no such recipe, not TOML, or a pass or option nobody knows.
     """
     path, beside = Path(name), Path()
+    source: Path | Traversable = path
     if path.is_file():
         beside = path.parent
-        text = path.read_text(encoding="utf-8")
     elif str(name) in shipped():
         source = resources.files("me2e_compress") / "recipes" / f"{name}.toml"
-        text = source.read_text(encoding="utf-8")
     else:
         raise RecipeError(f"no recipe {name}: no such file; we ship {shipped()}")
     try:
-        entries = tomllib.loads(text).get("pass")
-    except tomllib.TOMLDecodeError as error:
+        content = tomllib.loads(source.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecipeError(f"{name} is not TOML: {error}") from error
-    if not isinstance(entries, list) or not entries:
+    entries = content.get("pass")
+    listed = entries if isinstance(entries, list) else []
+    if not listed or not all(isinstance(entry, dict) for entry in listed):
         raise RecipeError(f"{name} has no [[pass]]")
     built: list[Pass] = []
-    for entry in entries:
+    for entry in listed:
         options = dict(entry)
         built.append(_beside(build(str(options.pop("name", "")), options), beside))
     return tuple(built)

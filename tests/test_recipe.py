@@ -109,6 +109,8 @@ def test_a_file_and_a_text_say_the_same(tmp_path: Path) -> None:
     [
         ("", "has no .*pass"),
         ("[[pass]]\nname = 3 4\n", "is not TOML"),
+        ('pass = ["exact"]\n', "has no .*pass"),
+        ("pass = 1\n", "has no .*pass"),
         ('[[pass]]\nname = "nobody"\n', "no pass 'nobody'"),
         ('[[pass]]\ndrop = ["occ"]\n', "no pass ''"),
     ],

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from me2e_compress.calibration.arrays import load_arrays
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array
@@ -54,11 +55,10 @@ class Checkpoint:
         if self.path is None or not self.path.is_file():
             return Standing()
         try:
-            with np.load(self.path, allow_pickle=False) as held:
-                found = {name: held[name] for name in held}
+            found = load_arrays(self.path, "a checkpoint")
             key = json.loads(str(found.pop("key")))
-            done = int(found.pop("done"))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            done = int(str(found.pop("done")))
+        except (ValueError, KeyError) as error:
             raise FramesError(f"{self.path}: not a checkpoint ({error})") from error
         self._check(key)
         return Standing(

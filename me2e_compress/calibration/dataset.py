@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.calibration.arrays import load_arrays
 from me2e_compress.calibration.check import check_frame
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
@@ -62,12 +63,7 @@ class CalibrationSet:
         Raises:
             FramesError: the file cannot be read as arrays.
         """
-        path = self.files[index]
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                arrays: dict[str, Array] = {name: archive[name] for name in archive}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise FramesError(f"{path}: not a readable .npz ({error})") from error
+        arrays = load_arrays(self.files[index])
         return Frame(index, index in self.scenes, arrays)
 
     @property

@@ -1,7 +1,6 @@
 """What a value is on average: the constant that stands in for a module that is gone."""
 
 import dataclasses
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
+from me2e_compress.calibration.arrays import load_arrays
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.session import Session, replay
@@ -53,12 +53,7 @@ def load_means(path: Path, values: Sequence[str]) -> dict[str, Array]:
     Raises:
         FramesError: the file is missing or no ``.npz``, or lacks one of the values.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            found: dict[str, Array] = {name: archive[name] for name in archive}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        line = " ".join(str(error).split())
-        raise FramesError(f"{path}: not a readable .npz ({line})") from error
+    found = load_arrays(path)
     if missing := [name for name in values if name not in found]:
         raise FramesError(
             f"{path}: holds no mean of {missing[0]}; there is"

@@ -4,14 +4,14 @@ import dataclasses
 import functools
 import io
 import itertools
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.calibration.arrays import load_arrays
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 
@@ -22,6 +22,9 @@ magnitude itself, onnxruntime's percentile as many on both sides of zero.)"""
 
 _SMALLEST = -100
 """Least exponent of a histogram: below, float32 cannot hold bins per unit."""
+
+_KEPT = ("model", "source", "tensors", "frames", "gauges", "counts")
+"""What a file of statistics holds."""
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 
@@ -61,7 +64,7 @@ class Statistics:
         last = np.maximum.accumulate(np.where(empty, -1, rows), axis=0)
         taken = np.where(last < 0, np.argmin(empty, axis=0), last)
         filled = self.gauges[taken, np.arange(len(self.tensors))]
-        return np.where(empty.all(axis=0)[:, None], np.float32(0), filled)
+        return np.where(empty.all(axis=0, keepdims=True).T, np.float32(0), filled)
 
     @property
     def lows(self) -> Floats:
@@ -125,19 +128,24 @@ class Statistics:
         """
         if not path.is_file():
             raise FramesError(f"{path}: no such statistics file")
-        try:
-            with np.load(path, allow_pickle=False) as held:
-                counts = held["counts"]
-                return cls(
-                    str(held["model"]),
-                    str(held["source"]),
-                    tuple(held["tensors"].tolist()),
-                    tuple(held["frames"].tolist()),
-                    held["gauges"],
-                    counts if counts.size else None,
-                )
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise FramesError(f"{path}: not saved statistics ({error})") from error
+        held: dict[str, npt.NDArray[Any]] = load_arrays(path, "saved statistics")
+        if missing := [name for name in _KEPT if name not in held]:
+            raise FramesError(f"{path}: not saved statistics (no {missing[0]})")
+        counts, names, frames = (held[name] for name in ("counts", "tensors", "frames"))
+        fits = counts.size == 0 or counts.shape == (names.size, BINS)
+        if held["gauges"].shape != (*frames.shape, *names.shape, 3) or not fits:
+            raise FramesError(f"{path}: not saved statistics (their shapes differ)")
+        ends = np.isfinite(held["gauges"][..., :2]).all(-1)
+        if not (ends | no_element(held["gauges"])).all():
+            raise FramesError(f"{path}: not saved statistics (an end is no number)")
+        return cls(
+            str(held["model"]),
+            str(held["source"]),
+            tuple(names.tolist()),
+            tuple(frames.tolist()),
+            held["gauges"],
+            counts if counts.size else None,
+        )
 
 
 def no_element(gauges: Floats) -> npt.NDArray[np.bool_]:
@@ -146,7 +154,7 @@ def no_element(gauges: Floats) -> npt.NDArray[np.bool_]:
     Args:
         gauges: float32 [..., 3], as :class:`Statistics` keeps them.
     """
-    return (gauges[..., 0] == np.inf) & (gauges[..., 1] == -np.inf)
+    return np.asarray((gauges[..., 0] == np.inf) & (gauges[..., 1] == -np.inf))
 
 
 def merge(parts: Sequence[Statistics]) -> Statistics:

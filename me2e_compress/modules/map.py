@@ -93,7 +93,11 @@ class ModuleMap:
         if path.suffix == ".toml":
             if not path.is_file():
                 raise ModuleMapError(f"{path}: no such file")
-            return cls.parse(path.read_text("utf-8"), path.stem, str(path))
+            try:
+                text = path.read_text("utf-8")
+            except UnicodeDecodeError as error:
+                raise ModuleMapError(f"{path}: not TOML ({error})") from error
+            return cls.parse(text, path.stem, str(path))
         if str(source) not in presets():
             raise ModuleMapError(
                 f"{source}: no such module map; presets are {', '.join(presets())},"

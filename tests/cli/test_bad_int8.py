@@ -2,7 +2,7 @@
 
 import json
 import re
-import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -166,8 +166,110 @@ def test_a_graph_that_is_quantized_already(
     assert "give the float graph that it was made of" in line
 
 
-def test_a_recording_that_is_cut_short(refused: Refused, dense: Path) -> None:
-    shutil.copy(dense / "dense.onnx", dense / "frames" / "000001.npz")
+def bare(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros((4, 4), np.float32))
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def damaged(path: Path) -> None:
+    """Compress it, and break what was compressed."""
+    arrays = dict(np.load(path))
+    np.savez_compressed(path, **arrays)
+    content = bytearray(path.read_bytes())
+    begin = content.index(b"camera.npy") + len(b"camera.npy") + 20
+    content[begin] = 0xFF
+    path.write_bytes(bytes(content))
+
+
+def no_array(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("camera", "words")
+
+
+def encrypted(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[6] |= 1
+    content[content.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize("harm", [bare, cut, damaged, no_array, encrypted])
+def test_a_recording_that_cannot_be_read(
+    refused: Refused, dense: Path, harm: Callable[[Path], None]
+) -> None:
+    harm(dense / "frames" / "000001.npz")
 
     line = refused("--scheme", "full", "--frames", dense / "frames")
-    assert "000001.npz: not a readable" in line
+    assert "000001.npz: not a readable .npz (" in line
+
+
+LATIN = "caf\u00e9".encode("latin-1")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("-r", "bad.toml"), "bad.toml is not TOML"),
+        (("--scheme", "full", "--overrides", "bad.toml"), "bad.toml: not TOML"),
+        (("--scheme", "full", "--map", "bad.toml"), "bad.toml: not TOML"),
+        (("--scheme", "full", "--ranges", "bad.toml"), "bad.toml: not ranges"),
+    ],
+)
+def test_a_file_that_is_no_text(
+    refused: Refused,
+    dense: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    message: str,
+) -> None:
+    monkeypatch.chdir(dense)
+    (dense / "bad.toml").write_bytes(LATIN)
+
+    assert message in refused(*words)
+
+
+def test_a_plan_that_is_no_text(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (dense / "p.json").write_bytes(LATIN)
+
+    assert command("plan", dense / "p.json") == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "p.json: not a plan" in error
+
+
+def without_a_tensor(path: Path) -> None:
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "tensors": arrays["tensors"][1:]})
+
+
+def without_a_number(path: Path) -> None:
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "gauges": arrays["gauges"] * np.float32(np.nan)})
+
+
+@pytest.mark.parametrize(
+    "harm", [bare, cut, no_array, encrypted, without_a_tensor, without_a_number]
+)
+def test_a_shard_that_cannot_be_read(
+    command: Command,
+    dense: Path,
+    capsys: pytest.CaptureFixture[str],
+    harm: Callable[[Path], None],
+) -> None:
+    place = ("--map", dense / "map.toml", "-o", dense / "s.npz")
+    frames = (dense / "frames", "--shard", "1/1")
+    assert command("calibrate", dense / "dense.onnx", *frames, *place) == 0
+    harm(dense / "s.npz")
+    capsys.readouterr()
+
+    shard = ("--merge", dense / "s.npz", "-o", dense / "r.json")
+    assert command("calibrate", dense / "dense.onnx", *shard) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "s.npz: not saved statistics (" in error

@@ -34,7 +34,7 @@ def load_plan(path: Path) -> QuantPlan:
     """
     if not path.is_file():
         raise RecipeError(f"{path}: no such plan")
-    return _parse(path.read_text(encoding="utf-8"), str(path))
+    return _parse(path.read_bytes(), str(path))
 
 
 def stamp_plan(model: ir.Model, plan: QuantPlan) -> None:
@@ -89,7 +89,7 @@ def _short(decision: Decision | None) -> str:
     return "none" if decision is None else f"{decision.dtype} ({decision.rule})"
 
 
-def _parse(text: str, origin: str) -> QuantPlan:
+def _parse(text: str | bytes, origin: str) -> QuantPlan:
     try:
         return pydantic.TypeAdapter(QuantPlan).validate_json(text)
     except pydantic.ValidationError as error:

@@ -110,7 +110,11 @@ class Overrides(_Strict):
         """
         if not path.is_file():
             raise RecipeError(f"{path}: no such file of overrides")
-        return cls.parse(path.read_text(encoding="utf-8"), str(path))
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise RecipeError(f"{path}: not TOML ({error})") from error
+        return cls.parse(text, str(path))
 
     @classmethod
     def parse(cls, text: str, origin: str = "overrides") -> Self:
