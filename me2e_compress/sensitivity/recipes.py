@@ -1,5 +1,7 @@
 """From what was found to a recipe."""
 
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 from me2e_compress.errors import EvaluationError
@@ -14,10 +16,13 @@ def advise(
     limit: float,
     driving_limit: float | None = None,
 ) -> Choice:
-    """Give the choice that keeps the loss within a limit, and floats little for it.
+    """Give a choice that keeps the loss within a limit, and floats little for it.
 
     Starts with all modules in int8. Until the measured losses are within the limits,
-    the costliest module first gives up the nodes that are to blame, then all of them.
+    the costliest module first gives up the nodes that are to blame, the worst first,
+    then all of them. Then each that was given up, the last first, is int8 again if
+    the losses stay within the limits: errors may cancel, or one culprit hide behind
+    another.
 
     Args:
         trials: judges variants.
@@ -32,14 +37,61 @@ def advise(
     Raises:
         EvaluationError: a limit of driving, and trials that have no hook for it.
     """
-    for choice in _steps(trials, found):
+
+    def fits(given: Sequence[_Sacrifice]) -> bool:
+        choice = _without(trials, found, given)
         if not choice.modules:
-            return choice
+            return True
         if trials.score(choice).loss > limit:
-            continue
-        if driving_limit is None or _driving_loss(trials, choice) <= driving_limit:
-            return choice
-    return Choice(())
+            return False
+        return driving_limit is None or _driving_loss(trials, choice) <= driving_limit
+
+    order, given = _sacrifices(found), list[_Sacrifice]()
+    while not fits(given):
+        given.append(order[len(given)])
+    for each in reversed(given):
+        kept = [other for other in given if other is not each]
+        if each.loss <= limit and fits(kept):
+            given = kept
+    return _without(trials, found, given)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Sacrifice:
+    """What may be given up: nodes of a module, or all of it; and its loss alone."""
+
+    module: str
+    nodes: tuple[str, ...] | None
+    loss: float
+
+
+def _sacrifices(found: Sensitivity) -> list[_Sacrifice]:
+    """List everything in the order in which it is given up."""
+    order = []
+    for each in found.findings:
+        name, own = each.module, each.score.loss
+        order += [_Sacrifice(name, group, loss) for group, loss in each.blamed]
+        order.append(_Sacrifice(name, None, own))
+    return order
+
+
+def _without(trials: Trials, found: Sensitivity, given: Sequence[_Sacrifice]) -> Choice:
+    """Give the choice of all modules but what was given up."""
+    gone = {each.module for each in given if each.nodes is None}
+    names = dict[str, list[str]]()
+    for each in given:
+        if each.module not in gone:
+            names.setdefault(each.module, []).extend(each.nodes or ())
+    # A module that gave up each of its nodes is given up.
+    gone |= {
+        each.module
+        for each in found.findings
+        if len(set(names.get(each.module, ()))) >= each.nodes
+    }
+    left = {each.module for each in found.findings} - gone
+    floats = [name for module in names if module in left for name in names[module]]
+    modules = (name for name in trials.modules.names() if name in left)
+    return Choice(tuple(modules), tuple(floats))
 
 
 def _driving_loss(trials: Trials, choice: Choice) -> float:
@@ -47,24 +99,6 @@ def _driving_loss(trials: Trials, choice: Choice) -> float:
     if whole is None or got is None:
         raise EvaluationError("a limit of driving needs trials that are driven")
     return whole - got
-
-
-def _steps(trials: Trials, found: Sensitivity) -> list[Choice]:
-    """List choices from all modules to none, the costliest given up first."""
-    left = {each.module for each in found.findings}
-
-    def choice(floats: list[str]) -> Choice:
-        names = (name for name in trials.modules.names() if name in left)
-        return Choice(tuple(names), tuple(floats))
-
-    steps = [choice([])]
-    for each in found.findings:
-        blamed = [name for group, _ in each.blamed for name in group]
-        if blamed and len(blamed) < each.nodes:
-            steps.append(choice(blamed))
-        left.discard(each.module)
-        steps.append(choice([]))
-    return steps
 
 
 def write_recipe(

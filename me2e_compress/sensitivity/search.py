@@ -62,7 +62,7 @@ def search(
 
     Every module is scored and weighed alone; all assignments are predicted from that,
     and the best of those that should fit are built, scored and weighed in turn until
-    one does fit.
+    one does fit; the last that is tried is the cheapest of all.
 
     Returns:
         What was tried; the last one fits.
@@ -86,7 +86,11 @@ def search(
     ranked = _predict(active, losses, savings, float_cost)
     fitting = [each for each in ranked if each.cost <= budget.limit]
     tried: list[Candidate] = []
-    for candidate in fitting[:most_tried]:
+    cheapest = min(ranked, key=lambda each: each.cost)
+    chosen = fitting[: most_tried - 1]
+    if fitting and cheapest not in chosen:
+        chosen.append(cheapest)
+    for candidate in chosen:
         choice = Choice(candidate.modules)
         cost = budget.cost(trials.variant(choice))
         tried.append(

@@ -10,6 +10,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.rules import rules_named
 from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.fidelity import Displacement, Fidelity
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -17,12 +18,14 @@ from me2e_compress.sensitivity import (
     Budget,
     Choice,
     Drive,
+    Score,
     Trials,
     advise,
     analyse,
     search,
     write_recipe,
 )
+from me2e_compress.sensitivity.analysis import names_of
 from me2e_compress.targets import TARGETS
 from tests.frames import record
 from tests.nets import net
@@ -130,6 +133,51 @@ def test_the_advice_floats_the_culprit_and_nothing_else(tmp_path: Path) -> None:
     assert advise(judge, found, 0.0) == Choice(())
 
 
+def invented(judge: Trials, cost: dict[str, float], *, joint: bool = False) -> Trials:
+    """Losses by table: those of what is int8 added up; ``joint``: the largest."""
+
+    def score(choice: Choice) -> Score:
+        costs = [
+            cost[name]
+            for module in choice.modules
+            for name in names_of(judge, module)
+            if name not in choice.floats
+        ]
+        loss = max(costs, default=0.0) if joint else sum(costs)
+        plan = Displacement(mean_m=loss, max_m=loss)
+        return Score(Fidelity((), (), plan, "", 1), 0)
+
+    judge.score = score  # type: ignore[method-assign]
+    return judge
+
+
+COSTS = {"/backbone/MatMul_0": 0.1, "/backbone/MatMul_1": 0.1} | {
+    f"/head/MatMul_{at}": loss for at, loss in enumerate((4, 0.2, 3, 0.1), start=2)
+}
+
+
+def test_one_culprit_after_the_other_is_given_up(tmp_path: Path) -> None:
+    judge = invented(trials(tmp_path, 99), COSTS)
+    found = analyse(judge, ("backbone", "head"))
+    both = ("backbone", "head")
+
+    assert advise(judge, found, 7.0) == Choice(both, ("/head/MatMul_2",))
+
+
+def test_what_fits_in_spite_of_its_blame_is_taken_back(tmp_path: Path) -> None:
+    judge = invented(trials(tmp_path, 99), COSTS, joint=True)
+    found = analyse(judge, ("backbone", "head"))
+    assert [group for group, _ in found.findings[0].blamed] == [
+        ("/head/MatMul_2",),
+        ("/head/MatMul_4",),
+    ]
+
+    # 4 was in vain, 2 alone is too much
+    choice = advise(judge, dataclasses.replace(found, findings=found.findings[::-1]), 3)
+
+    assert choice == Choice(("backbone", "head"), ("/head/MatMul_2",))
+
+
 def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
     judge = trials(tmp_path, 3)
     choice = Choice(("backbone", "head"), ("/head/MatMul_3",))
@@ -226,6 +274,21 @@ def test_the_search_keeps_the_budget_and_loses_least(tmp_path: Path) -> None:
         assert each.score is not None
         assert each.measured_cost is not None
     assert tight[-1].measured_cost == only_backbone
+
+
+def test_the_last_that_is_tried_is_the_cheapest(tmp_path: Path) -> None:
+    judge, both = trials(tmp_path, 3), ("backbone", "head")
+    whole = weight_bytes(judge.model)
+    least = weight_bytes(judge.variant(Choice(both)))
+    weighed: list[float] = []
+
+    def cost(made: ir.Model) -> float:  # once all are predicted, only both stay cheap
+        weighed.append(weight_bytes(made))
+        return weighed[-1] + (whole if len(weighed) > 3 and weighed[-1] > least else 0)
+
+    found = search(judge, both, Budget(whole, "bytes", cost), most_tried=2)
+
+    assert [each.modules for each in found] == [(), both]
 
 
 def test_a_budget_that_nothing_fits_is_an_error(tmp_path: Path) -> None:
