@@ -87,6 +87,8 @@ class QuantizeInt8:
         target = target_named(self.target)
         graph.infer_shapes(model)
         plan = self.plan(model, context)
+        kept_float = target.kept_float(plan, model)
+        plan = dataclasses.replace(plan, target=target.name, kept_float=kept_float)
         tensors = target.tensors(plan, model)
         if not tensors:
             return PassResult(model, 0, ("nothing to quantize", *_notes(plan)))
@@ -101,7 +103,7 @@ class QuantizeInt8:
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
         notes = (*_notes(plan), *_findings(plan, ranges), _lint(placed, self.target))
-        return PassResult(placed, len(plan.chosen), notes)
+        return PassResult(placed, len(plan.placed), notes)
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
         """Decide for every node of a graph whose shapes are inferred."""
@@ -119,12 +121,34 @@ class QuantizeInt8:
 
 def _notes(plan: QuantPlan) -> tuple[str, ...]:
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
+    found = f"{len(plan.placed)} of {len(plan.decisions)} nodes {INT8}"
+    if plan.kept_float:
+        found += f"; {len(plan.chosen)} by the plan"
     scheme = plan.scheme
     close = [f"{each.node}: {each.borderline}" for each in plan.borderline]
     return (
         f"scheme {scheme.name}: {', '.join(scheme.modules)}",
-        f"{len(plan.chosen)} of {len(plan.decisions)} nodes {INT8}; by rule: {counts}",
+        f"{found}; by rule: {counts}",
+        *_kept_float(plan),
         *_first(close, "close decisions"),
+    )
+
+
+def _kept_float(plan: QuantPlan) -> tuple[str, ...]:
+    """Say which of the plan's nodes the target leaves in float, a line a reason."""
+    reasons = dict.fromkeys(each.reason for each in plan.kept_float)
+    nodes = {
+        reason: [
+            each.node or each.output
+            for each in plan.kept_float
+            if each.reason == reason
+        ]
+        for reason in reasons
+    }
+    return tuple(
+        line
+        for reason, names in nodes.items()
+        for line in _first(names, f"{len(names)} stay float on {plan.target}, {reason}")
     )
 
 

@@ -16,6 +16,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.plan import (
     Decision,
+    KeptFloat,
     QuantPlan,
     share_scales,
     tensors_of,
@@ -34,6 +35,11 @@ BY = "quantize-int8"
 def tensors(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
     """Name the activations that :func:`place` needs a range of."""
     return tensors_of(plan, model)
+
+
+def kept_float(plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
+    """List the plan's nodes that :func:`place` leaves in float: none."""
+    return ()
 
 
 def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:

@@ -17,6 +17,7 @@ from me2e_compress.metrics.fidelity import compare
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
+from me2e_compress.targets.onnxruntime import int8_layers
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, image, net
 
@@ -209,3 +210,38 @@ def test_the_same_frames_give_the_same_graph(context: Context) -> None:
         for _ in range(2)
     )
     assert first == again
+
+
+def test_what_the_target_keeps_in_float_is_not_counted_as_int8(
+    context: Context,
+) -> None:
+    result = QuantizeInt8(target="onnxruntime").run(conv_attention(), context)
+
+    assert result.changes == len(int8_layers(result.model)) == 2
+    assert (
+        "2 of 10 nodes int8; 4 by the plan; by rule: attention 2, layer 2"
+    ) in result.notes
+    assert (
+        "2 stay float on onnxruntime, products of two activations are slower in int8:"
+        " /head/QK; /head/AV"
+    ) in result.notes
+    plan = plan_of(result.model)
+    assert plan is not None
+    assert (len(plan.chosen), len(plan.placed), plan.target) == (4, 2, "onnxruntime")
+
+
+def test_where_the_target_takes_nothing_nothing_is_int8(context: Context) -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    up (float[1,3,8,8] image, float[3,8,2,2] w) => (float[1,8,16,16] y) {
+        ["/backbone/Up"] y = ConvTranspose<strides=[2,2]>(image, w)
+    }
+    """
+    model = net(text, {"w": np.ones((3, 8, 2, 2))})
+    options = QuantizeInt8(scheme="feature-ext", target="onnxruntime")
+
+    result = options.run(model, context)
+
+    assert result.changes == 0
+    assert result.notes[0] == "nothing to quantize"
+    assert "0 of 1 nodes int8; 1 by the plan; by rule: layer 1" in result.notes

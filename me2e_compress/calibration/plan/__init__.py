@@ -5,6 +5,7 @@ from me2e_compress.calibration.plan.decision import (
     INT8,
     RESIDUAL,
     Decision,
+    KeptFloat,
     QuantPlan,
     ScaleGroup,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "RESIDUAL",
     "Decision",
     "Difference",
+    "KeptFloat",
     "Overrides",
     "QuantPlan",
     "ScaleGroup",

@@ -67,25 +67,50 @@ class ScaleGroup:
 
 
 @dataclasses.dataclass(frozen=True)
+class KeptFloat:
+    """A node that a plan makes int8, and one target does not.
+
+    Attributes:
+        node: its name.
+        output: name of its first output.
+        reason: what the target lacks.
+    """
+
+    node: str
+    output: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
 class QuantPlan:
-    """Decisions for every node of a graph, in graph order.
+    """Decisions for every node of a graph, in graph order; the same for all targets.
 
     Attributes:
         scheme: what was asked for.
         decisions: one a node.
         rules: name of the rule set that was asked.
         groups: what was decided together.
+        target: for which it was carried out; empty where it was not.
+        kept_float: which of its int8 nodes stay float on that target.
     """
 
     scheme: QuantScheme
     decisions: tuple[Decision, ...]
     rules: str = "paper"
     groups: tuple[ScaleGroup, ...] = ()
+    target: str = ""
+    kept_float: tuple[KeptFloat, ...] = ()
 
     @property
     def chosen(self) -> tuple[Decision, ...]:
         """The nodes that read int8: layers, attention products, residual Adds."""
         return tuple(each for each in self.decisions if each.dtype == INT8)
+
+    @property
+    def placed(self) -> tuple[Decision, ...]:
+        """Those of them that are int8 in the graph for the target."""
+        left = {each.output for each in self.kept_float}
+        return tuple(each for each in self.chosen if each.output not in left)
 
     @property
     def borderline(self) -> tuple[Decision, ...]:

@@ -2,6 +2,6 @@
 
 from me2e_compress.targets.onnxruntime.census import int8_layers
 from me2e_compress.targets.onnxruntime.convert import convert, unranged
-from me2e_compress.targets.onnxruntime.place import place, tensors
+from me2e_compress.targets.onnxruntime.place import kept_float, place, tensors
 
-__all__ = ["convert", "int8_layers", "place", "tensors", "unranged"]
+__all__ = ["convert", "int8_layers", "kept_float", "place", "tensors", "unranged"]

@@ -17,25 +17,35 @@ MOVES = frozenset(
 """Operators that choose, move or average elements: what they answer lies on the grid,
 or at least in the range, of what they read."""
 
+LAYERS = ("Conv", "Gemm", "MatMul")
+"""Operators with a weight that have an int8 kernel."""
+
 JOINS = frozenset({"Add", "Concat"})
 """Operators that read several tensors of the network, each on a grid of its own."""
 
 
 def is_layer(node: ir.Node) -> bool:
-    """Say whether a layer has an int8 kernel; its weight is taken for granted.
+    """Say whether a layer has an int8 kernel; its weight is taken for granted."""
+    return objection(node) is None
+
+
+def objection(node: ir.Node) -> str | None:
+    """Say why a layer has no int8 kernel; None if it has one.
 
     There is QLinearConv, but none for ConvTranspose; QGemm has neither beta nor a
     transposed left operand; MatMul must have one weight for the whole batch.
     """
-    if node.domain not in ("", "ai.onnx"):
-        return False
+    if node.domain not in ("", "ai.onnx") or node.op_type not in LAYERS:
+        return f"there is no int8 kernel for {node.op_type}"
     if node.op_type == "Conv":
-        return bias_of(node) is None or graph.array_of(bias_of(node)) is not None
+        stored = bias_of(node) is None or graph.array_of(bias_of(node)) is not None
+        return None if stored else "the bias is computed"
     if node.op_type == "Gemm":
-        return _is_plain_gemm(node)
-    if node.op_type != "MatMul":
-        return False
-    return rank_of(node.inputs[0]) >= 2 and is_one_matrix(node)
+        plain = _is_plain_gemm(node)
+        return None if plain else "QGemm takes no factors, and one bias for all rows"
+    if rank_of(node.inputs[0]) < 2:
+        return "the left operand is a vector, or of unknown rank"
+    return None if is_one_matrix(node) else "the weight is a batch of matrices"
 
 
 def rank_of(value: ir.Value | None) -> int:

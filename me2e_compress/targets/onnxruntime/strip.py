@@ -7,7 +7,7 @@ from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.rewrite import can_replace
 from me2e_compress.targets.onnxruntime.draft import Draft
-from me2e_compress.targets.onnxruntime.kernels import is_layer
+from me2e_compress.targets.onnxruntime.kernels import LAYERS, is_layer
 from me2e_compress.targets.onnxruntime.stored import (
     DEQUANTIZE,
     QUANTIZE,
@@ -15,8 +15,6 @@ from me2e_compress.targets.onnxruntime.stored import (
     step_of,
     weight_of,
 )
-
-LAYERS = ("Conv", "Gemm", "MatMul")
 
 
 def draft_of_qdq(model: ir.Model) -> Draft:

@@ -9,7 +9,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.targets.lint import lint
-from me2e_compress.targets.onnxruntime import place, tensors
+from me2e_compress.targets.onnxruntime import int8_layers, kept_float, place, tensors
 from tests.nets import conv_attention
 from tests.targets.onnxruntime.lowered import (
     FULL,
@@ -181,3 +181,37 @@ def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
 
     onnx.checker.check_model(ir.to_proto(result), full_check=True)
     assert sqnr_db(ran(model, fed)["y"], ran(result, fed)["y"]) > 30
+
+
+KEPT = """
+<ir_version: 9, opset_import: ["" : 17]>
+kept (float[1,8,4,4] x, float[8,8,1,1] w, float[8,8,2,2] up, float[8,4,4] many)
+    => (float[1,8,4,4] s, float[1,8,8,8] u, float[1,8,4,4] m) {
+    c = Conv(x, w)
+    s = Add(c, x)
+    u = ConvTranspose<kernel_shape=[2,2], strides=[2,2]>(x, up)
+    m = MatMul(x, many)
+}
+"""
+
+
+def test_what_the_kernels_do_not_take_is_listed_with_the_reason() -> None:
+    model = drawn(KEPT, {"w": (8, 8, 1, 1), "up": (8, 8, 2, 2), "many": (8, 4, 4)})
+    plan = make_plan(model, FULL)
+
+    found = {each.output: each.reason for each in kept_float(plan, model)}
+
+    assert found == {
+        "s": "a sum that no int8 kernel reads, or of which none gives a side",
+        "u": "there is no int8 kernel for ConvTranspose",
+        "m": "the weight is a batch of matrices",
+    }
+    assert len(int8_layers(lowered(model))) == len(plan.chosen) - len(found)
+
+
+def test_attention_products_are_listed_as_float() -> None:
+    model = conv_attention()
+
+    found = kept_float(make_plan(model, FULL), model)
+
+    assert [each.node for each in found] == ["/head/QK", "/head/AV"]
