@@ -88,6 +88,11 @@ def calibrate(
     """
     observer(method)
     _check_sources(frames, shards, foreign, part)
+    if part is not None and (as_json or tensorrt_cache or onnxruntime_table):
+        raise FramesError(
+            "a shard has no ranges yet: leave --json, --tensorrt-cache and"
+            " --onnxruntime-table to --merge"
+        )
     checkpoint = output.with_name(output.name + ".checkpoint")
     read = (model, frames, recipe_name, module_map, foreign, *(shards or ()))
     check_output([output, checkpoint, tensorrt_cache], read)

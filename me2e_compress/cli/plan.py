@@ -64,10 +64,10 @@ def plan(
     found = read_plan(model, options, module_map)
     if output is not None:
         save_plan(found, output)
-    if as_json:
+    if against is not None:
+        _compare(read_plan(against, options, module_map), found, as_json)
+    elif as_json:
         print_json(record(found))
-    elif against is not None:
-        _compare(read_plan(against, options, module_map), found)
     else:
         _show(found, every=every)
 
@@ -130,8 +130,11 @@ def _groups(found: QuantPlan) -> Table:
     return shown
 
 
-def _compare(old: QuantPlan, new: QuantPlan) -> None:
-    lines = [str(each) for each in differences(old, new)]
-    for line in lines:
-        console.print(escape(line), soft_wrap=True)
-    console.print(f"{len(lines)} differences")
+def _compare(old: QuantPlan, new: QuantPlan, as_json: bool) -> None:
+    found = tuple(differences(old, new))
+    if as_json:
+        print_json(found)
+        return
+    for each in found:
+        console.print(escape(str(each)), soft_wrap=True)
+    console.print(f"{len(found)} differences")

@@ -1,10 +1,11 @@
 """``me2e-compress search``."""
 
-import dataclasses
+from collections.abc import Sequence
 from typing import Annotated
 
 import onnx_ir as ir
 import typer
+from rich.markup import escape
 
 from me2e_compress import graph
 from me2e_compress.cli.console import console, print_json, progress, table
@@ -24,7 +25,7 @@ from me2e_compress.cli.trials import (
 from me2e_compress.errors import RecipeError
 from me2e_compress.runtime.race import race
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity import Budget, Choice, Trials
+from me2e_compress.sensitivity import Budget, Candidate, Choice, Trials
 from me2e_compress.sensitivity import search as find
 
 
@@ -68,17 +69,22 @@ def search(
     )
     with progress("modules") as advance:
         tried = find(trials, modules, budget, progress=advance)
+    written = setting.write(output, Choice(tried[-1].modules))
     if as_json:
-        print_json([dataclasses.asdict(each) for each in tried])
+        print_json(tried)
     else:
-        shown = table("Tried, best first", "int8", "loss", "predicted", budget.unit)
-        for each in tried:
-            loss = "-" if each.score is None else f"{each.score.loss:.4g}"
-            cost = "-" if each.measured_cost is None else f"{each.measured_cost:.4g}"
-            names = ", ".join(each.modules) or "none"
-            shown.add_row(names, loss, f"{each.loss:.4g}", cost)
-        console.print(shown)
-    setting.write(output, Choice(tried[-1].modules))
+        _show(tried, budget.unit)
+        console.print(escape(written), soft_wrap=True)
+
+
+def _show(tried: Sequence[Candidate], unit: str) -> None:
+    shown = table("Tried, best first", "int8", "loss", "predicted", unit)
+    for each in tried:
+        loss = "-" if each.score is None else f"{each.score.loss:.4g}"
+        cost = "-" if each.measured_cost is None else f"{each.measured_cost:.4g}"
+        names = ", ".join(each.modules) or "none"
+        shown.add_row(names, loss, f"{each.loss:.4g}", cost)
+    console.print(shown)
 
 
 class _Stopwatch:

@@ -88,12 +88,13 @@ def sensitivity(
     with progress("modules") as advance:
         found = analyse(trials, modules, node_trials=node_trials, progress=advance)
     choice = advise(trials, found, limit, drive_limit)
+    written = setting.write(output, choice)
     if as_json:
         print_json(found)
-    else:
-        _show(found)
-    setting.write(output, choice)
-    if choice.modules and not as_json:
+        return
+    _show(found)
+    console.print(escape(written), soft_wrap=True)
+    if choice.modules:
         score = trials.score(choice)
         console.print(f"its loss: {score.loss:.4g} {score.unit}, limit {limit:g}")
         driving = trials.driving(choice)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.calibrator import Calibrator
@@ -15,7 +14,7 @@ from me2e_compress.calibration.rules import rules_named
 from me2e_compress.calibration.sample import draw
 from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.cli.calibrate import prepare
-from me2e_compress.cli.console import console, progress
+from me2e_compress.cli.console import progress
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import Given, check_output
 from me2e_compress.modules import map_of
@@ -90,10 +89,10 @@ class Setting:
         )
         return made, scheme.modules
 
-    def write(self, output: Path, choice: Choice) -> None:
-        """Write the recipe, and say where it is."""
+    def write(self, output: Path, choice: Choice) -> str:
+        """Write the recipe, and give a line that says where it is."""
         before = tuple(each.name for each in recipe.load("exact"))
         overrides = write_recipe(output, choice, before, self.rules, self.target)
         listed = ", ".join(choice.modules) or "no module"
         more = f", {len(choice.floats)} of their nodes in float" if overrides else ""
-        console.print(escape(f"{output}: int8 in {listed}{more}"), soft_wrap=True)
+        return f"{output}: int8 in {listed}{more}"

@@ -6,7 +6,7 @@ import pytest
 import typer.main
 
 from me2e_compress.cli.app import app
-from tests.cli.conftest import Command
+from tests.cli.conftest import Command, strict
 
 NAMES = sorted(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
 
@@ -52,8 +52,9 @@ def test_a_graph_compared_with_itself_is_equal(
 ) -> None:
     words = (files / "in.onnx", files / "in.onnx", files / "frames", "--json")
     assert command("compare", *words) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = strict(capsys.readouterr().out)
     assert [item["error"] for item in found["outputs"]] == [0.0]
+    assert [item["sqnr_db"] for item in found["outputs"]] == [None]
     assert found["frames"] == 2
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.plan import load_plan, plan_of
-from tests.cli.conftest import Command
+from tests.cli.conftest import Command, strict
 from tests.nets import net
 
 
@@ -54,6 +54,12 @@ def test_plans_are_compared(
     said = capsys.readouterr().out
     assert "/plan_head/MatMul: int8 (layer) -> float (small-product)" in said
     assert "1 differences" in said
+    assert command("plan", dense / "dense.onnx", *words, *more, "--json") == 0
+    (found,) = strict(capsys.readouterr().out)
+    assert [found[side]["rule"] for side in ("old", "new")] == [
+        "layer",
+        "small-product",
+    ]
 
 
 def test_a_plan_is_shown_with_reasons(

@@ -1,6 +1,5 @@
 """``sensitivity --drive``: int8 judged by how it drives."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
 from me2e_compress.evaluators.highway.routes import save_routes
 from me2e_compress.metrics.episode import Episode
-from tests.cli.conftest import Command, write_frames
+from tests.cli.conftest import Command, strict, write_frames
 from tests.evaluators.highway.drivers import PARKED, straight_on
 from tests.metrics.drives import drive as by_hand
 
@@ -49,7 +48,7 @@ def test_float_and_int8_drive_and_a_second_run_drives_nothing(
     words = (*words, "--drive", tmp_path / "routes.json")
 
     assert command(*words, "--json") == 0
-    found = json.loads(capsys.readouterr().out.partition("\n}\n")[0] + "}")
+    found = strict(capsys.readouterr().out)
     episodes = sorted((tmp_path / "r.drives").glob("*/routes/parked.json"))
     written = [path.stat().st_mtime_ns for path in episodes]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress import graph
-from tests.cli.conftest import Command
+from tests.cli.conftest import Command, strict
 
 
 def test_sensitivity_writes_a_recipe_that_compresses(
@@ -52,6 +52,27 @@ def test_saved_ranges_are_taken_and_stale_ones_refused(
     (dense / "ranges.json").write_text(json.dumps(stale))
     assert command(*words, "--ranges", dense / "ranges.json") == 1
     assert "stale: of graph other" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "rows"), [("sensitivity", "findings"), ("search --max-mb 1", "")]
+)
+def test_programs_get_json_and_the_recipe(
+    command: Command,
+    dense: Path,
+    capsys: pytest.CaptureFixture[str],
+    line: str,
+    rows: str,
+) -> None:
+    name, *how = line.split()
+    place = ("--map", dense / "map.toml", "-o", dense / "r.toml")
+    words = (dense / "dense.onnx", dense / "frames", *place)
+
+    assert command(name, *words, *how, "--json") == 0
+
+    found = strict(capsys.readouterr().out)
+    assert len(found[rows] if rows else found) == 1
+    assert (dense / "r.toml").is_file()
 
 
 @pytest.mark.parametrize("line", ["sensitivity", "search --max-mb 1"])
