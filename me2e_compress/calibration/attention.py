@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator
 import onnx_ir as ir
 
 from me2e_compress.calibration.nearest import Nearest, ahead, behind
-from me2e_compress.graph import static_shape
+from me2e_compress.graph import open_shape, static_shape
 
 FUSED = frozenset(
     {
@@ -41,8 +41,8 @@ class Attention:
     """One attention.
 
     Attributes:
-        queries: number of query tokens; None if the shape is open.
-        keys: number of key tokens; None if the shape is open.
+        queries: number of query tokens; None if that is open.
+        keys: number of key tokens; None if that is open.
     """
 
     queries: int | None
@@ -120,7 +120,8 @@ def _fits(product: ir.Value, scores: ir.Value) -> bool:
     """Say whether scores may be this product: as many, or as many a row."""
     left, right = static_shape(product), static_shape(scores)
     if not left or not right:
-        return True
+        ends = [(open_shape(value) or (None,))[-1:] for value in (product, scores)]
+        return (None,) in ends or ends[0] == ends[1]
     have, want = math.prod(left), math.prod(right)
     return have == want or (left[-1] == right[-1] and have > 0 and want % have == 0)
 
@@ -136,7 +137,7 @@ def _fused(nodes: Iterable[ir.Node]) -> dict[ir.Node, Attention]:
 
 def _tokens(value: ir.Value | None) -> int | None:
     """Count the tokens of queries or keys, [batch, (heads,) tokens, width]."""
-    shape = static_shape(value)
+    shape = open_shape(value)
     return None if shape is None or len(shape) < 2 else shape[-2]
 
 
@@ -164,7 +165,7 @@ def _decomposed(division: ir.Node) -> ir.Value | None:
 
 
 def _lengths(scores: ir.Value) -> tuple[int | None, int | None]:
-    shape = static_shape(scores)
+    shape = open_shape(scores)
     if shape is None or len(shape) < 2:
         return None, None
     return shape[-2], shape[-1]

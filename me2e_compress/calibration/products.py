@@ -5,7 +5,9 @@ import math
 
 import onnx_ir as ir
 
-from me2e_compress.graph import static_shape
+from me2e_compress.graph import open_shape, static_shape
+
+Dims = tuple[int | None, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,7 +16,7 @@ class Extent:
 
     Attributes:
         rows: M: of a product with a plain weight, all leading dimensions together;
-            of a batch of products, the rows of one. None where the shape is open.
+            of a batch of products, the rows of one. None where that is open.
         columns: N, likewise of one product.
         depth: K, what is summed over.
     """
@@ -41,15 +43,15 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
         node: the product.
         weight: whether its right operand is constant.
     """
-    left, right = static_shape(node.inputs[0]), static_shape(node.inputs[1])
+    left, right = open_shape(node.inputs[0]), open_shape(node.inputs[1])
     if node.op_type == "Gemm":
         return _gemm(node, left, right)
     columns, depth = (None, None) if right is None else _sides(right)
     if not left:
         return Extent(None, columns, depth)
-    shared = weight and right is not None and math.prod(right[:-2]) == 1
-    rows = math.prod(left[:-1]) if shared or len(left) == 1 else left[-2]
-    return Extent(rows, columns, left[-1])
+    shared = weight and right is not None and _product(right[:-2]) == 1
+    rows = _product(left[:-1]) if shared or len(left) == 1 else left[-2]
+    return Extent(rows, columns, depth if left[-1] is None else left[-1])
 
 
 def is_one_matrix(product: ir.Node) -> bool:
@@ -65,14 +67,18 @@ def is_one_matrix(product: ir.Node) -> bool:
     return len(right) == 2 or (math.prod(right[:-2]) == 1 and len(right) <= rank)
 
 
-def _sides(right: tuple[int, ...]) -> tuple[int, int]:
+def _product(dims: Dims) -> int | None:
+    """Multiply dimensions; None if one of them is open."""
+    known = [dim for dim in dims if dim is not None]
+    return math.prod(known) if len(known) == len(dims) else None
+
+
+def _sides(right: Dims) -> tuple[int | None, int | None]:
     """Give N and K of a right operand; a vector is one column."""
-    return (right[-1], right[-2]) if len(right) > 1 else (1, math.prod(right))
+    return (right[-1], right[-2]) if len(right) > 1 else (1, _product(right))
 
 
-def _gemm(
-    node: ir.Node, left: tuple[int, ...] | None, right: tuple[int, ...] | None
-) -> Extent:
+def _gemm(node: ir.Node, left: Dims | None, right: Dims | None) -> Extent:
     flip_left = bool(node.attributes.get_int("transA", 0))
     flip_right = bool(node.attributes.get_int("transB", 0))
     return Extent(

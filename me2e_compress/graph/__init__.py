@@ -23,7 +23,7 @@ from me2e_compress.graph.rewrite import (
     sort,
     sweep,
 )
-from me2e_compress.graph.shapes import infer_shapes, static_shape
+from me2e_compress.graph.shapes import infer_shapes, open_shape, static_shape
 
 __all__ = [
     "Port",
@@ -40,6 +40,7 @@ __all__ = [
     "load",
     "macs",
     "node_count",
+    "open_shape",
     "replace_value",
     "save",
     "sha256_of",

@@ -16,6 +16,13 @@ def static_shape(value: ir.Value | None) -> tuple[int, ...] | None:
     return tuple(int(dim) for dim in value.shape.numpy())
 
 
+def open_shape(value: ir.Value | None) -> tuple[int | None, ...] | None:
+    """Give a value's shape, None for every dimension that is open; None if unknown."""
+    if value is None or value.shape is None:
+        return None
+    return tuple(dim if isinstance(dim, int) else None for dim in value.shape)
+
+
 def infer_shapes(model: ir.Model) -> None:
     """Let ONNX infer types and shapes, data propagation included, in place.
 

@@ -116,3 +116,40 @@ def test_heads_written_out_one_by_one_are_found() -> None:
         f" y = Concat<axis=1>({total}) }}"
     )
     assert len(found(text)) == 1 + heads
+
+
+def test_an_open_batch_leaves_the_lengths_known() -> None:
+    text = """
+    batch (float[N,30,8] a, float[N,8,700] b, float[N,700,8] c) => (float[N,30,8] y) {
+        s = MatMul(a, b)
+        p = Softmax(s)
+        y = MatMul(p, c)
+    }
+    """
+    assert found(text) == {"s": Attention(30, 700), "y": Attention(30, 700)}
+
+
+def test_an_open_length_is_unknown() -> None:
+    text = """
+    batch (float[1,30,8] a, float[1,8,K] b, float[1,K,8] c) => (float[1,30,8] y) {
+        s = MatMul(a, b)
+        p = Softmax(s)
+        y = MatMul(p, c)
+    }
+    """
+    assert found(text) == {"s": Attention(30, None), "y": Attention(30, None)}
+
+
+def test_with_an_open_batch_a_mask_of_another_length_is_no_product_of_keys() -> None:
+    text = """
+    batch (float[N,30,8] a, float[N,8,700] b, float[N,700,8] c, float[N,30,4] m,
+           float[N,4,1] n) => (float[N,30,8] y) {
+        s = MatMul(a, b)
+        t = Mul(s, s)
+        mask = MatMul(m, n)
+        masked = Add(t, mask)
+        p = Softmax(masked)
+        y = MatMul(p, c)
+    }
+    """
+    assert found(text) == {"s": Attention(30, 700), "y": Attention(30, 700)}

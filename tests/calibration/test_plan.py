@@ -254,3 +254,30 @@ def test_five_thousand_nodes_are_planned_in_two_seconds() -> None:
 
     assert len(plan.decisions) > 5000
     assert time.process_time() - start < 2
+
+
+OPEN = """
+<ir_version: 9, opset_import: ["" : 17]>
+batch (float[N,%s,8] a, float[N,8,%s] b, float[N,%s,8] c) => (float[N,%s,8] y) {
+    s = MatMul(a, b)
+    p = Softmax(s)
+    y = MatMul(p, c)
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("sizes", "rule"),
+    [
+        ((16, 16, 16, 16), "attention"),
+        ((16, 600, 600, 16), "attention-length"),
+        ((1, 16, 16, 1), "gemv"),
+        (("Q", 16, 16, "Q"), "attention-length"),
+    ],
+)
+def test_an_open_batch_changes_no_decision(
+    sizes: tuple[int | str, ...], rule: str
+) -> None:
+    plan = make_plan(net(OPEN % sizes, {}), HEAD)
+
+    assert [each.rule for each in plan.decisions if each.op == "MatMul"] == [rule] * 2
