@@ -11,6 +11,8 @@ from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.latency import parse_latency
 from me2e_compress.passes import Pass
+from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
 
 TRACE = "trace"
 """A condition's latency: what was measured of each model, under the device scale."""
@@ -139,7 +141,7 @@ class Study:
 
     Raises:
         StudyError: Nothing to drive, a name twice, a baseline that is no scheme, a
-            negative seed, or a trace asked for without frames to measure it on.
+            negative seed, or passes or a trace that need frames where there are none.
     """
 
     title: str
@@ -166,6 +168,20 @@ class Study:
             raise StudyError(f"{self.title}: there is no route to drive")
         if self.seed < 0:
             raise StudyError(f"seed {self.seed}: must be 0 or more")
+        self._check_frames()
+
+    def _check_frames(self) -> None:
+        needy = [
+            (scheme.name, each.name)
+            for scheme in self.schemes
+            for each in scheme.passes
+            if _needs_frames(each)
+        ]
+        if needy and self.frames is None:
+            raise StudyError(
+                f"scheme {needy[0][0]}: {needy[0][1]} measures on recorded frames, and "
+                "there are none (frames = FRAMES)"
+            )
         untimed = [each for each in self.schemes if each.is_model and not each.trace]
         traced = [each.name for each in self.conditions if each.traced]
         if traced and untimed and self.held_out is None:
@@ -185,6 +201,13 @@ def _check_name(kind: str, name: str) -> None:
         raise StudyError(
             f"{kind} {name!r}: a name is made of letters, digits, '_', '+' and '-'"
         )
+
+
+def _needs_frames(current: Pass) -> bool:
+    """Whether a pass measures on frames, whatever the graph is."""
+    if isinstance(current, AblateModules):
+        return current.fill == "means" and current.means is None
+    return isinstance(current, QuantizeInt8) and current.ranges is None
 
 
 def _unique(kind: str, names: Iterable[str]) -> None:

@@ -12,6 +12,7 @@ from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
 from me2e_compress.passes import Pass
 from me2e_compress.study.definition import Condition, Scheme, Study, Timing
+from me2e_compress.study.recordings import check_recordings
 
 Resolve = Callable[[str], Path]
 """From the name of a model that ships to its file; the name itself if none does."""
@@ -29,7 +30,7 @@ def load_study(path: Path, resolve: Resolve = Path, routes: str | None = None) -
 
     Raises:
         StudyError: No such file, not TOML, a key that is unknown, missing or of
-            another type, or a study that could not be finished.
+            another type, frames that are none, or a study that could not be finished.
         RecipeError: An unknown recipe or pass.
         EvaluationError: Unknown routes or latency.
     """
@@ -43,7 +44,9 @@ def load_study(path: Path, resolve: Resolve = Path, routes: str | None = None) -
         table = _Study.model_validate(content)
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
-    return _Reader(path, resolve).study(table, routes)
+    study = _Reader(path, resolve).study(table, routes)
+    check_recordings(study)
+    return study
 
 
 class _Table(BaseModel):

@@ -10,6 +10,7 @@ from me2e_compress.study.fidelity import judge
 from me2e_compress.study.models import Contender, contend
 from me2e_compress.study.outcome import Outcome, SchemeOutcome, this_machine
 from me2e_compress.study.pictures import take_pictures
+from me2e_compress.study.recordings import check_recordings
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workplace import SILENT, Listener, Workplace
 
@@ -37,6 +38,7 @@ def run_study(
         Me2eError: A model cannot drive, a pass refused its graph, frames do not fit,
             or the folder is of another study; one line that names the culprit.
     """
+    check_recordings(study)
     workplace = Workplace(folder)
     contenders = [
         contend(study, scheme, workplace, listener) for scheme in study.schemes

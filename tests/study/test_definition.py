@@ -4,6 +4,7 @@ import pytest
 
 from me2e_compress import recipe
 from me2e_compress.errors import EvaluationError, Me2eError, StudyError
+from me2e_compress.passes import Pass
 from me2e_compress.study import Condition, Scheme, Timing
 from tests.study.conftest import IDEAL, Make
 
@@ -28,6 +29,36 @@ def test_a_study_that_could_not_be_finished(
 ) -> None:
     with pytest.raises(StudyError, match=message):
         make(**changes)
+
+
+@pytest.mark.parametrize(
+    ("passes", "name"),
+    [
+        (recipe.load("feature-ext"), "quantize-int8"),
+        (recipe.load("minus-occ"), "ablate-modules"),
+    ],
+)
+def test_passes_that_need_frames_and_none_are_given(
+    make: Make, passes: tuple[Pass, ...], name: str
+) -> None:
+    words = rf"scheme small: {name} measures on recorded frames, and there are none"
+    with pytest.raises(StudyError, match=words):
+        make(schemes=(Scheme("small", "m.onnx", passes),), baseline="small")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "quantize-int8{ranges=r.json}",
+        "ablate-modules{drop=[occ]}",
+        "ablate-modules{drop=[occ],fill=means,means=m.npz}",
+        "lower-int8",
+    ],
+)
+def test_passes_that_need_no_frames(make: Make, text: str) -> None:
+    schemes = (Scheme("small", "m.onnx", recipe.parse(text)),)
+
+    assert make(schemes=schemes, baseline="small").frames is None
 
 
 @pytest.mark.parametrize("name", ["", "a b", "../up", "a/b", ".hidden", "a.b"])

@@ -1,11 +1,13 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from me2e_compress.errors import EvaluationError, GraphError, RecipeError, StudyError
 from me2e_compress.evaluators.highway.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
+from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
 
 GOOD = """
@@ -66,6 +68,7 @@ def test_files_lie_beside_the_study(models: Path, tmp_path: Path) -> None:
     save_routes((CROSSING, PARKED), tmp_path / "two.json")
     (tmp_path / "my.toml").write_text('[[pass]]\nname = "fold-constants"\n')
     (tmp_path / "slow.onnx").write_bytes((models / "slow.onnx").read_bytes())
+    write_frames(tmp_path / "frames", command=np.array([3]))
     text = GOOD.replace("routes = 3", 'routes = "two.json"')
 
     study = load_study(write(tmp_path, text.replace('"exact"', '"my.toml"')))
@@ -111,6 +114,19 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
         ('"slow.onnx"\nrecipe', '"quick"\nrecipe', GraphError, "quick: no such file"),
         ('latency = "none"', 'latency = "quick"', EvaluationError, "latency 'quick'"),
         ("[latency]", "[latency", StudyError, "not TOML"),
+        ('"frames"', '"gone"', StudyError, r"^held_out: \S+/gone: no such folder"),
+        (
+            "routes = 3",
+            'routes = 3\nframes = "slow.onnx"',
+            StudyError,
+            r"^frames: \S+/slow\.onnx: no such folder",
+        ),
+        (
+            'recipe = "exact"',
+            'recipe = "feature-ext"',
+            StudyError,
+            "scheme small: quantize-int8 measures on recorded frames, and there are no",
+        ),
     ],
 )
 def test_what_is_wrong_is_one_line(
@@ -140,6 +156,9 @@ def test_no_such_file(tmp_path: Path) -> None:
 def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
     page = Path(__file__).parents[2] / "docs" / "study.md"
     (block,) = re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+
+    for name in ("frames", "held-out"):
+        write_frames(tmp_path / name, command=np.array([3]))
 
     study = load_study(write(tmp_path, block), lambda name: Path("/shipped") / name)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph, recipe
-from me2e_compress.errors import FramesError, StudyError
+from me2e_compress.errors import StudyError
 from me2e_compress.manager import PassManager
 from me2e_compress.study import Listener, Scheme, Study
 from me2e_compress.study.models import Contender, contend
@@ -172,11 +172,6 @@ def test_a_file_that_a_pass_reads_and_that_is_gone(
         StudyError, match=r"minus-occ: \S+gone\.npz: cannot be read: No"
     ):
         made(asked, tmp_path)
-
-
-def test_passes_that_need_frames_say_so(study: Study, tmp_path: Path) -> None:
-    with pytest.raises(FramesError):
-        made(dataclasses.replace(study, frames=None), tmp_path)
 
 
 def test_what_made_a_file_is_read_from_the_report_beside_it(

@@ -193,6 +193,17 @@ def test_a_missing_model_is_named_before_anything_drives(
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.parametrize("which", ["frames", "held_out"])
+def test_frames_that_are_none_are_named_before_anything_runs(
+    make: Make, tmp_path: Path, which: str
+) -> None:
+    asked = make(**{which: tmp_path / "gone"})
+
+    with pytest.raises(StudyError, match=rf"^{which}: \S+/gone: no such folder"):
+        run_study(asked, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
     toml = tmp_path / "study.toml"
     toml.write_text(STUDY)
