@@ -88,10 +88,12 @@ class QuantizeInt8:
         graph.infer_shapes(model)
         plan = self.plan(model, context)
         kept_float = target.kept_float(plan, model)
-        plan = dataclasses.replace(plan, target=target.name, kept_float=kept_float)
+        plan = dataclasses.replace(plan, kept_float=kept_float)
         tensors = target.tensors(plan, model)
         if not tensors:
-            return PassResult(model, 0, ("nothing to quantize", *_notes(plan)))
+            return PassResult(
+                model, 0, ("nothing to quantize", *_notes(plan, self.target))
+            )
         ranges = measured_ranges(
             self.name,
             model,
@@ -102,7 +104,11 @@ class QuantizeInt8:
         )
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
-        notes = (*_notes(plan), *_findings(plan, ranges), _lint(placed, self.target))
+        notes = (
+            *_notes(plan, self.target),
+            *_findings(plan, ranges),
+            _lint(placed, self.target),
+        )
         return PassResult(placed, len(plan.placed), notes)
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
@@ -119,7 +125,7 @@ class QuantizeInt8:
         return QuantScheme.named(self.scheme, context.modules)
 
 
-def _notes(plan: QuantPlan) -> tuple[str, ...]:
+def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
     found = f"{len(plan.placed)} of {len(plan.decisions)} nodes {INT8}"
     if plan.kept_float:
@@ -129,12 +135,12 @@ def _notes(plan: QuantPlan) -> tuple[str, ...]:
     return (
         f"scheme {scheme.name}: {', '.join(scheme.modules)}",
         f"{found}; by rule: {counts}",
-        *_kept_float(plan),
+        *_kept_float(plan, target),
         *_first(close, "close decisions"),
     )
 
 
-def _kept_float(plan: QuantPlan) -> tuple[str, ...]:
+def _kept_float(plan: QuantPlan, target: str) -> tuple[str, ...]:
     """Say which of the plan's nodes the target leaves in float, a line a reason."""
     reasons = dict.fromkeys(each.reason for each in plan.kept_float)
     nodes = {
@@ -148,7 +154,7 @@ def _kept_float(plan: QuantPlan) -> tuple[str, ...]:
     return tuple(
         line
         for reason, names in nodes.items()
-        for line in _first(names, f"{len(names)} stay float on {plan.target}, {reason}")
+        for line in _first(names, f"{len(names)} stay float on {target}, {reason}")
     )
 
 

@@ -227,7 +227,7 @@ def test_what_the_target_keeps_in_float_is_not_counted_as_int8(
     ) in result.notes
     plan = plan_of(result.model)
     assert plan is not None
-    assert (len(plan.chosen), len(plan.placed), plan.target) == (4, 2, "onnxruntime")
+    assert (len(plan.chosen), len(plan.placed)) == (4, 2)
 
 
 def test_where_the_target_takes_nothing_nothing_is_int8(context: Context) -> None:

@@ -90,15 +90,14 @@ class QuantPlan:
         decisions: one a node.
         rules: name of the rule set that was asked.
         groups: what was decided together.
-        target: for which it was carried out; empty where it was not.
-        kept_float: which of its int8 nodes stay float on that target.
+        kept_float: which of its int8 nodes stay float on the target for which it was
+            carried out; none where it was not.
     """
 
     scheme: QuantScheme
     decisions: tuple[Decision, ...]
     rules: str = "paper"
     groups: tuple[ScaleGroup, ...] = ()
-    target: str = ""
     kept_float: tuple[KeptFloat, ...] = ()
 
     @property
