@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.shares import Share
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
 
@@ -18,10 +19,12 @@ class Part:
     Attributes:
         whole: the recording.
         places: which of its frames.
+        share: of what it is a shard; None if it is none.
     """
 
     whole: CalibrationSet
     places: tuple[int, ...]
+    share: Share | None = None
 
     @property
     def fingerprint(self) -> str:
@@ -88,7 +91,8 @@ def shard(part: Part, number: int, count: int) -> Part:
             " runs through a scene"
         )
     mine = np.array_split(np.arange(len(scenes)), count)[number - 1].tolist()
-    return Part(part.whole, tuple(place for at in mine for place in scenes[at]))
+    places = tuple(place for at in mine for place in scenes[at])
+    return Part(part.whole, places, Share(number, count, part.places))
 
 
 def _scenes(whole: CalibrationSet) -> list[range]:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.calibration.arrays import load_arrays
+from me2e_compress.calibration.shares import Share, check_whole
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 
@@ -23,7 +24,7 @@ magnitude itself, onnxruntime's percentile as many on both sides of zero.)"""
 _SMALLEST = -100
 """Least exponent of a histogram: below, float32 cannot hold bins per unit."""
 
-_KEPT = ("model", "source", "tensors", "frames", "gauges", "counts")
+_KEPT = ("model", "source", "tensors", "frames", "gauges", "counts", "share")
 """What a file of statistics holds."""
 
 Floats: TypeAlias = npt.NDArray[np.float32]
@@ -42,6 +43,7 @@ class Statistics:
             infinity, minus infinity and 0 where a tensor had no element.
         counts: int64 [tensors, bins] over all frames: how many magnitudes lie in each
             bin of [0, 2^exponent); None where no histogram was asked for.
+        share: of what it is a shard; None if it is none.
     """
 
     model: str
@@ -50,6 +52,7 @@ class Statistics:
     frames: tuple[int, ...]
     gauges: Floats
     counts: npt.NDArray[np.int64] | None = None
+    share: Share | None = None
 
     @functools.cached_property
     def readings(self) -> Floats:
@@ -116,6 +119,7 @@ class Statistics:
             frames=np.array(self.frames, np.int64),
             gauges=self.gauges,
             counts=np.empty(0, np.int64) if self.counts is None else self.counts,
+            share=np.array(_listed(self.share), np.int64),
         )
         write_bytes(path, content.getvalue())
 
@@ -145,6 +149,7 @@ class Statistics:
             tuple(frames.tolist()),
             held["gauges"],
             counts if counts.size else None,
+            _share(held["share"].tolist()),
         )
 
 
@@ -164,8 +169,8 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
     shard of smaller reach fall whole into those of the joint one.
 
     Raises:
-        FramesError: no shard, a frame in two of them, or shards of different graphs,
-            recordings, tensors or kinds.
+        FramesError: no shard, one missing, a frame in two of them, or shards of
+            different graphs, recordings, tensors, kinds or draws.
     """
     if not parts:
         raise FramesError("no shards to merge")
@@ -179,13 +184,16 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
                 )
         if (each.counts is None) != (first.counts is None):
             raise FramesError("some of the shards have histograms and some have not")
+    check_whole([each.share for each in parts])
     places = [(place, part, row) for part in parts for row, place in _rows(part)]
     places.sort(key=lambda each: each[0])
     frames = tuple(place for place, _, _ in places)
     if doubles := [a for a, b in itertools.pairwise(frames) if a == b]:
         raise FramesError(f"frame {doubles[0]} is in two of the shards")
     gauges = np.stack([part.gauges[row] for _, part, row in places])
-    joint = dataclasses.replace(first, frames=frames, gauges=gauges, counts=None)
+    joint = dataclasses.replace(
+        first, frames=frames, gauges=gauges, counts=None, share=None
+    )
     if first.counts is None:
         return joint
     counts = sum(_widened(part, joint.exponents) for part in parts)
@@ -194,6 +202,16 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
 
 def _rows(part: Statistics) -> list[tuple[int, int]]:
     return list(enumerate(part.frames))
+
+
+def _listed(share: Share | None) -> list[int]:
+    return [] if share is None else [share.number, share.count, *share.drawn]
+
+
+def _share(listed: list[int]) -> Share | None:
+    if len(listed) < 2:
+        return None
+    return Share(listed[0], listed[1], tuple(listed[2:]))
 
 
 def _span(part: Statistics) -> str:

@@ -114,7 +114,7 @@ def calibrate(
                 ready, tensors, chosen, lambda done, of: advance(done, of, method)
             )
         if part is not None:
-            seen.save(output)
+            dataclasses.replace(seen, share=chosen.share).save(output)
             console.print(f"{output}: shard {part}, {len(chosen)} frames")
             return
         found = Ranges.of(seen, observer(method))

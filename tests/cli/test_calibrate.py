@@ -63,6 +63,42 @@ def test_merged_shards_give_the_ranges_of_one_run(
     assert ranges(command, folder, "merged.json", *shards, *how) == whole
 
 
+def shard(command: Command, folder: Path, part: str, *how: str) -> tuple[str, Path]:
+    name = f"{part.replace('/', '-')}{''.join(how)}.npz"
+    ranges(command, folder, name, folder / "scenes", "--shard", part, *how)
+    return "--merge", folder / name
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (["1/3"], "shard 2 of 3 is missing, and 1 more"),
+        (["1/3", "3/3"], "shard 2 of 3 is missing, and 0 more"),
+        (["1/2", "3/3"], "shard 3 of 3, shard 1 of 2"),
+        (["1/2 -n 4", "2/2 -n 6"], r"1 and 2 are of different draws \(4 and 6 frames"),
+        (["1/2 -n 4", "2/2 -n 4 --seed 1"], "are of different draws"),
+        (["1/2", "2/2", "2/2"], "frame 4 is in two of the shards"),
+    ],
+)
+def test_shards_that_are_no_whole_are_one_line(
+    command: Command,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    parts: list[str],
+    message: str,
+) -> None:
+    words = [word for part in parts for word in shard(command, folder, *part.split())]
+    capsys.readouterr()
+
+    place = ("--map", folder / "map.toml", "-o", folder / "r.json")
+    assert command("calibrate", folder / "dense.onnx", *words, *place) == 1
+
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert re.search(message, error)
+    assert not (folder / "r.json").exists()
+
+
 def test_another_tools_cache_comes_and_goes(command: Command, folder: Path) -> None:
     cache, table = folder / "trt.cache", folder / "table"
     ours = ranges(

@@ -1,0 +1,58 @@
+"""Which share of a draw a shard is, and whether shards are a whole."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from me2e_compress.errors import FramesError
+
+
+@dataclasses.dataclass(frozen=True)
+class Share:
+    """One shard's share of the frames that were drawn.
+
+    Attributes:
+        number: which shard, from 1.
+        count: how many there are.
+        drawn: places in the recording of the frames of all of them.
+    """
+
+    number: int
+    count: int
+    drawn: tuple[int, ...]
+
+
+def check_whole(shares: Sequence[Share | None]) -> None:
+    """Refuse shards that are not all of one draw.
+
+    Args:
+        shares: of the shards; None of statistics that are no shard of ours, about
+            which nothing is said if none is.
+
+    Raises:
+        FramesError: only some are shards, they are of different draws or of another
+            number of shards, or one is missing.
+    """
+    known = [each for each in shares if each is not None]
+    if not known:
+        return
+    if len(known) < len(shares):
+        raise FramesError("some of the files are shards, others a whole calibration")
+    first = known[0]
+    for each in known[1:]:
+        if each.count != first.count:
+            raise FramesError(
+                f"shards do not belong together: shard {each.number} of {each.count},"
+                f" shard {first.number} of {first.count}"
+            )
+        if each.drawn != first.drawn:
+            raise FramesError(
+                f"shards do not belong together: shards {first.number} and"
+                f" {each.number} are of different draws ({len(first.drawn)} and"
+                f" {len(each.drawn)} frames): give -n and --seed alike"
+            )
+    numbers = [each.number for each in known]
+    if missing := [at for at in range(1, first.count + 1) if at not in numbers]:
+        raise FramesError(
+            f"shard {missing[0]} of {first.count} is missing, and"
+            f" {len(missing) - 1} more: ranges are of all frames that were drawn"
+        )
