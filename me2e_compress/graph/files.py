@@ -16,12 +16,16 @@ from me2e_compress.errors import GraphError
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
 
+_PLAIN_INITIALIZERS_SINCE_IR = 4
+"""The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)."""
+
 
 def load(path: Path) -> ir.Model:
     """Read an ONNX file; external weights stay on disk and are mapped when read.
 
     Initializers that the exporter also listed as inputs
-    (``keep_initializers_as_inputs``) stop being inputs.
+    (``keep_initializers_as_inputs``) stop being inputs, which is valid from IR version
+    4 on: older models are raised to that.
 
     Raises:
         GraphError: no such file, not an ONNX model, cut short, or its data file is
@@ -39,6 +43,7 @@ def load(path: Path) -> ir.Model:
         raise GraphError(f"{path}: not an ONNX model (no opset, no outputs)")
     _check_external(model, path)
     common.RemoveInitializersFromInputsPass()(model)
+    model.ir_version = max(model.ir_version, _PLAIN_INITIALIZERS_SINCE_IR)
     return model
 
 

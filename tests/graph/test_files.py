@@ -132,3 +132,25 @@ def test_a_hash_covers_the_external_weights(tmp_path: Path) -> None:
     data = tmp_path / "m.onnx.data"
     data.write_bytes(data.read_bytes()[::-1])
     assert graph.sha256_of(tmp_path / "m.onnx") != before
+
+
+def test_a_model_of_ir_version_3_is_raised_to_where_weights_are_no_inputs(
+    tmp_path: Path,
+) -> None:
+    proto = onnx.parser.parse_model(
+        """
+        <ir_version: 3, opset_import: ["" : 13]>
+        old (float[2] x, float[2] w) => (float[2] y) { y = Add(x, w) }
+        """
+    )
+    proto.graph.initializer.append(
+        onnx.numpy_helper.from_array(np.ones(2, np.float32), "w")
+    )
+    onnx.save(proto, tmp_path / "old.onnx")
+
+    graph.save(graph.load(tmp_path / "old.onnx"), tmp_path / "new.onnx")
+
+    onnx.checker.check_model(tmp_path / "new.onnx", full_check=True)
+    saved = onnx.load(tmp_path / "new.onnx")
+    assert saved.ir_version == 4
+    assert [value.name for value in saved.graph.input] == ["x"]
