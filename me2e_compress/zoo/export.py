@@ -1,7 +1,6 @@
 """Write a stack of the zoo as ONNX."""
 
 import importlib.util
-import os
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import onnx
 
 from me2e_compress.errors import GraphError, MissingExtraError
+from me2e_compress.zoo.files import write
 from me2e_compress.zoo.stacks import Stack, find
 
 if TYPE_CHECKING:
@@ -53,7 +53,8 @@ def export(
 
     Raises:
         MissingExtraError: torch is not installed.
-        GraphError: Unknown stack or opset, or the exporter wrote another opset.
+        GraphError: Unknown stack or opset, the exporter wrote another opset, or the
+            file cannot be written.
     """
     spec = find(stack)
     if opset not in OPSETS:
@@ -71,15 +72,13 @@ def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Pat
         graph: Gets the metadata.
         metadata: Properties by key.
         path: The ``.onnx``; replaced in one step.
+
+    Raises:
+        GraphError: It cannot be written.
     """
     for key, value in metadata.items():
         graph.metadata_props.add(key=key, value=value)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
-        draft = Path(folder) / path.name
-        draft.write_bytes(graph.SerializeToString())
-        os.replace(draft, path)
-    return path
+    return write(path, graph.SerializeToString())
 
 
 def build(

@@ -2,14 +2,13 @@
 
 import functools
 import hashlib
-import os
-import tempfile
 from pathlib import Path
 from typing import Self
 
 import pydantic
 
 from me2e_compress.errors import GraphError
+from me2e_compress.zoo.files import write
 from me2e_compress.zoo.stacks import STACKS
 
 WEIGHTS = Path(__file__).with_name("weights")
@@ -148,14 +147,10 @@ def copy(name: str, target: Path, folder: Path | None = None) -> Path:
     """Write a copy of a shipped model, replaced in one step; give its path.
 
     Raises:
-        GraphError: as `shipped`, or ``target`` is the shipped file itself.
+        GraphError: as `shipped`, or ``target`` is the shipped file itself or cannot be
+            written.
     """
     source = shipped(name, folder)
     if target.exists() and target.samefile(source):
         raise GraphError(f"{target} is the shipped model: choose another output")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".copy-") as draft:
-        file = Path(draft) / target.name
-        file.write_bytes(source.read_bytes())
-        os.replace(file, target)
-    return target
+    return write(target, source.read_bytes())

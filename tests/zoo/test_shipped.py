@@ -104,6 +104,31 @@ def test_a_copy_has_the_same_bytes(weights: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in target.parent.iterdir()) == ["mine.onnx"]
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("folder", r"folder: cannot be written: Is a directory"),
+        ("file/x.onnx", r"file/x\.onnx: its folder cannot be made: "),
+        ("file/up/x.onnx", r"file/up/x\.onnx: its folder cannot be made: "),
+    ],
+)
+def test_a_copy_that_cannot_be_written_is_one_line(
+    weights: Path, tmp_path: Path, name: str, words: str
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("mine")
+
+    with pytest.raises(GraphError, match=rf"^\S+/{words}") as caught:
+        copy("highway", tmp_path / name, weights)
+    assert "\n" not in str(caught.value)
+    assert "Errno" not in str(caught.value)
+    assert sorted(each.name for each in tmp_path.iterdir()) == [
+        "file",
+        "folder",
+        "weights",
+    ]
+
+
 def test_the_shipped_file_is_not_overwritten(weights: Path) -> None:
     with pytest.raises(GraphError, match="is the shipped model"):
         copy("highway", weights / "highway.onnx", weights)

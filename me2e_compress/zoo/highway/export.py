@@ -20,7 +20,7 @@ def write(model: Highway, path: Path) -> Path:
         path: the ``.onnx``; replaced in one step.
 
     Raises:
-        GraphError: the exporter wrote another opset.
+        GraphError: the exporter wrote another opset, or it cannot be written.
     """
     spec = find("highway")
     # torch's stubs leave this form of `to` out
