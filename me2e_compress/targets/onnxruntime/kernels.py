@@ -6,7 +6,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.products import is_one_matrix
+from me2e_compress.calibration.products import extent, is_one_matrix
 
 MOVES = frozenset(
     {
@@ -59,7 +59,7 @@ def _is_plain_gemm(node: ir.Node) -> bool:
         node.attributes.get_float("alpha", 1.0) == 1
         and node.attributes.get_float("beta", 1.0) == 1
         and not node.attributes.get_int("transA", 0)
-        and (bias is None or is_bias(bias, 2))
+        and (bias is None or is_bias(bias, 2, extent(node, weight=True).columns))
     )
 
 
@@ -79,18 +79,20 @@ def bias_of(node: ir.Node) -> ir.Value | None:
     return node.inputs[2] if len(node.inputs) > 2 else None
 
 
-def is_bias(value: ir.Value | None, rank: int) -> bool:
+def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
     """Say whether a value is a constant that adds one number to every column.
 
     Args:
         value: what is added.
         rank: of the product; a constant of higher rank would lend it that.
+        columns: of the product; one column and a longer constant give more columns.
     """
     array = graph.array_of(value)
     return (
         array is not None
         and array.ndim <= rank
         and math.prod(array.shape[:-1]) == 1
+        and array.size in (1, columns)
         and array.dtype == np.float32
     )
 
@@ -103,7 +105,9 @@ def biased_end(product: ir.Node) -> ir.Node | None:
     if addition is None or addition.op_type != "Add":
         return None
     others = [each for each in addition.inputs if each is not value]
-    return addition if len(others) == 1 and is_bias(others[0], rank) else None
+    columns = extent(product, weight=True).columns
+    found = len(others) == 1 and is_bias(others[0], rank, columns)
+    return addition if found else None
 
 
 def is_move(node: ir.Node) -> bool:

@@ -5,14 +5,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
+from me2e_compress.calibration.plan import make_plan
+from me2e_compress.calibration.rules import paper_rules
+from me2e_compress.targets.onnxruntime import place, tensors
 from tests.nets import net
 from tests.targets.onnxruntime.lowered import (
+    FULL,
     TOKENS,
     calibrated,
+    drawn,
     feeds,
     kernels,
     linear,
     lowered,
+    measured,
     ran,
     sqnr_db,
 )
@@ -140,3 +146,23 @@ def test_open_dimensions_stay_open(shape: str) -> None:
     assert got.shape == want.shape
     assert sqnr_db(want, got) > 30
     assert kernels(small)["QGemm"] == 1
+
+
+def test_a_constant_that_lends_a_product_its_columns_is_no_bias() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    lends (float[4,8] x, float[8,1] w, float[5] b) => (float[4,5] y) {
+        m = MatMul(x, w)
+        y = Add(m, b)
+    }
+    """
+    model = drawn(text, {"w": (8, 1), "b": (5,)})
+    plan = make_plan(model, FULL, paper_rules().without(["gemv"]))
+    fed = feeds(2, x=(4, 8))
+
+    result = place(model, plan, measured(model, tensors(plan, model), fed))
+
+    got, want = ran(result, fed)["y"], ran(model, fed)["y"]
+    assert kernels(result)["QGemm"] == 0
+    assert got.shape == want.shape
+    assert sqnr_db(want, got) > 25
