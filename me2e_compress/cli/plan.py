@@ -1,5 +1,7 @@
 """``me2e-compress plan``."""
 
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +25,7 @@ from me2e_compress.cli.console import console, print_json, table
 from me2e_compress.cli.job import run_on
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import check_output
-from me2e_compress.errors import PreconditionError
+from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.modules import map_of
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -35,8 +37,12 @@ def plan(
         Path,
         typer.Argument(help="an ONNX file, float or with a plan", parser=model_path),
     ],
-    scheme: Annotated[str, typer.Option(help="feature-ext, prediction, full")] = "full",
-    rules: Annotated[str, typer.Option(help="paper or tensorrt")] = "paper",
+    scheme: Annotated[
+        str | None, typer.Option(help="feature-ext, prediction; default full")
+    ] = None,
+    rules: Annotated[
+        str | None, typer.Option(help="paper or tensorrt; default paper")
+    ] = None,
     overrides: Annotated[
         Path | None, typer.Option(help="TOML file of exceptions")
     ] = None,
@@ -44,7 +50,7 @@ def plan(
         str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
     ] = None,
     against: Annotated[
-        Path | None, typer.Option(help="another plan, or a model with one: compare")
+        Path | None, typer.Option(help="a plan or model: compare; float: no overrides")
     ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="save it as JSON")
@@ -56,33 +62,53 @@ def plan(
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
     check_output([output], (model, overrides, module_map, against))
-    options = QuantizeInt8(
-        scheme=scheme,
-        rules=rules,
-        overrides=overrides,
-    )
-    found = read_plan(model, options, module_map)
+    files = (model,) if against is None else (model, against)
+    read = [read_plan(path) for path in files]
+    given = {"scheme": scheme, "rules": rules, "overrides": overrides}
+    _check_options([name for name, value in given.items() if value], files, read)
+    plain = QuantizeInt8(scheme=scheme or "full", rules=rules or "paper")
+    found = _made(read[0], dataclasses.replace(plain, overrides=overrides), module_map)
     if output is not None:
         save_plan(found, output)
     if against is not None:
-        _compare(read_plan(against, options, module_map), found, as_json)
+        _compare(_made(read[1], plain, module_map), found, as_json)
     elif as_json:
         print_json(record(found))
     else:
         _show(found, every=every)
 
 
-def read_plan(path: Path, options: QuantizeInt8, module_map: str | None) -> QuantPlan:
-    """Give the plan that a file is or carries, else the one that would be made of it.
-
-    Raises:
-        PreconditionError: the graph is quantized and carries no plan.
-    """
+def read_plan(path: Path) -> QuantPlan | ir.Model:
+    """Give the plan that a file is or carries, else the graph to make one of."""
     if path.suffix == ".json":
         return load_plan(path)
     model = graph.load(path)
-    carried = plan_of(model)
-    return make(model, options, module_map) if carried is None else carried
+    return plan_of(model) or model
+
+
+def _check_options(
+    given: Sequence[str],
+    files: Sequence[Path],
+    read: Sequence[QuantPlan | ir.Model],
+) -> None:
+    """Refuse options of a plan that would change none, for all are made.
+
+    Raises:
+        RecipeError: names the first option and the file.
+    """
+    only = read[:1] if "overrides" in given else read
+    if given and all(isinstance(each, QuantPlan) for each in only):
+        option = "overrides" if "overrides" in given else given[0]
+        raise RecipeError(
+            f"--{option} is for a plan that is yet to be made, and {files[0]} has its"
+            " own: give the float model"
+        )
+
+
+def _made(
+    read: QuantPlan | ir.Model, options: QuantizeInt8, module_map: str | None
+) -> QuantPlan:
+    return read if isinstance(read, QuantPlan) else make(read, options, module_map)
 
 
 def make(model: ir.Model, options: QuantizeInt8, module_map: str | None) -> QuantPlan:

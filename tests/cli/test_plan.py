@@ -62,6 +62,50 @@ def test_plans_are_compared(
     ]
 
 
+def test_what_overrides_change_is_told_against_the_same_model(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (dense / "o.toml").write_text('[[override]]\nop = "MatMul"\ndtype = "float"\n')
+    model, map_ = dense / "dense.onnx", ("--map", dense / "map.toml")
+    words = (*map_, "--overrides", dense / "o.toml", "--against", model)
+
+    assert command("plan", model, *words) == 0
+
+    said = capsys.readouterr().out
+    assert "/plan_head/MatMul: int8 (layer) -> float (override)" in said
+    assert "1 differences" in said
+
+
+@pytest.mark.parametrize("file", ["out.onnx", "out.plan.json"])
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("--scheme full", "scheme"),
+        ("--rules tensorrt", "rules"),
+        ("--overrides none.toml", "overrides"),
+        ("--overrides none.toml --against dense.onnx", "overrides"),
+        ("--scheme full --against out.plan.json", "scheme"),
+    ],
+)
+def test_options_are_not_for_a_plan_that_is_made(
+    command: Command,
+    dense: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    words: str,
+    option: str,
+) -> None:
+    compressed(command, dense)
+    monkeypatch.chdir(dense)
+    capsys.readouterr()
+
+    assert command("plan", file, *words.split()) == 1
+
+    error = capsys.readouterr().err
+    assert f"--{option} is for a plan that is yet to be made, and {file} has" in error
+
+
 def test_a_plan_is_shown_with_reasons(
     command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
