@@ -46,12 +46,22 @@ class Grid:
 
 
 def never_negative(value: ir.Value) -> bool:
-    """Prove by what makes a tensor that none of its elements is negative."""
-    node = value.producer()
-    while node is not None and is_move(node) and node.inputs[0] is not None:
-        node = node.inputs[0].producer()
-    if node is None:
-        return False
-    if node.op_type == "Concat":
-        return all(each is not None and never_negative(each) for each in node.inputs)
-    return node.op_type in _UNSIGNED or is_clip_at_zero(node)
+    """Prove by what makes a tensor that none of its elements is negative.
+
+    Linear in the nodes behind it: what several ways lead to is looked at once.
+    """
+    pending: list[ir.Value | None] = [value]
+    seen: set[ir.Value] = {value}
+    while pending:
+        current = pending.pop()
+        node = None if current is None else current.producer()
+        if node is None:
+            return False
+        if node.op_type in _UNSIGNED or is_clip_at_zero(node):
+            continue
+        if node.op_type != "Concat" and not is_move(node):
+            return False
+        sources = node.inputs if node.op_type == "Concat" else node.inputs[:1]
+        pending += [each for each in sources if each not in seen]
+        seen.update(each for each in sources if each is not None)
+    return True
