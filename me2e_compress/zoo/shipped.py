@@ -43,9 +43,10 @@ class ModelCard(pydantic.BaseModel):
         parameters: trained numbers in it.
         seed: of the initial weights and of everything drawn in training.
         data: what it learned from.
-        command: what trains it again.
-        hours: of training on the machine that ``command`` names or describes; None:
-            not measured.
+        command: how it was trained, in words, and the command that trains one such as
+            it.
+        hours: of training, on the machine that the page of ``command`` tells; None: not
+            measured.
         scores: by name with the unit in it (``driving_score_percent``); None: not
             measured, as a whole or one by one.
     """

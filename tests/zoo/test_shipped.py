@@ -1,5 +1,6 @@
 import hashlib
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -150,6 +151,16 @@ def test_an_altered_checkpoint_is_refused(weights: Path) -> None:
 
     with pytest.raises(GraphError, match=r"highway\.pt: altered or incomplete: sha256"):
         checkpoint("highway", weights)
+
+
+def test_the_card_says_where_its_training_is_told() -> None:
+    root = Path(__file__).parents[2]
+    (page,) = re.findall(r"\S+\.md\b", card("highway").command)
+
+    stages = sorted((root / page).parent.glob("training/stage-*.jsonl"))
+    assert "## How it was trained" in (root / page).read_text("utf-8")
+    assert card("highway").command.startswith("eight stages")
+    assert len(stages) == 8
 
 
 def test_a_card_without_a_checkpoint_says_so(weights: Path) -> None:
