@@ -1,3 +1,4 @@
+import numpy as np
 import onnx_ir as ir
 import pytest
 
@@ -6,7 +7,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.targets import target_named
 from me2e_compress.targets.lint import lint
-from tests.nets import MODULES, conv_attention
+from tests.nets import MODULES, conv_attention, net
 
 LAYER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -72,6 +73,25 @@ def test_opsets_nobody_has_released() -> None:
 
 def test_what_we_place_for_it_has_no_findings() -> None:
     model = conv_attention()
+    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    target = target_named("onnxruntime")
+    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
+
+    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+
+    assert lint(placed, "onnxruntime") == ()
+
+
+def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    up (float[1,8,4,4] x, float[8,8,1,1] w, float[8,8,2,2] t) => (float[1,8,8,8] y) {
+        c = Conv(x, w)
+        r = Relu(c)
+        y = ConvTranspose<kernel_shape=[2,2], strides=[2,2]>(r, t)
+    }
+    """
+    model = net(text, {"w": np.ones((8, 8, 1, 1)), "t": np.ones((8, 8, 2, 2))})
     plan = make_plan(model, QuantScheme.named("full", MODULES))
     target = target_named("onnxruntime")
     ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))

@@ -52,12 +52,13 @@ def signed_activations(model: ir.Model) -> Iterator[Finding]:
 
 
 def unanswered(model: ir.Model) -> Iterator[Finding]:
-    """Find convolutions whose result is not quantized: they run in float.
+    """Find quantized convolutions whose result is not: they run in float.
 
-    A Relu or Clip may stand in between: it is fused.
+    A Relu or Clip may stand in between: it is fused. A convolution with a float weight
+    is meant to run in float, whatever it reads.
     """
     for node in _layers(model):
-        if node.op_type not in CONVOLUTIONS or not is_pair(node.inputs[0]):
+        if node.op_type not in CONVOLUTIONS or not all(map(is_pair, node.inputs[:2])):
             continue
         value = node.outputs[0]
         readers = list(value.consumers())
