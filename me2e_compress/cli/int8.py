@@ -32,8 +32,15 @@ class Int8Options:
         """Put them into the quantization of a pipeline; add one for a scheme.
 
         Raises:
-            RecipeError: there is nothing that they could apply to.
+            RecipeError: there is nothing that they could apply to, or the pipeline
+                quantizes twice.
         """
+        found = [each for each in passes if isinstance(each, QuantizeInt8)]
+        if len(found) + (self.scheme is not None) > 1:
+            raise RecipeError(
+                f"{QuantizeInt8.name} is twice in the pipeline, a graph is quantized"
+                f" once: leave out {'--scheme' if self.scheme else 'one of them'}"
+            )
         if self.scheme is not None:
             passes = (*passes, QuantizeInt8(scheme=self.scheme))
         options = {name: value for name, value in vars(self).items() if value}

@@ -36,6 +36,23 @@ def refused(
     return run
 
 
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (("-r", "full", "--scheme", "full"), "leave out --scheme"),
+        (("--passes", "quantize-int8", "--scheme", "full"), "leave out --scheme"),
+        (("--passes", "quantize-int8,quantize-int8"), "leave out one of them"),
+    ],
+)
+def test_int8_twice(
+    refused: Refused, dense: Path, words: tuple[str, ...], advice: str
+) -> None:
+    line = refused(*words, "--frames", dense / "frames")
+
+    assert "quantize-int8 is twice in the pipeline" in line
+    assert advice in line
+
+
 def test_no_frames(refused: Refused, dense: Path) -> None:
     (dense / "empty").mkdir()
 
