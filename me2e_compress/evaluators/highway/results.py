@@ -66,10 +66,11 @@ class ResultsFolder:
                 else, or cannot be written.
         """
         try:
-            (path / ROUTES).mkdir(parents=True, exist_ok=True)
+            path.mkdir(parents=True, exist_ok=True)
             if not (path / MANIFEST).exists():
-                if any((path / ROUTES).iterdir()):
-                    raise EvaluationError(f"{path}: holds routes but no {MANIFEST}")
+                _refuse_foreign(path)
+            (path / ROUTES).mkdir(exist_ok=True)
+            if not (path / MANIFEST).exists():
                 write_json(path / MANIFEST, made_by, indent=1)
         except OSError as error:
             raise _unwritable(path, error) from error
@@ -168,6 +169,15 @@ def read_results(paths: Iterable[Path]) -> list[ResultsFolder]:
         EvaluationError: One of them is none.
     """
     return [ResultsFolder.open(path) for path in paths]
+
+
+def _refuse_foreign(path: Path) -> None:
+    """Refuse a folder that is not ours; a kill leaves a draft and no more in ours."""
+    names = [file.name for file in path.iterdir() if not file.name.startswith(".")]
+    if any(name != ROUTES for name in names):
+        raise EvaluationError(f"{path}: not empty, and holds no {MANIFEST}")
+    if names and any((path / ROUTES).iterdir()):
+        raise EvaluationError(f"{path}: holds routes but no {MANIFEST}")
 
 
 def _unwritable(path: Path, error: OSError) -> EvaluationError:

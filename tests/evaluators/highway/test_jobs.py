@@ -106,6 +106,26 @@ def test_finished_routes_are_not_driven_again(results: Path) -> None:
     assert [(report.done, report.total) for report in reports] == [(2, 2)]
 
 
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "thesis"
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("years of work")
+
+    with pytest.raises(EvaluationError, match=r"/thesis: not empty, and holds no eval"):
+        ResultsFolder.create(folder, _made_by(evaluator(folder)))
+    assert list(content(folder)) == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("left", ["routes", ".evaluation.json.x1"])
+def test_what_a_kill_left_at_the_beginning_does_not_matter(
+    tmp_path: Path, left: str
+) -> None:
+    (tmp_path / "results" / left).mkdir(parents=True)
+    folder = ResultsFolder.create(tmp_path / "results", _made_by(evaluator(tmp_path)))
+
+    assert folder.episodes() == {}
+
+
 def test_a_corrupt_file_is_named_and_driven_again(results: Path) -> None:
     warnings = list[str]()
     before = content(results)
