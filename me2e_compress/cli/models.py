@@ -6,16 +6,17 @@ from me2e_compress.errors import GraphError
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 
-def model_path(text: str) -> Path:
-    """Give the file that a word of the command line means; an existing file wins.
+def model_path(text: str, beside: Path = Path()) -> Path:
+    """Give the file that a word means; an existing file wins.
 
     Args:
         text: a path, or a name in `SHIPPED`.
+        beside: the folder that the path is relative to.
 
     Raises:
         GraphError: neither, or the shipped file is missing or altered.
     """
-    path = Path(text)
+    path = beside / text
     if path.is_file():
         return path
     if text in SHIPPED:

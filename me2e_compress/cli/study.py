@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -34,7 +35,8 @@ def study(
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Drive schemes under conditions and compare them; run it again to go on."""
-    asked = load_study(definition, model_path, routes)
+    ours = partial(model_path, beside=definition.parent)
+    asked = load_study(definition, ours, routes)
     check_folder(output, _read(definition, asked), (JSON, MARKDOWN, HTML))
     with listener() as told:
         found = run_study(asked, output, engine_of(engine, workers, address), told)

@@ -132,8 +132,7 @@ class _Reader:
     def _scheme(self, table: _Scheme) -> Scheme:
         policy = table.policy
         if Driver(policy).is_model:
-            beside = self._beside(policy)
-            policy = str(beside if beside.is_file() else self.resolve(policy))
+            policy = str(self._model(policy))
         return Scheme(
             table.name,
             policy,
@@ -142,6 +141,14 @@ class _Reader:
             self._file(table.adapter),
             self._file(table.trace),
         )
+
+    def _model(self, policy: str) -> Path:
+        """Find a model beside the study or by its name, and nowhere else."""
+        beside = self._beside(policy)
+        if beside.is_file():
+            return beside
+        found = self.resolve(policy)
+        return beside if found == Path(policy) else found
 
     def _passes(self, table: _Scheme) -> tuple[Pass, ...]:
         if table.recipe is not None and table.passes is not None:

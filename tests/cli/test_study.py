@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 from me2e_compress.cli import evaluate, study
+from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.routes import save_routes
+from me2e_compress.study import Study
+from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import Command, write_frames
 from tests.evaluators.highway.drivers import CROSSING, straight_on
 from tests.study.conftest import Here
@@ -109,6 +112,27 @@ def test_what_is_wrong_is_one_line(
     line = capsys.readouterr().err
     assert message in line
     assert line.count("\n") == 1
+
+
+def test_a_model_that_ships_is_not_one_where_you_are(
+    toml: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    straight_on(elsewhere / "highway")
+    monkeypatch.chdir(elsewhere)
+    toml.write_text(STUDY.replace('"m.onnx"', '"highway"'))
+    asked = list[Study]()
+
+    def noted(found: Study, *_: object) -> None:
+        asked.append(found)
+        raise StudyError("seen")
+
+    monkeypatch.setattr(study, "run_study", noted)
+    with pytest.raises(StudyError, match="seen"):
+        study.study(toml, tmp_path / "out")
+
+    assert asked[0].schemes[0].policy == str(shipped("highway"))
 
 
 def test_an_engine_nobody_knows(

@@ -85,6 +85,18 @@ def test_a_name_that_is_no_file_is_one_that_ships(models: Path) -> None:
     assert study.schemes[0].policy == "/shipped/highway"
 
 
+def test_a_file_where_you_are_is_not_beside_the_study(
+    models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(models, GOOD.replace('"slow.onnx"', '"other.onnx"'))
+    (tmp_path / "other.onnx").write_bytes((models / "slow.onnx").read_bytes())
+    monkeypatch.chdir(tmp_path)
+
+    study = load_study(path)
+
+    assert study.schemes[0].policy == str(models / "other.onnx")
+
+
 def test_routes_of_the_command_line_win(models: Path) -> None:
     study = load_study(write(models, GOOD), routes="ParkedObstacle_0")
 
