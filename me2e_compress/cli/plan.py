@@ -142,9 +142,11 @@ def _show(found: QuantPlan, *, every: bool) -> None:
     if every and found.groups:
         console.print(_groups(found))
     counts = ", ".join(f"{rule} {count}" for rule, count in found.counts().items())
+    kept = len(found.kept_float)
     console.print(
         f"scheme {found.scheme.name}, rules {found.rules}: {len(found.chosen)} of"
         f" {len(found.decisions)} nodes int8; {counts}"
+        + (f"; {kept} of them stay float on their target" if kept else "")
     )
 
 

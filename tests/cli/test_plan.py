@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from pathlib import Path
 
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan import load_plan, plan_of
+from me2e_compress.calibration.plan import KeptFloat, load_plan, plan_of, save_plan
 from tests.cli.conftest import Command, strict
 from tests.nets import net
 
@@ -195,3 +196,18 @@ def test_a_quantized_graph_is_explained_not_quantized_again(
     assert "quantized already: 2 DequantizeLinear, 1 Quantize" in (
         capsys.readouterr().err
     )
+
+
+def test_what_a_target_kept_in_float_is_counted(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compressed(command, dense)
+    made = load_plan(dense / "out.plan.json")
+    kept = tuple(KeptFloat(each.node, each.output, "slow") for each in made.chosen)
+    save_plan(dataclasses.replace(made, kept_float=kept), dense / "kept.plan.json")
+    capsys.readouterr()
+
+    assert command("plan", dense / "kept.plan.json") == 0
+
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 of them stay float on their target" in said
