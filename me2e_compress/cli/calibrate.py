@@ -58,7 +58,7 @@ def calibrate(
     count: Annotated[
         int, typer.Option("-n", "--count", help="frames, drawn in whole scenes")
     ] = 256,
-    seed: Annotated[int, typer.Option(help="of the draw")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="of the draw")] = 0,
     module_map: Annotated[
         str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
     ] = None,
@@ -78,7 +78,9 @@ def calibrate(
     onnxruntime_table: Annotated[
         Path | None, typer.Option(help="write onnxruntime's table too: a folder")
     ] = None,
-    threads: Annotated[int, typer.Option(help="of onnxruntime; 0 takes all")] = 0,
+    threads: Annotated[
+        int, typer.Option(min=0, help="of onnxruntime; 0 takes all")
+    ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.

@@ -56,9 +56,10 @@ def compress(
     module_map: Annotated[
         str | None, typer.Option("--map", help="a preset or a TOML file")
     ] = None,
-    seed: Annotated[int, typer.Option(help="of everything random")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="of everything random")] = 0,
     verify_frames: Annotated[
-        int, typer.Option(help="frames that exact passes are checked on; 0: none")
+        int,
+        typer.Option(min=0, help="frames that exact passes are checked on; 0: none"),
     ] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:

@@ -22,8 +22,10 @@ def demo(
     ] = "feature-ext",
     routes: Annotated[str, typer.Option(help="that highway drives: N or ID,ID")] = "5",
     workers: Annotated[int, typer.Option(min=1, help="routes at a time")] = 2,
-    rounds: Annotated[int, typer.Option(help="latency rounds of vad-tiny")] = 4,
-    threads: Annotated[int, typer.Option(help="of onnxruntime, for vad-tiny")] = 2,
+    rounds: Annotated[int, typer.Option(min=1, help="latency rounds of vad-tiny")] = 4,
+    threads: Annotated[
+        int, typer.Option(min=0, help="of onnxruntime, for vad-tiny")
+    ] = 2,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
 

@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from me2e_compress.cli.console import console, errors, number, print_json, progress
 from me2e_compress.cli.drivers import driver_of
+from me2e_compress.cli.limits import check_number
 from me2e_compress.cli.output import check_folder
 from me2e_compress.cli.score import scores_table
 from me2e_compress.errors import EvaluationError
@@ -41,7 +42,7 @@ def evaluate(
         float, typer.Option(help="of a trace or a measurement")
     ] = 1.0,
     in_order: Annotated[bool, typer.Option(help="replay a trace in its order")] = False,
-    seed: Annotated[int, typer.Option(help="of the draws from a trace")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="of the draws from a trace")] = 0,
     workers: Annotated[int, typer.Option(min=1, help="routes at a time")] = 1,
     dt_ms: Annotated[float, typer.Option(help="step of the world")] = 50.0,
     adapter: Annotated[Path | None, typer.Option(help="TOML: adapts a model")] = None,
@@ -57,6 +58,8 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on."""
+    for option, value in (("--dt-ms", dt_ms), ("--frame-limit", frame_limit)):
+        check_number(option, value)
     trace = latency.removeprefix("trace:")
     check_folder(output, (policy, routes, trace, adapter), (MANIFEST,))
     picked, set_size = routes_named(routes)

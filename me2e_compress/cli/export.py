@@ -25,7 +25,7 @@ def export(
         typer.Option(help="classes and ego modes of vad-tiny; default nuscenes"),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="of the initial weights; default 0")
+        int | None, typer.Option(min=0, help="of the initial weights; default 0")
     ] = None,
 ) -> None:
     """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver."""

@@ -32,7 +32,7 @@ def frames(
             f" {DRIVEN_SCENE_LENGTH}"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="of the scenes")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="of the scenes")] = 0,
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 

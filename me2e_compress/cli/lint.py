@@ -25,7 +25,7 @@ def lint(
         typer.Option("--trt-check", help="also parse and build it by TensorRT-RTX"),
     ] = False,
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,
-    shown: Annotated[int, typer.Option(help="nodes shown of each rule")] = 3,
+    shown: Annotated[int, typer.Option(min=0, help="nodes shown of each rule")] = 3,
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Check a graph for the program that will run it; 1 if it would be refused."""

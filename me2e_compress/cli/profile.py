@@ -20,7 +20,9 @@ def profile(
     output: Annotated[Path, typer.Option("-o", "--output", help="the trace")],
     samples: Annotated[int | None, typer.Option(help="how many latencies")] = None,
     warm_up: Annotated[int, typer.Option(help="inferences before")] = WARM_UP,
-    threads: Annotated[int, typer.Option(help="of onnxruntime; 0 takes all")] = 1,
+    threads: Annotated[
+        int, typer.Option(min=0, help="of onnxruntime; 0 takes all")
+    ] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="for programs")] = False,
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace."""

@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from me2e_compress import graph
 from me2e_compress.cli.console import console, print_json, progress, table
+from me2e_compress.cli.limits import check_number
 from me2e_compress.cli.trials import (
     Count,
     Json,
@@ -49,6 +50,8 @@ def search(
     as_json: Json = False,
 ) -> None:
     """Find the modules whose int8 meets a budget and costs the plan least."""
+    check_number("--max-mb", max_mb)
+    check_number("--max-ms", max_ms)
     if (max_mb is None) == (max_ms is None):
         raise RecipeError("give a budget: --max-mb or --max-ms, one of the two")
     runs_on = target or ("tensorrt" if max_ms is None else "onnxruntime")

@@ -14,6 +14,7 @@ from me2e_compress.cli.console import (
     progress,
     table,
 )
+from me2e_compress.cli.limits import check_number
 from me2e_compress.cli.output import check_folder
 from me2e_compress.cli.road import drives_of, on_routes
 from me2e_compress.cli.trials import (
@@ -59,7 +60,7 @@ def sensitivity(
         int, typer.Option(min=1, help="with --drive: routes at a time")
     ] = 1,
     node_trials: Annotated[
-        int, typer.Option(help="most trials on the nodes of a module; 0: none")
+        int, typer.Option(min=0, help="most trials on the nodes of a module; 0: none")
     ] = 24,
     ranges: Saved = None,
     module_map: Map = None,
@@ -74,6 +75,8 @@ def sensitivity(
     With --drive every module, all together and the float model drive the routes
     too; the episodes stay in RECIPE.drives, and run again, it goes on from them.
     """
+    check_number("--limit", limit, zero=True)
+    check_number("--drive-limit", drive_limit, zero=True)
     if drive is None and (drive_limit is not None or adapter is not None):
         raise RecipeError("--drive-limit and --adapter say how to drive: add --drive")
     setting = Setting(

@@ -33,7 +33,7 @@ Map = Annotated[
     str | None, typer.Option("--map", help="vad, uniad, tcp, or a TOML file")
 ]
 Count = Annotated[int, typer.Option("-n", "--count", help="frames to judge on")]
-Threads = Annotated[int, typer.Option(help="of onnxruntime; 0 takes all")]
+Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; 0 takes all")]
 Json = Annotated[bool, typer.Option("--json", help="for programs")]
 
 
