@@ -4,6 +4,7 @@ Both know one number a tensor, so what comes back is symmetric: [-reach, reach].
 """
 
 import os
+import re
 import struct
 import tempfile
 from collections.abc import Callable, Mapping
@@ -21,6 +22,9 @@ from me2e_compress.runtime.atomic import write_bytes
 TABLE_FILES = ("calibration.flatbuffers", "calibration.json", "calibration.cache")
 """What an onnxruntime table is made of, in a folder."""
 
+_MIN_MAX, _ENTROPY = "MinMaxCalibration", "EntropyCalibration2"
+_HEAD = re.compile(r"TRT-\d+-(\w+)")
+
 _VERSION = "TRT-101000"
 """What the cache claims to be written by; TensorRT 10 reads caches of this form."""
 
@@ -28,11 +32,12 @@ _VERSION = "TRT-101000"
 def write_tensorrt_cache(ranges: Ranges, path: Path) -> None:
     """Write a TensorRT calibration cache: a line ``name: scale`` for every tensor.
 
-    The scale, reach / 127, is a float32 in big-endian hexadecimal.
+    The scale, reach / 127, is a float32 in big-endian hexadecimal. The head names the
+    calibrator whose cache it is: that of an imported one, if it said which.
     """
-    kind = "MinMax" if ranges.method == MaxMin.name else "Entropy"
-    suffix = "Calibration2" if kind == "Entropy" else "Calibration"
-    lines = [f"{_VERSION}-{kind}{suffix}"]
+    extremes = ranges.method in (MaxMin.name, IMPORTED)
+    kind = ranges.calibrator or (_MIN_MAX if extremes else _ENTROPY)
+    lines = [f"{_VERSION}-{kind}"]
     lines += [
         f"{name}: {struct.pack('!f', float(scale_of(*ends))).hex()}"
         for name, ends in ranges.tensors.items()
@@ -74,11 +79,13 @@ def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise FramesError(f"{path}: not a calibration cache ({error})") from error
+    head = _HEAD.fullmatch(lines[0]) if lines else None
     if lines and lines[0].startswith("TRT-"):
         reach = _parse(path, lines, 1, ": ", _hexadecimal)
     else:
         reach = _parse(path, lines, 0, " ", float)
-    return Ranges(_needed(path, reach, tensors), IMPORTED, 0, model, "")
+    ends = _needed(path, reach, tensors)
+    return Ranges(ends, IMPORTED, 0, model, "", calibrator=head[1] if head else "")
 
 
 def _parse(

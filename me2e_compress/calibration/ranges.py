@@ -36,6 +36,8 @@ class Ranges:
         source: fingerprint of the recording.
         outliers: crest factor of each tensor whose range a few elements make, see
             :data:`OUTLIER_CREST`.
+        calibrator: of TensorRT, that made the cache they were imported from; empty if
+            none did.
     """
 
     tensors: dict[str, tuple[float, float]]
@@ -44,6 +46,7 @@ class Ranges:
     model: str
     source: str
     outliers: dict[str, float] = dataclasses.field(default_factory=dict)
+    calibrator: str = ""
 
     @classmethod
     def of(cls, seen: Statistics, method: Observer) -> Self:

@@ -41,6 +41,25 @@ def test_the_cache_is_as_tensorrt_writes_it(
     assert lines[0] == f"{NAMES[0]}: {struct.pack('>f', 3.5 / 127).hex()}"
 
 
+@pytest.mark.parametrize("method", ["max-min", "mse"])
+def test_a_cache_that_came_in_goes_out_as_it_was(tmp_path: Path, method: str) -> None:
+    write_tensorrt_cache(ranges(method), tmp_path / "c")
+    read_foreign(tmp_path / "c", "m", NAMES).save(tmp_path / "r.json")
+
+    write_tensorrt_cache(Ranges.load(tmp_path / "r.json"), tmp_path / "again")
+
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes()
+
+
+def test_what_came_from_a_table_is_of_extremes(tmp_path: Path) -> None:
+    write_onnxruntime_table(ranges(), tmp_path)
+    found = read_foreign(tmp_path / "calibration.cache", "m", NAMES)
+
+    write_tensorrt_cache(found, tmp_path / "c")
+
+    assert "-MinMaxCalibration\n" in (tmp_path / "c").read_text()
+
+
 @settings(max_examples=20, deadline=None)
 @given(reach=st.floats(1e-30, 1e30))
 def test_scales_survive_the_way_through_a_cache(
