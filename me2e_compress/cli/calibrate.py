@@ -29,8 +29,9 @@ from me2e_compress.cli.output import check_folder, check_output
 from me2e_compress.errors import FramesError, PreconditionError, RecipeError
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.targets import TARGETS
+from me2e_compress.targets import TARGETS, onnxruntime
 from me2e_compress.targets.quantized import describe_quantized
 
 _SHOWN = 5
@@ -100,8 +101,9 @@ def calibrate(
     check_output([output, checkpoint, tensorrt_cache], read)
     if onnxruntime_table is not None:
         check_folder(onnxruntime_table, read, TABLE_FILES)
-    passes = _before_int8(recipe.load(recipe_name))
-    ready, tensors = prepare(model, module_map, passes)
+    passes, lowers = _before_int8(recipe.load(recipe_name))
+    get = prepare_lowering if lowers else prepare
+    ready, tensors = get(model, module_map, passes)
     if foreign is not None:
         found = read_foreign(foreign, graph.digest(ready), tensors)
     elif shards:
@@ -162,6 +164,25 @@ def prepare(
     return ready, tensors
 
 
+def prepare_lowering(
+    path: Path, module_map: str | None, passes: tuple[Pass, ...]
+) -> tuple[ir.Model, tuple[str, ...]]:
+    """Give the quantized graph that is lowered, and the tensors it tells no range of.
+
+    Raises:
+        PreconditionError: the graph is not quantized, or tells every range.
+    """
+    loaded = graph.load(path)
+    ready = run_on(loaded, passes, map_of(loaded, module_map))
+    graph.infer_shapes(ready)
+    tensors = onnxruntime.unranged(ready)
+    if not tensors:
+        raise PreconditionError(
+            f"{path}: it tells every range that {LowerInt8.name} needs: none to measure"
+        )
+    return ready, tensors
+
+
 def tensors_of_all(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
     """Name what any rule set and target reads when every module is int8."""
     names: dict[str, None] = {}
@@ -189,12 +210,12 @@ def _check_sources(
         raise FramesError("--shard is for frames, and none are given")
 
 
-def _before_int8(passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
-    """Leave out the quantization and what follows it."""
-    names = [each.name for each in passes]
-    if QuantizeInt8.name not in names:
-        return passes
-    return passes[: names.index(QuantizeInt8.name)]
+def _before_int8(passes: tuple[Pass, ...]) -> tuple[tuple[Pass, ...], bool]:
+    """Leave out the first pass that reads ranges and the rest; say if it lowers."""
+    for at, each in enumerate(passes):
+        if isinstance(each, (QuantizeInt8, LowerInt8)):
+            return passes[:at], isinstance(each, LowerInt8)
+    return passes, False
 
 
 def _fraction(text: str) -> tuple[int, int]:

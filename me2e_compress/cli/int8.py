@@ -5,6 +5,7 @@ from pathlib import Path
 
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes import Pass
+from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 
 
@@ -47,22 +48,33 @@ class Int8Options:
         options.pop("scheme", None)
         if not options:
             return passes
-        if not any(isinstance(each, QuantizeInt8) for each in passes):
+        if any(isinstance(each, QuantizeInt8) for each in passes):
+            return tuple(self._quantize(each) for each in passes)
+        names = [name for name in options if name not in ("ranges", "method")]
+        if names or not any(isinstance(each, LowerInt8) for each in passes):
             raise RecipeError(
-                f"--{next(iter(options))} is for int8, and the pipeline has no"
+                f"--{next(iter(names or options))} is for int8, and the pipeline has no"
                 f" {QuantizeInt8.name}: add --scheme"
             )
-        return tuple(
-            self._changed(each) if isinstance(each, QuantizeInt8) else each
-            for each in passes
-        )
+        return tuple(self._lower(each) for each in passes)
 
-    def _changed(self, given: QuantizeInt8) -> QuantizeInt8:
+    def _quantize(self, given: Pass) -> Pass:
+        if not isinstance(given, QuantizeInt8):
+            return given
         return dataclasses.replace(
             given,
             rules=self.rules or given.rules,
             target=self.target or given.target,
             overrides=self.overrides or given.overrides,
+            ranges=self.ranges or given.ranges,
+            method=self.method or given.method,
+        )
+
+    def _lower(self, given: Pass) -> Pass:
+        if not isinstance(given, LowerInt8):
+            return given
+        return dataclasses.replace(
+            given,
             ranges=self.ranges or given.ranges,
             method=self.method or given.method,
         )

@@ -8,6 +8,7 @@ import pytest
 from me2e_compress import graph
 from tests.cli.conftest import Command
 from tests.frames import record
+from tests.nets import conv_attention, image
 
 
 @pytest.fixture
@@ -181,3 +182,34 @@ def test_shards_of_another_model_and_quantized_graphs_are_refused(
     graph.save(model, folder / "other.onnx")
     assert command("calibrate", folder / "other.onnx", *with_other, *map_) == 1
     assert "stale: of graph" in capsys.readouterr().err
+
+
+def test_a_graph_that_is_lowered_takes_saved_ranges(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph.save(conv_attention(), tmp_path / "m.onnx")
+    frames = record(tmp_path / "frames", [image(seed) for seed in range(2)], (0,))
+    (tmp_path / "map.toml").write_text(
+        '[modules.backbone]\nrole = "feature"\npatterns = ["backbone"]\n'
+        '[modules.head]\nrole = "prediction"\npatterns = ["head"]\n'
+    )
+    (tmp_path / "lower.toml").write_text('[[pass]]\nname = "lower-int8"\n')
+    place, model = ("--map", tmp_path / "map.toml"), tmp_path / "int8.onnx"
+    made = ("--scheme", "full", "--frames", frames, *place, "-o", model)
+    assert command("compress", tmp_path / "m.onnx", *made) == 0
+
+    saved, how = tmp_path / "r.json", ("-r", tmp_path / "lower.toml", *place)
+    assert command("calibrate", model, frames, *how, "-o", saved) == 0
+    for name, source in (("a", ("--ranges", saved)), ("b", ("--frames", frames))):
+        done = command(
+            *("compress", model, *how, *source, "--verify-frames", "0"),
+            *("-o", tmp_path / f"{name}.onnx"),
+        )
+        assert done == 0
+
+    one, other = (graph.load(tmp_path / f"{name}.onnx") for name in "ab")
+    assert graph.digest(one) == graph.digest(other)
+    capsys.readouterr()
+    words = ("--rules", "paper", "-o", tmp_path / "c.onnx")
+    assert command("compress", model, *how, *words) == 1
+    assert "--rules is for int8" in capsys.readouterr().err
