@@ -42,7 +42,7 @@ def test_a_file_in_the_place_of_the_folder(
     (tmp_path / "out").write_text("mine")
 
     assert command("train", "highway", "--small", "-o", tmp_path / "out") == 1
-    assert "File exists" in capsys.readouterr().err
+    assert "out is a file: name a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [("uniad",), ("highway", "--workers", "0"), ()])
