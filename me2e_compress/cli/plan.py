@@ -136,7 +136,7 @@ def _show(found: QuantPlan, *, every: bool) -> None:
                 each.op,
                 each.dtype,
                 each.rule,
-                escape(each.reason + close),
+                escape(each.reason) + close,
             )
     console.print(shown)
     if every and found.groups:

@@ -211,3 +211,23 @@ def test_what_a_target_kept_in_float_is_counted(
 
     said = " ".join(capsys.readouterr().out.split())
     assert "1 of them stay float on their target" in said
+
+
+def test_a_close_decision_says_so_without_markup(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compressed(command, dense)
+    made = load_plan(dense / "out.plan.json")
+    close = tuple(
+        dataclasses.replace(each, reason="[8,8]", borderline="near 512")
+        for each in made.decisions
+    )
+    save_plan(dataclasses.replace(made, decisions=close), dense / "close.plan.json")
+    capsys.readouterr()
+
+    assert command("plan", dense / "close.plan.json", "--all") == 0
+
+    said = " ".join(capsys.readouterr().out.split())
+    assert "[8,8]" in said
+    assert "(near" in said
+    assert "bold" not in said
