@@ -80,7 +80,9 @@ def load(name: str | Path) -> tuple[Pass, ...]:
     elif str(name) in shipped():
         source = resources.files("me2e_compress") / "recipes" / f"{name}.toml"
     else:
-        raise RecipeError(f"no recipe {name}: no such file; we ship {shipped()}")
+        raise RecipeError(
+            f"no recipe {name}: no such file; we ship {', '.join(shipped())}"
+        )
     try:
         content = tomllib.loads(source.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
