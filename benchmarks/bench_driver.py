@@ -23,6 +23,7 @@ from pathlib import Path
 
 from benchmarks.driver_records import (
     among_conditions,
+    among_schemes,
     losers,
     routes_csv,
     scores_csv,
@@ -203,7 +204,18 @@ def slowed(bench: Bench) -> str:
     return "\n".join(table.markdown() for table in tables)
 
 
+def one_more(bench: Bench) -> str:
+    """Hold what drives without two modules against what drives without one of them."""
+    couples = [
+        (bench.without(*pair), bench.without(name))
+        for pair in combinations(MODULES, 2)
+        for name in pair
+    ]
+    return among_schemes(Workplace(bench.out), couples, IDEAL).markdown()
+
+
 BESIDES: Mapping[str, Callable[[Bench], str]] = {
+    "pairs": one_more,
     "latency": slowed,
     "determinism": same_bytes,
 }

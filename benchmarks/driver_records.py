@@ -70,6 +70,30 @@ def among_conditions(
     )
 
 
+def among_schemes(
+    workplace: Workplace, pairs: Iterable[tuple[Scheme, Scheme]], condition: Condition
+) -> Table:
+    """Each first driver minus the second, under one condition.
+
+    Args:
+        workplace: Where they were driven.
+        pairs: Both of each were driven, or the row is left out.
+        condition: Of all.
+    """
+    rows = [
+        (Cell(f"{one.name} minus {two.name}"), *_cells(difference(more, less)))
+        for one, two in pairs
+        if (more := _driven(workplace, one, condition))
+        and (less := _driven(workplace, two, condition))
+    ]
+    return Table(
+        "One more module away",
+        ("schemes", "DS, points", "SR, points", "routes better", "routes worse"),
+        tuple(rows),
+        "Mean over routes with its 95 % interval, paired bootstrap.",
+    )
+
+
 def losers(outcome: Outcome) -> str:
     """Name the drives that are worse than the baseline's beyond doubt."""
     sure = [
@@ -97,6 +121,15 @@ def _episodes(
 ) -> list[Episode]:
     folder = ResultsFolder.open(workplace.results(scheme, condition))
     return list(folder.episodes().values())
+
+
+def _driven(
+    workplace: Workplace, scheme: Scheme, condition: Condition
+) -> list[Episode]:
+    """Give the episodes; none where nobody drove."""
+    if not workplace.results(scheme, condition).is_dir():
+        return []
+    return _episodes(workplace, scheme, condition)
 
 
 def _scores(outcome: Outcome, drive: Drive) -> Row:
