@@ -10,6 +10,8 @@ from collections.abc import Iterable
 
 import onnx_ir as ir
 
+from me2e_compress.errors import GraphError
+
 MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
 
 
@@ -29,15 +31,28 @@ class Provenance:
 
 
 def read(node: ir.Node) -> Provenance | None:
-    """Read a node's past; None if it has none."""
+    """Read a node's past; None if it has none.
+
+    Raises:
+        GraphError: what stands there is not what :func:`stamp` wrote.
+    """
     data = node.metadata_props
     if MODULE not in data or ORIGINS not in data:
         return None
-    return Provenance(
-        data[MODULE],
-        tuple(json.loads(data[ORIGINS])),
-        tuple(json.loads(data.get(PASSES, "[]"))),
-    )
+    return Provenance(data[MODULE], _names(node, ORIGINS), _names(node, PASSES))
+
+
+def _names(node: ir.Node, key: str) -> tuple[str, ...]:
+    text = node.metadata_props.get(key, "[]")
+    try:
+        names = json.loads(text)
+    except ValueError:
+        names = None
+    if not isinstance(names, list) or not all(type(name) is str for name in names):
+        raise GraphError(
+            f"node {node.name}: its metadata {key} is {text[:40]!r}, no list of names"
+        )
+    return tuple(names)
 
 
 def module_of(node: ir.Node) -> str:
