@@ -20,7 +20,5 @@ def test_a_past_is_read_as_it_was_stamped(node: ir.Node) -> None:
 @pytest.mark.parametrize("text", ["", "{", "3", '{"a": 1}', "[1]", '["a", null]'])
 def test_a_past_of_another_kind_is_named(node: ir.Node, text: str) -> None:
     node.metadata_props[ORIGINS] = text
-    with pytest.raises(
-        GraphError, match=r"^node /occ/Relu: its metadata me2e"
-    ):
+    with pytest.raises(GraphError, match=r"^node /occ/Relu: its metadata me2e"):
         provenance.read(node)
