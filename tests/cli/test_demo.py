@@ -46,6 +46,7 @@ def test_the_demo_compresses_drives_and_reports(
         out / "highway.full.onnx"
     )
     assert "quantize-int8" in record["schemes"][1]["pipeline"]
+    assert 'target="onnxruntime"' in record["schemes"][1]["pipeline"]
     assert record["routes"] == {"driven": 1, "set": 220}
     assert (out / "report.html").read_text().startswith("<!doctype html>")
     assert "<svg" in (out / "demo.svg").read_text()
