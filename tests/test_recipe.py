@@ -123,7 +123,7 @@ def test_a_bad_file_names_the_culprit(tmp_path: Path, text: str, message: str) -
 
 
 def test_an_unknown_recipe_lists_the_shipped_ones() -> None:
-    with pytest.raises(RecipeError, match="no recipe none: .*exact, feature-ext, "):
+    with pytest.raises(RecipeError, match=r"no recipe none: .*exact, feature-ext, "):
         recipe.load("none")
 
 
