@@ -81,6 +81,7 @@ def shown(content: Table) -> Shown:
     made = table(content.title, *content.columns)
     made.columns[0].no_wrap = True
     wide = console.width >= WIDE
+    made.show_edge = made.pad_edge = wide  # four characters that numbers can use
     for row in content.rows:
         made.add_row(*(_text(cell, wide) for cell in row))
     made.caption, made.caption_justify = content.note, "left"
