@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def two_threads() -> None:
-    """More would only wait for each other on a shared machine."""
-    torch.set_num_threads(2)
+def one_thread() -> None:
+    """Tests run side by side; torch's threads wait for each other by spinning."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
