@@ -14,13 +14,13 @@ from functools import partial
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.cameras import (
+from me2e_compress.simulator.cameras import (
     CameraRig,
     Cameras,
     Weather,
     paint_texture,
 )
-from me2e_compress.evaluators.highway.scene import (
+from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
     ActorKind,

@@ -23,19 +23,19 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 
-from me2e_compress.evaluators.base import Observation
+from me2e_compress.driving.contract import Observation
+from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.evaluators.latency import FixedLatency
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 
 LATENCIES_S = (0.0, 0.05, 0.15, 0.25, 0.45, 0.85)
 MODEL_MS = 10.0

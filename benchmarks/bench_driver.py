@@ -33,10 +33,10 @@ from me2e_compress.cli.frames import record
 from me2e_compress.cli.models import model_path
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
 from me2e_compress.passes import Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study import (
     Condition,
     Listener,

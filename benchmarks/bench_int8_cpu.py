@@ -36,13 +36,13 @@ from benchmarks.peer import peak_mb
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
-from me2e_compress.metrics.fidelity import compare
+from me2e_compress.fidelity.compare import compare
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.runtime.evaluate import constant_values
-from me2e_compress.runtime.race import race
+from me2e_compress.runtime.constant_values import constant_values
+from me2e_compress.runtime.interleaved import race
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers
 

@@ -29,22 +29,22 @@ from benchmarks.synthetic import synthetic
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.plan import (
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.fidelity.compare import compare
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.quantization.plan import (
     FLOAT,
     INT8,
     Decision,
     QuantPlan,
     make_plan,
 )
-from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.rules import WEIGHTED, tensorrt_rules
-from me2e_compress.calibration.scheme import QuantScheme
-from me2e_compress.manager import PassManager
-from me2e_compress.metrics.fidelity import compare
-from me2e_compress.modules import ModuleMap
-from me2e_compress.passes import Context
-from me2e_compress.runtime.evaluate import constant_values, evaluate_constants
-from me2e_compress.runtime.race import race
+from me2e_compress.quantization.rules import WEIGHTED, tensorrt_rules
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
+from me2e_compress.runtime.interleaved import race
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import tensorrt
 

@@ -17,11 +17,11 @@ import onnx_ir as ir
 
 from benchmarks import subjects
 from me2e_compress import graph
-from me2e_compress.calibration.plan import make_plan
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.rules import RULE_SETS, rules_named
-from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.modules import ModuleMap
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.rules import RULE_SETS, rules_named
+from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 
 PAPER_MB = {"prediction": 104.57, "feature-ext": 119.25, "full": 83.32}

@@ -9,11 +9,11 @@ import argparse
 import time
 from collections.abc import Callable
 
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scenarios.layouts.streets import multilane
-from me2e_compress.evaluators.highway.scene import Control
-from me2e_compress.evaluators.highway.traffic.stage import Stage
-from me2e_compress.evaluators.highway.world import World
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.layouts.streets import multilane
+from me2e_compress.simulator.scene import Control
+from me2e_compress.simulator.traffic.stage import Stage
+from me2e_compress.simulator.world import World
 
 CARS = (0, 5, 20, 50)
 

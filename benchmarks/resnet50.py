@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.frames import frames
 from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.vad.backbone import OUT_CHANNELS, ResNet50
 
 SIDE = 224

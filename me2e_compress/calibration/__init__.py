@@ -1,1 +1,1 @@
-"""The calibration frames, what is observed on them, and the ranges that follow."""
+"""What is measured on frames: recorded inputs, observers, the ranges that follow."""

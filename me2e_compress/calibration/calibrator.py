@@ -9,10 +9,10 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.checkpoint import Checkpoint, Standing
-from me2e_compress.calibration.gauges import Counts, Extremes, Gauge
 from me2e_compress.calibration.observers import observer
+from me2e_compress.calibration.probes import Counts, Extremes, Gauge
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.resume import Checkpoint, Standing
 from me2e_compress.calibration.statistics import BINS, Statistics, no_element
 from me2e_compress.calibration.stream import Readings, Recording, gauged, stream
 from me2e_compress.errors import FramesError

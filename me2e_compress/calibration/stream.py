@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.calibration.gauges import Gauge
-from me2e_compress.calibration.taps import GAUGES, arrange, tap
+from me2e_compress.calibration.insert_probes import GAUGES, arrange, tap
+from me2e_compress.calibration.probes import Gauge
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, replay
 

@@ -19,7 +19,6 @@ from me2e_compress.calibration.exchange import (
 )
 from me2e_compress.calibration.observers import observer
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.rules import RULE_SETS
 from me2e_compress.calibration.sample import Part, draw, shard
 from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.cli.console import console, print_json, progress
@@ -31,6 +30,7 @@ from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.targets import TARGETS, onnxruntime
 from me2e_compress.targets.quantized import describe_quantized
 

@@ -10,8 +10,8 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.cli.console import console, print_json, progress
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.tables import fidelity_table, plan_line
-from me2e_compress.metrics.fidelity import Fidelity
-from me2e_compress.metrics.fidelity import compare as measure
+from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.runtime.session import Session
 
 

@@ -19,10 +19,10 @@ from me2e_compress.cli.tables import (
     verification_table,
 )
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.evaluators.highway.routes import load_routes, pick_routes
 from me2e_compress.modules import Item, map_of
 from me2e_compress.passes import Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study import Condition, Scheme, Study, Timing, run_study
 from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.write import write

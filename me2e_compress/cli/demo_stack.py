@@ -27,7 +27,7 @@ from me2e_compress.cli.tables import (
     verification_table,
 )
 from me2e_compress.modules import Item, map_of
-from me2e_compress.runtime.race import Lap, race
+from me2e_compress.runtime.interleaved import Lap, race
 from me2e_compress.runtime.session import Session
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 8, 4

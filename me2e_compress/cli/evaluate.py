@@ -12,19 +12,19 @@ from me2e_compress.cli.drivers import driver_of
 from me2e_compress.cli.limits import check_number
 from me2e_compress.cli.output import check_folder
 from me2e_compress.cli.score import scores_table
+from me2e_compress.driving.latency import parse_latency
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.cameras import Weather
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
 from me2e_compress.evaluators.highway.render import render
 from me2e_compress.evaluators.highway.results import MANIFEST
-from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
-from me2e_compress.evaluators.latency import parse_latency
 from me2e_compress.metrics.scores import Scores, score
+from me2e_compress.simulator.cameras import Weather
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 
 
 def evaluate(

@@ -12,8 +12,8 @@ from me2e_compress.cli.extras import need_closed_loop
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import check_folder
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.zoo.frames import frames as synthetic
 from me2e_compress.zoo.stacks import STACKS, find
+from me2e_compress.zoo.synthetic_frames import frames as synthetic
 
 SCENE_LENGTH = 8
 """Frames of a synthetic scene, half a second apart."""
@@ -91,8 +91,8 @@ def record(
 
 def _driven(model: Path, count: int, seed: int, length: int) -> Iterator[Frame]:
     need_closed_loop("what frames of a driver need")
-    from me2e_compress.evaluators.highway.frames import driven_frames
     from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+    from me2e_compress.evaluators.highway.recorder import driven_frames
 
     policy = OnnxPolicy.open(model)
     return driven_frames(policy, count, seed=seed, scene_length=length)

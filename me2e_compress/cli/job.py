@@ -6,13 +6,13 @@ import onnx_ir as ir
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.plan import plan_of, save_plan
 from me2e_compress.cli.console import progress
 from me2e_compress.cli.int8 import Int8Options
 from me2e_compress.errors import RecipeError
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
+from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.runtime.atomic import write_json
 
 

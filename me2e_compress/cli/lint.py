@@ -14,7 +14,7 @@ from me2e_compress.cli.models import model_path
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.targets.lint import Finding
 from me2e_compress.targets.lint import lint as find
-from me2e_compress.targets.rtx import Verdict, check
+from me2e_compress.targets.tensorrt.rtx import Verdict, check
 
 
 def lint(

@@ -11,16 +11,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from me2e_compress import graph, recipe
-from me2e_compress.calibration.plan import (
-    INT8,
-    QuantPlan,
-    differences,
-    load_plan,
-    plan_of,
-    save_plan,
-)
-from me2e_compress.calibration.plan.files import record
-from me2e_compress.calibration.rules import WEIGHTED
 from me2e_compress.cli.console import console, print_json, table
 from me2e_compress.cli.job import run_on
 from me2e_compress.cli.models import model_path
@@ -29,6 +19,16 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.modules import map_of
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import (
+    INT8,
+    QuantPlan,
+    differences,
+    load_plan,
+    plan_of,
+    save_plan,
+)
+from me2e_compress.quantization.plan.plan_files import record
+from me2e_compress.quantization.rules import WEIGHTED
 from me2e_compress.targets.quantized import describe_quantized
 
 

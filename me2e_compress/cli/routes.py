@@ -9,14 +9,14 @@ from rich.table import Table
 from me2e_compress.cli.console import console, errors, print_json, progress
 from me2e_compress.cli.output import check_output
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.admission import Verdict, examine
 from me2e_compress.evaluators.highway.generate import VARIANTS, Harvest, generate
-from me2e_compress.evaluators.highway.routes import (
+from me2e_compress.simulator.routes import (
     load_routes,
     pick_routes,
     save_routes,
 )
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 
 
 def routes(

@@ -24,7 +24,7 @@ from me2e_compress.cli.trials import (
     Threads,
 )
 from me2e_compress.errors import RecipeError
-from me2e_compress.runtime.race import race
+from me2e_compress.runtime.interleaved import race
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity import Budget, Candidate, Choice, Trials
 from me2e_compress.sensitivity import search as find

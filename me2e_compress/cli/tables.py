@@ -6,8 +6,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from me2e_compress.cli.console import megabytes, number, table
+from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.manager import Step, Verification
-from me2e_compress.metrics.fidelity import Fidelity
 from me2e_compress.modules import Item
 
 

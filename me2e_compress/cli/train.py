@@ -11,7 +11,7 @@ from me2e_compress.cli.output import check_folder
 from me2e_compress.metrics.measure import Estimate
 
 if TYPE_CHECKING:
-    from me2e_compress.zoo.train.course import News
+    from me2e_compress.training.course import News
 
 
 def train(
@@ -26,9 +26,9 @@ def train(
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
     # takes torch seconds to import
-    from me2e_compress.zoo.train.course import NO_LATENCY, run
-    from me2e_compress.zoo.train.curriculum import FULL
-    from me2e_compress.zoo.train.small import LATENCY, SMALL
+    from me2e_compress.training.course import NO_LATENCY, run
+    from me2e_compress.training.curriculum import FULL
+    from me2e_compress.training.small import LATENCY, SMALL
 
     check_folder(output, ())
     told = ""

@@ -10,14 +10,14 @@ from me2e_compress import graph, recipe
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.rules import rules_named
 from me2e_compress.calibration.sample import draw
-from me2e_compress.calibration.scheme import QuantScheme
 from me2e_compress.cli.calibrate import prepare
 from me2e_compress.cli.console import progress
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import Given, check_output
 from me2e_compress.modules import map_of
+from me2e_compress.quantization.rules import rules_named
+from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Choice, Drive, Trials, write_recipe
 from me2e_compress.targets import target_named
 

@@ -13,7 +13,6 @@ from me2e_compress.graph.files import (
     sha256_of,
 )
 from me2e_compress.graph.interface import Port, interface
-from me2e_compress.graph.measure import Size, macs, node_count, size
 from me2e_compress.graph.names import fresh_name, value_names
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.graph.rewrite import (
@@ -24,6 +23,7 @@ from me2e_compress.graph.rewrite import (
     sweep,
 )
 from me2e_compress.graph.shapes import infer_shapes, open_shape, static_shape
+from me2e_compress.graph.size_of import Size, macs, node_count, size
 
 __all__ = [
     "Port",

@@ -1,1 +1,1 @@
-"""Scores: they see recorded values and episodes, never a simulator or a pass."""
+"""Scores of episodes: they never see a simulator, a model or a pass."""

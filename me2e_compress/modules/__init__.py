@@ -4,7 +4,13 @@ from me2e_compress.modules.assign import Assignment, Placement, assign
 from me2e_compress.modules.detect import detect, map_of
 from me2e_compress.modules.inventory import Inventory, Weight, inventory
 from me2e_compress.modules.itemise import Item, itemise
-from me2e_compress.modules.map import Module, ModuleMap, Role, Substitute, presets
+from me2e_compress.modules.module_map import (
+    Module,
+    ModuleMap,
+    Role,
+    Substitute,
+    presets,
+)
 from me2e_compress.modules.patterns import Pattern
 from me2e_compress.modules.scopes import exits, scope_of
 

@@ -8,7 +8,7 @@ from typing import Literal
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules.map import ModuleMap
+from me2e_compress.modules.module_map import ModuleMap
 from me2e_compress.modules.neighbours import spread
 from me2e_compress.modules.parameters import by_parameter, is_constant, parameter_path
 from me2e_compress.modules.scopes import scope_of

@@ -3,7 +3,7 @@
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules.map import ModuleMap, presets
+from me2e_compress.modules.module_map import ModuleMap, presets
 from me2e_compress.modules.parameters import parameter_path
 from me2e_compress.modules.scopes import scope_of
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 import onnx_ir as ir
 
 from me2e_compress.modules.itemise import owner_of
-from me2e_compress.modules.map import ModuleMap
+from me2e_compress.modules.module_map import ModuleMap
 
 _INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
 

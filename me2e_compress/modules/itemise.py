@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import onnx_ir as ir
 
-from me2e_compress.modules.map import ModuleMap
+from me2e_compress.modules.module_map import ModuleMap
 from me2e_compress.modules.parameters import parameter_path
 
 _NOT_WEIGHTS = (

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import onnx_ir as ir
 
-from me2e_compress.modules.map import ModuleMap
+from me2e_compress.modules.module_map import ModuleMap
 
 
 def parameter_path(name: str | None) -> str:

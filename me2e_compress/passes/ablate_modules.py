@@ -13,7 +13,7 @@ from me2e_compress.modules import Substitute
 from me2e_compress.passes.base import Context, PassResult
 from me2e_compress.passes.glue import hand_over
 from me2e_compress.passes.means import means_of
-from me2e_compress.passes.stand_ins import (
+from me2e_compress.passes.substitutes import (
     constant_like,
     depends,
     module_of,

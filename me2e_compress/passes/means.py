@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.means import load_means, token_means
 from me2e_compress.errors import FramesError
-from me2e_compress.passes.stand_ins import layout_of
+from me2e_compress.passes.substitutes import layout_of
 from me2e_compress.runtime.frames import Array
 
 

@@ -7,7 +7,11 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan import (
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.errors import PreconditionError
+from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.measured import measured_ranges
+from me2e_compress.quantization.plan import (
     INT8,
     Overrides,
     QuantPlan,
@@ -15,12 +19,8 @@ from me2e_compress.calibration.plan import (
     sharing_costs,
     stamp_plan,
 )
-from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.rules import rules_named
-from me2e_compress.calibration.scheme import QuantScheme
-from me2e_compress.errors import PreconditionError
-from me2e_compress.passes.base import Context, PassResult
-from me2e_compress.passes.measured import measured_ranges
+from me2e_compress.quantization.rules import rules_named
+from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import target_named
 from me2e_compress.targets.lint import lint
 from me2e_compress.targets.quantized import describe_quantized
@@ -37,7 +37,7 @@ class QuantizeInt8:
     Result:  y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
 
     Which nodes, and why the others not, is the plan's to say
-    (:mod:`me2e_compress.calibration.plan`), and the graph carries it in its metadata:
+    (:mod:`me2e_compress.quantization.plan`), and the graph carries it in its metadata:
     attention of more than ``attention_limit`` tokens and matrix-vector products stay
     float. Ranges are measured on the context's frames, or read from a file; there is no
     calibration on made-up data.

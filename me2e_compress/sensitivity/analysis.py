@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-from me2e_compress.calibration.plan import RESIDUAL
+from me2e_compress.quantization.plan import RESIDUAL
 from me2e_compress.sensitivity.trials import Choice, Score, Trials
 
 BLAME = 0.5

@@ -7,13 +7,13 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan import FLOAT, Overrides, QuantPlan, make_plan
-from me2e_compress.calibration.plan.overrides import Override
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.rules import RuleSet
-from me2e_compress.calibration.scheme import QuantScheme
-from me2e_compress.metrics.fidelity import Fidelity, Reference
+from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.modules import ModuleMap
+from me2e_compress.quantization.plan import FLOAT, Overrides, QuantPlan, make_plan
+from me2e_compress.quantization.plan.overrides import Override
+from me2e_compress.quantization.rules import RuleSet
+from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target

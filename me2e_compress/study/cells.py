@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study.fidelity import EXACT
+from me2e_compress.study.plan_fidelity import EXACT
 
 MISSING = "\N{EN DASH}"
 """Stands where nothing was measured."""

@@ -6,13 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from me2e_compress.driving.latency import parse_latency
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import Driver
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.latency import parse_latency
 from me2e_compress.passes import Pass
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.simulator.routes import Route
 
 TRACE = "trace"
 """A condition's latency: what was measured of each model, under the device scale."""

@@ -13,8 +13,8 @@ from me2e_compress.metrics.differences import Difference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.study.definition import Condition, Study
-from me2e_compress.study.models import Contender
-from me2e_compress.study.routes import RouteOutcome, outcomes
+from me2e_compress.study.prepared import Contender
+from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
 from me2e_compress.study.workplace import Listener, Workplace
 

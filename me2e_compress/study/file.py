@@ -9,10 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from me2e_compress import recipe
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import Driver
-from me2e_compress.evaluators.highway.routes import Route, load_routes, pick_routes
 from me2e_compress.passes import Pass
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.study.check_frames import check_recordings
 from me2e_compress.study.definition import Condition, Scheme, Study, Timing
-from me2e_compress.study.recordings import check_recordings
 
 Resolve = Callable[[str], Path]
 """From the name of a model that ships to its file; the name itself if none does."""

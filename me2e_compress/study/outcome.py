@@ -9,9 +9,9 @@ from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.profile import processor
 from me2e_compress.study.definition import Condition, Study
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.fidelity import Faithfulness, measure_json
-from me2e_compress.study.models import Contender
-from me2e_compress.study.pictures import Contrast
+from me2e_compress.study.plan_fidelity import Faithfulness, measure_json
+from me2e_compress.study.prepared import Contender
+from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.timing import Clock
 
 LATENCY_PERCENTILES = (50, 99)

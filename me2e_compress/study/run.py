@@ -4,13 +4,13 @@ from pathlib import Path
 
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.manager.report import versions
+from me2e_compress.study.check_frames import check_recordings
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import Road
-from me2e_compress.study.fidelity import judge
-from me2e_compress.study.models import Contender, contend
 from me2e_compress.study.outcome import Outcome, SchemeOutcome, this_machine
-from me2e_compress.study.pictures import take_pictures
-from me2e_compress.study.recordings import check_recordings
+from me2e_compress.study.plan_fidelity import judge
+from me2e_compress.study.prepared import Contender, contend
+from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workplace import SILENT, Listener, Workplace
 

@@ -4,16 +4,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.latency import (
+from me2e_compress.driving.latency import (
     LatencySource,
     TraceLatency,
     parse_latency,
 )
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.interleaved import machine_in_turn, traces_in_turn
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.race import machine_in_turn, traces_in_turn
 from me2e_compress.study.definition import Condition, Scheme, Study
-from me2e_compress.study.models import Contender
+from me2e_compress.study.prepared import Contender
 from me2e_compress.study.workplace import Listener, Workplace
 
 

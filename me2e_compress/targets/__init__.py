@@ -5,10 +5,13 @@ from collections.abc import Callable
 
 import onnx_ir as ir
 
-from me2e_compress.calibration.plan import KeptFloat, QuantPlan
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import RecipeError
-from me2e_compress.targets import onnxruntime, tensorrt
+from me2e_compress.quantization.plan import KeptFloat, QuantPlan
+from me2e_compress.targets import (
+    onnxruntime,
+    tensorrt,
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections import Counter
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan.files import METADATA
+from me2e_compress.quantization.plan.plan_files import METADATA
 
 PAIRS = ("QuantizeLinear", "DequantizeLinear")
 INTEGER_OPS = frozenset(

@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.calibration.plan import Decision
-from me2e_compress.calibration.weights import quantize_weight
 from me2e_compress.errors import PreconditionError
-from me2e_compress.runtime.evaluate import evaluate_constants
+from me2e_compress.quantization.int8_weights import quantize_weight
+from me2e_compress.quantization.plan import Decision
+from me2e_compress.runtime.constant_values import evaluate_constants
 from me2e_compress.runtime.frames import Array
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from me2e_compress.zoo.world import Box, Pose, World
+from me2e_compress.zoo.synthetic_world import Box, Pose, World
 
 Array = NDArray[np.floating[Any]]
 

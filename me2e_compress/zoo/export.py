@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import onnx
 
 from me2e_compress.errors import GraphError, MissingExtraError
-from me2e_compress.zoo.files import write
+from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import Stack, find
 
 if TYPE_CHECKING:

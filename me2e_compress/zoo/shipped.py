@@ -8,7 +8,7 @@ from typing import Self
 import pydantic
 
 from me2e_compress.errors import GraphError
-from me2e_compress.zoo.files import write
+from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import STACKS
 
 WEIGHTS = Path(__file__).with_name("weights")
@@ -109,7 +109,7 @@ def shipped(name: str, folder: Path | None = None) -> Path:
 def checkpoint(name: str, folder: Path | None = None) -> Path:
     """Give the weights of a shipped model as training goes on from them.
 
-    It is a file of `me2e_compress.zoo.train.checkpoint.Start`.
+    It is a file of `me2e_compress.training.checkpoint.Start`.
 
     Args:
         name: one of `SHIPPED`.

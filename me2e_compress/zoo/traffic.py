@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from me2e_compress.zoo.world import LANE_M, LANES, TILE, Box, World
+from me2e_compress.zoo.synthetic_world import LANE_M, LANES, TILE, Box, World
 
 Range = tuple[float, float]
 

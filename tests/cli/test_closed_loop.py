@@ -12,7 +12,7 @@ from me2e_compress.cli.evaluate import evaluate
 from me2e_compress.cli.profile import profile
 from me2e_compress.cli.score import score
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.routes import save_routes
+from me2e_compress.simulator.routes import save_routes
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 
 Run = Callable[..., str]

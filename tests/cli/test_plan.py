@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan import KeptFloat, load_plan, plan_of, save_plan
+from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
 from tests.cli.conftest import Command, strict
 from tests.nets import net
 

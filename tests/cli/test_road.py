@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
-from me2e_compress.evaluators.highway.routes import save_routes
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.simulator.routes import save_routes
 from tests.cli.conftest import Command, strict, write_frames
 from tests.evaluators.highway.drivers import PARKED, straight_on
 from tests.metrics.drives import drive as by_hand

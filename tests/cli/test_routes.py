@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 
 from me2e_compress.cli.routes import routes
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.routes import load_routes, save_routes
-from tests.evaluators.highway.world.driving import route_of
+from me2e_compress.simulator.routes import load_routes, save_routes
+from tests.simulator.world.driving import route_of
 
 STOP = "VanillaNonSignalizedTurnEncounterStopsign"
 

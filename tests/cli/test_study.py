@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress.cli import evaluate, study
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway.routes import save_routes
+from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import Study
 from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import Command, write_frames

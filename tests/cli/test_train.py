@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 
 from me2e_compress.cli.extras import training
 from me2e_compress.errors import MissingExtraError
-from me2e_compress.zoo.train.course import claim
-from me2e_compress.zoo.train.curriculum import FULL
+from me2e_compress.training.course import claim
+from me2e_compress.training.curriculum import FULL
 from tests.cli.conftest import Command
 
 Capture = pytest.CaptureFixture[str]

@@ -11,7 +11,10 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
-from me2e_compress.passes.fold_with_onnxsim import FoldWithOnnxsim, worker
+from me2e_compress.passes.fold_with_onnxsim import (
+    FoldWithOnnxsim,
+    onnxsim_main,
+)
 
 CONTEXT = Context(
     ModuleMap.parse('[modules.neck]\nrole = "feature"\npatterns = ["neck"]', "one")
@@ -88,7 +91,7 @@ def test_weights_that_stay_are_shared_with_the_model() -> None:
 def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     script = tmp_path / "stand_in.py"
     script.write_text(code)
-    monkeypatch.setattr(worker, "__file__", str(script))
+    monkeypatch.setattr(onnxsim_main, "__file__", str(script))
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph import provenance
 from me2e_compress.manager import PassManager
-from me2e_compress.metrics.fidelity import compare
 from me2e_compress.passes import Context
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8

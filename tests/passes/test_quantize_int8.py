@@ -6,16 +6,16 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.plan import plan_of
 from me2e_compress.errors import (
     FramesError,
     ModuleMapError,
     PreconditionError,
     RecipeError,
 )
-from me2e_compress.metrics.fidelity import compare
+from me2e_compress.fidelity.compare import compare
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers
 from tests.frames import record

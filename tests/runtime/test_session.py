@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.runtime.evaluate import constant_values, evaluate_constants
+from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, can_run, replay, run_once
 

@@ -8,12 +8,12 @@ import pytest
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.rules import rules_named
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.fidelity import Displacement, Fidelity
+from me2e_compress.fidelity.compare import Displacement, Fidelity
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.rules import rules_named
 from me2e_compress.sensitivity import (
     Budget,
     Choice,

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.evaluators.highway.worker import Driven, Job
+from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Condition, Outcome, Scheme, Study, Timing, run_study
 from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on

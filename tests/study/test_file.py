@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import EvaluationError, GraphError, RecipeError, StudyError
-from me2e_compress.evaluators.highway.routes import load_routes, save_routes
+from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
 from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.latency import FixedLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.latency import FixedLatency, TraceLatency
 from me2e_compress.graph import sha256_of
+from me2e_compress.runtime.interleaved import machine_in_turn
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.race import machine_in_turn
 from me2e_compress.study import Condition, Listener, Scheme, Study, Timing, timing
-from me2e_compress.study.models import contend
+from me2e_compress.study.prepared import contend
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workplace import SILENT, Workplace
 from tests.study.conftest import BLIND, IDEAL, Make

@@ -10,23 +10,23 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.plan import make_plan, tensors_of
-from me2e_compress.calibration.scheme import QuantScheme
+from me2e_compress.fidelity.compare import compare
+from me2e_compress.fidelity.reaction import plan_reaction
 from me2e_compress.graph import provenance
-from me2e_compress.metrics.fidelity import compare
-from me2e_compress.metrics.reaction import plan_reaction
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import make_plan, tensors_of
+from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import onnxruntime
 from me2e_compress.targets.lint import lint
-from me2e_compress.targets.rtx import check
-from me2e_compress.zoo.frames import frames as drive
+from me2e_compress.targets.tensorrt.rtx import check
 from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.synthetic_frames import frames as drive
 from tests.frames import record
 
 pytestmark = pytest.mark.xdist_group("vad-run")

@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from me2e_compress.zoo.export import build
-from me2e_compress.zoo.frames import Frame, frames
 from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.synthetic_frames import Frame, frames
 
 if TYPE_CHECKING:
     from me2e_compress.zoo.vad.stack import VadTiny

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from me2e_compress.errors import GraphError, MissingExtraError
 from me2e_compress.evaluators.highway.adapter import Adapter
-from me2e_compress.metrics.adapter import PlanAdapter
+from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.zoo import export as exporting
 from me2e_compress.zoo.export import export
-from me2e_compress.zoo.frames import Frame
 from me2e_compress.zoo.stacks import HIGHWAY, STACKS, VAD_TINY, Stack
+from me2e_compress.zoo.synthetic_frames import Frame
 from me2e_compress.zoo.vad.stack import VadTiny
 
 TINY = replace(VAD_TINY, name="tiny", inputs={"x": (1,)}, outputs=("y",))

@@ -3,9 +3,9 @@ import pytest
 
 from me2e_compress.errors import FramesError
 from me2e_compress.zoo.cameras import HEIGHT, WIDTH, rig
-from me2e_compress.zoo.frames import Frame, frames
 from me2e_compress.zoo.stacks import VAD_TINY
-from me2e_compress.zoo.world import FRAME_S, Pose
+from me2e_compress.zoo.synthetic_frames import Frame, frames
+from me2e_compress.zoo.synthetic_world import FRAME_S, Pose
 
 
 def test_frames_are_the_inputs_without_the_state(scenes: list[Frame]) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from me2e_compress.zoo.vad.attention import deformable_attention
-from me2e_compress.zoo.vad.geometry import (
+from me2e_compress.zoo.vad.reference_points import (
     cell_positions,
     ego_shift,
     pillars,

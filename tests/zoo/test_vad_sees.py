@@ -4,8 +4,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from me2e_compress.zoo.frames import Frame
 from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.synthetic_frames import Frame
 from me2e_compress.zoo.vad.stack import VadTiny
 
 COMMAND = VAD_TINY.default_mode["nuscenes"]

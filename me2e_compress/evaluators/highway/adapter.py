@@ -12,7 +12,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.adapter import PlanAdapter
+from me2e_compress.runtime.plan_adapter import PlanAdapter
 
 IMAGE = "me2e.image"
 """Metadata key: JSON of `ImageNormalization`."""

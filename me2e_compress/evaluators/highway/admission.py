@@ -8,9 +8,9 @@ one speed on the route's centre, commits an infraction on it at every one of
 from dataclasses import dataclass
 
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
+from me2e_compress.evaluators.highway.dry_run import Rehearsal, rehearse
 from me2e_compress.evaluators.highway.expert import Expert
-from me2e_compress.evaluators.highway.rehearsal import Rehearsal, rehearse
-from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.simulator.routes import Route
 
 
 @dataclass(frozen=True, slots=True)

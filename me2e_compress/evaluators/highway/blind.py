@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from me2e_compress.driving.contract import PLAN_SHAPE, PLAN_STEP_US, Observation, Plan
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import PLAN_SHAPE, PLAN_STEP_US, Observation, Plan
 from me2e_compress.evaluators.highway.reference import (
     beyond,
     in_ego_frame,
     reentry,
     slope_of,
 )
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scene import Ego, RoutePath
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scene import Ego, RoutePath
 
 SPEEDS_MPS = (4.0, 8.0, 12.0)
 """The speeds at which the admission gate tries it."""

@@ -29,14 +29,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
-from me2e_compress.evaluators.highway.bicycle import (
+from me2e_compress.simulator.bicycle import (
     advance,
     slip_of,
     steering_through,
 )
-from me2e_compress.evaluators.highway.geometry import Floats, resample
-from me2e_compress.evaluators.highway.scene import Control, Ego
-from me2e_compress.evaluators.highway.traffic.bodies import (
+from me2e_compress.simulator.plane_geometry import Floats, resample
+from me2e_compress.simulator.scene import Control, Ego
+from me2e_compress.simulator.traffic.bodies import (
     ACCELERATION_LAG_S,
     ACCELERATION_RANGE_MPS2,
     STEERING_LAG_S,

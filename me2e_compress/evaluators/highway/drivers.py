@@ -4,8 +4,8 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from me2e_compress.driving.contract import Policy
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import Policy
 from me2e_compress.evaluators.highway.adapter import Adapter
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.expert import Expert

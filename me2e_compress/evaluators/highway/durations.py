@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.simulator.routes import Route
 
 EXPERT_S = {
     "MergerIntoSlowTrafficV2": 49,

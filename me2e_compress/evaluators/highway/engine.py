@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.worker import Driven, Job, RouteWorker
+from me2e_compress.simulator.routes import Route
 
 
 class Engine(Protocol):

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from me2e_compress.errors import EvaluationError, MissingExtraError
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.worker import Driven, Job, RouteWorker
+from me2e_compress.simulator.routes import Route
 
 KNOCK_S = 5.0
 

@@ -10,11 +10,11 @@ from multiprocessing import get_context
 import numpy as np
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.admission import examine
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scenarios.registry import stage_of
 from me2e_compress.runtime.parent import end_with_parent
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.scenarios.registry import stage_of
 
 VARIANTS = 5
 """Routes of each type, as in Bench2Drive's 220."""

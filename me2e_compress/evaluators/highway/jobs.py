@@ -9,10 +9,10 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.durations import longest_first
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.simulator.routes import Route
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.evaluators.base import CAN_BUS_SIZE, Observation, Policy
-from me2e_compress.evaluators.highway.cameras import CameraRig, Cameras
-from me2e_compress.evaluators.highway.scene import Ego, Scene
-from me2e_compress.evaluators.highway.world import World
+from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation, Policy
+from me2e_compress.simulator.cameras import CameraRig, Cameras
+from me2e_compress.simulator.scene import Ego, Scene
+from me2e_compress.simulator.world import World
 
 
 @dataclass

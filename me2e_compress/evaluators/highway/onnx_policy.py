@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
+from me2e_compress.driving.contract import CAN_BUS_SIZE, PLAN_SHAPE, Observation, Plan
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.evaluators.base import CAN_BUS_SIZE, PLAN_SHAPE, Observation, Plan
 from me2e_compress.evaluators.highway.adapter import Adapter, ImageNormalization
 from me2e_compress.evaluators.highway.ports import (
     CAMERAS,
@@ -19,10 +19,10 @@ from me2e_compress.evaluators.highway.ports import (
     image_size,
     zeros,
 )
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.metrics.adapter import PlanAdapter
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
+from me2e_compress.simulator.routes import Route
 
 MICROSECONDS = 1_000_000
 """In a second."""

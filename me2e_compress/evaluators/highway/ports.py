@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from me2e_compress.driving.contract import CAN_BUS_SIZE
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import CAN_BUS_SIZE
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Port
 

@@ -4,17 +4,17 @@ import math
 from dataclasses import dataclass, field
 from statistics import fmean
 
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scene import (
+from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode, Frame
+from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scene import (
     ActorKind,
     Command,
     RoutePath,
     Scene,
 )
-from me2e_compress.evaluators.highway.traffic.legs import ANNOUNCED_M
-from me2e_compress.evaluators.highway.world import Event, EventKind, World
-from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode, Frame
-from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.simulator.traffic.legs import ANNOUNCED_M
+from me2e_compress.simulator.world import Event, EventKind, World
 
 NEAR_M = 50.0
 """Vehicles no farther than this are the traffic that the ego is compared with."""

@@ -3,17 +3,17 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from me2e_compress.evaluators.highway.cameras import paint_texture
-from me2e_compress.evaluators.highway.picture import (
+from me2e_compress.evaluators.highway.runner import Listeners, drive
+from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.simulator.cameras import paint_texture
+from me2e_compress.simulator.pictures import (
     Moment,
     RoutePicture,
     write_gif,
     write_png,
 )
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.runner import Listeners, drive
-from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.evaluators.highway.world import World
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.world import World
 
 EVERY_US = 200_000
 """Simulated time between two frames of an animation."""

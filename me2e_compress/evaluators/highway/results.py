@@ -10,10 +10,10 @@ from typing import Any, Self
 
 from me2e_compress import __version__
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.atomic import write_json
+from me2e_compress.simulator.routes import Route
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"

@@ -8,26 +8,26 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.driving.contract import PLAN_SHAPE, Observation, Policy
+from me2e_compress.driving.latency import FixedLatency, LatencySource
+from me2e_compress.driving.realtime import DT_US, HeldControl
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import PLAN_SHAPE, Observation, Policy
-from me2e_compress.evaluators.highway.cameras import (
+from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.endings import Rules
+from me2e_compress.evaluators.highway.observe import Observer
+from me2e_compress.evaluators.highway.record import Recorder
+from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode
+from me2e_compress.simulator.cameras import (
     CLEAR,
     CameraRig,
     Cameras,
     Weather,
     paint_texture,
 )
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.observe import Observer
-from me2e_compress.evaluators.highway.picture import Moment
-from me2e_compress.evaluators.highway.record import Recorder
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.rules import Rules
-from me2e_compress.evaluators.highway.scene import Control, Ego, Scene
-from me2e_compress.evaluators.highway.world import World
-from me2e_compress.evaluators.latency import FixedLatency, LatencySource
-from me2e_compress.evaluators.realtime import DT_US, HeldControl
-from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode
+from me2e_compress.simulator.pictures import Moment
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scene import Control, Ego, Scene
+from me2e_compress.simulator.world import World
 
 Plan = npt.NDArray[np.float64]
 

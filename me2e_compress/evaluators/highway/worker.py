@@ -17,10 +17,10 @@ import psutil
 from me2e_compress.errors import EvaluationError, Me2eError
 from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.record import completion_percent, unrecorded
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
-from me2e_compress.evaluators.highway.world import World
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.world import World
 
 POLL_S = 0.05
 FRAME_LIMIT_S = 60.0

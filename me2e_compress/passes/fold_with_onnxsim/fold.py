@@ -13,7 +13,7 @@ from me2e_compress.errors import PassError
 from me2e_compress.graph import digest, load, node_count, save, sweep
 from me2e_compress.graph.restore import restore
 from me2e_compress.passes.base import Context, PassResult
-from me2e_compress.passes.fold_with_onnxsim import worker
+from me2e_compress.passes.fold_with_onnxsim import onnxsim_main
 from me2e_compress.passes.import_normalize.constants import lift
 
 _OWN_METADATA = "onnxsim."
@@ -66,7 +66,7 @@ class FoldWithOnnxsim:
 
 
 def _simplify(given: Path, folded: Path, timeout_s: float) -> None:
-    command = [sys.executable, "-P", worker.__file__, str(given), str(folded)]
+    command = [sys.executable, "-P", onnxsim_main.__file__, str(given), str(folded)]
     try:
         subprocess.run(
             command, check=True, capture_output=True, text=True, timeout=timeout_s

@@ -10,11 +10,11 @@ from markupsafe import Markup
 
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.study.outcome import Outcome
-from me2e_compress.study.pictures import Contrast
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import forest, pareto
 from me2e_compress.study.report.findings import findings
-from me2e_compress.study.routes import RouteOutcome
+from me2e_compress.study.route_outcomes import RouteOutcome
+from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.tables import abilities, differences, scoreboards
 
 TEMPLATE = "report.html"

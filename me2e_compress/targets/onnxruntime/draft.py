@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import onnx_ir as ir
 
-from me2e_compress.calibration.plan import Decision, QuantPlan
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.quantization.plan import Decision, QuantPlan
 from me2e_compress.targets.weights import Weight, weights_of
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.products import extent, is_one_matrix
+from me2e_compress.quantization.extents import extent, is_one_matrix
 
 MOVES = frozenset(
     {

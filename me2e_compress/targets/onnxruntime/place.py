@@ -2,9 +2,9 @@
 
 import onnx_ir as ir
 
-from me2e_compress.calibration.plan import Decision, KeptFloat, QuantPlan
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
+from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
 from me2e_compress.targets.onnxruntime.draft import draft_of_plan, layers_of
 from me2e_compress.targets.onnxruntime.kernels import objection
 from me2e_compress.targets.onnxruntime.lower import lower

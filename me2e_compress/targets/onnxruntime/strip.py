@@ -8,7 +8,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.rewrite import can_replace
 from me2e_compress.targets.onnxruntime.draft import Draft
 from me2e_compress.targets.onnxruntime.kernels import LAYERS, is_layer
-from me2e_compress.targets.onnxruntime.stored import (
+from me2e_compress.targets.onnxruntime.stored_constants import (
     DEQUANTIZE,
     QUANTIZE,
     bias_of,

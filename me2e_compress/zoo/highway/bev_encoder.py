@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.highway.bev_grid import cell_centres, grid_of
 from me2e_compress.zoo.highway.config import CAMERAS, HighwayConfig
-from me2e_compress.zoo.highway.geometry import cell_centres, grid_of
 from me2e_compress.zoo.highway.layers import Residual, conv_block, mlp, sample
 
 NEAREST_M = 0.3

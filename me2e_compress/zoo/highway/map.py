@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.highway.bev_grid import grid_of, route_points
 from me2e_compress.zoo.highway.config import (
     CAMERAS,
     COMMANDS,
@@ -13,7 +14,6 @@ from me2e_compress.zoo.highway.config import (
     SIGNAL_STATES,
     HighwayConfig,
 )
-from me2e_compress.zoo.highway.geometry import grid_of, route_points
 from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp, sample
 
 FORWARD_CAMERAS = 3

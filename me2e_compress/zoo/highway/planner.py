@@ -22,15 +22,15 @@ from me2e_compress.zoo.highway.costs import (
     occupied,
     swept,
 )
-from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
-from me2e_compress.zoo.highway.map import GAP_SCALE_M
-from me2e_compress.zoo.highway.world import (
+from me2e_compress.zoo.highway.interfaces import (
     EGO_FEATURES,
     SPEED_SCALE_MPS,
     Candidates,
     EgoState,
     World,
 )
+from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
+from me2e_compress.zoo.highway.map import GAP_SCALE_M
 
 LIMITS = 5
 """Too fast, too far left, too far right, left of the oncoming lanes, off the route."""

@@ -8,12 +8,12 @@ from torch import Tensor, nn
 from me2e_compress.zoo.highway.backbone import Backbone, Neck
 from me2e_compress.zoo.highway.bev_encoder import BevEncoder
 from me2e_compress.zoo.highway.config import HighwayConfig
+from me2e_compress.zoo.highway.interfaces import EgoState, World, gather
 from me2e_compress.zoo.highway.map import Choice, Map, RoadMap
 from me2e_compress.zoo.highway.motion import Futures, Motion
 from me2e_compress.zoo.highway.occ import Occ
 from me2e_compress.zoo.highway.planner import Planner
 from me2e_compress.zoo.highway.track import Track, Tracks
-from me2e_compress.zoo.highway.world import EgoState, World, gather
 
 STANDING_MPS = 0.1
 STOOD_S = 5.0

@@ -14,7 +14,7 @@ from me2e_compress.zoo.vad.config import (
     PILLAR_POINTS,
     Sampling,
 )
-from me2e_compress.zoo.vad.geometry import pillars, project
+from me2e_compress.zoo.vad.reference_points import pillars, project
 
 
 class TemporalSelfAttention(nn.Module):

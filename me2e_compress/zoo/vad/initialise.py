@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from me2e_compress.zoo.frames import frames
 from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.vad.config import ATTENTION_HEADS
 from me2e_compress.zoo.vad.stack import VadTiny
 

@@ -7,7 +7,7 @@ from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.vad.bev_encoder import BevEncoder
 from me2e_compress.zoo.vad.config import CAMERAS, EMBED, FEATURE_LEVELS, Sampling
 from me2e_compress.zoo.vad.decoder import Decoder
-from me2e_compress.zoo.vad.geometry import cell_positions, ego_shift, turn
+from me2e_compress.zoo.vad.reference_points import cell_positions, ego_shift, turn
 
 CAN_BUS = 18
 

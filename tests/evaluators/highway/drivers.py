@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 
-from me2e_compress.evaluators.base import Observation, Policy
+from me2e_compress.driving.contract import Observation, Policy
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.drivers import Driver
-from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.simulator.routes import Route
 
 CROSSING = Route("crossing", "DynamicObjectCrossing", "Emergency_Brake", 1)
 PARKED = Route("parked", "ParkedObstacle", "Overtaking", 1)

@@ -4,6 +4,7 @@ import pytest
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.admission import Verdict, examine
+from me2e_compress.evaluators.highway.dry_run import Rehearsal
 from me2e_compress.evaluators.highway.generate import (
     Harvest,
     generate,
@@ -11,12 +12,11 @@ from me2e_compress.evaluators.highway.generate import (
     propose,
     seed_of,
 )
-from me2e_compress.evaluators.highway.rehearsal import Rehearsal
-from me2e_compress.evaluators.highway.routes import load_routes, pick_routes
-from me2e_compress.evaluators.highway.world import World
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
-from tests.evaluators.highway.world.driving import route_of
+from me2e_compress.simulator.routes import load_routes, pick_routes
+from me2e_compress.simulator.world import World
+from tests.simulator.world.driving import route_of
 
 SAMPLE = pick_routes(load_routes(), "11")
 HIT = (InfractionKind.COLLISION_VEHICLE,)

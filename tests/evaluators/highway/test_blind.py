@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import CAN_BUS_SIZE, Observation
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind, centre_plan
-from me2e_compress.evaluators.highway.rehearsal import rehearse
-from me2e_compress.evaluators.highway.routes import Route
+from me2e_compress.evaluators.highway.dry_run import rehearse
 from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.simulator.routes import Route
 from tests.evaluators.highway.tiny_world import circle, ego_at, straight
 
 

@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.evaluators.highway.bicycle import (
+from me2e_compress.evaluators.highway.blind import centre_plan
+from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.simulator.bicycle import (
     MAX_STEERING_RAD,
     advance,
     curvature_of,
@@ -15,9 +17,7 @@ from me2e_compress.evaluators.highway.bicycle import (
     steering_of,
     steering_through,
 )
-from me2e_compress.evaluators.highway.blind import centre_plan
-from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.geometry import RoutePath
+from me2e_compress.simulator.plane_geometry import RoutePath
 from tests.evaluators.highway.tiny_world import (
     DT_US,
     TinyWorld,

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.evaluators.highway.expert import Decision, Memory, ceiling, decide
-from me2e_compress.evaluators.highway.scene import (
+from me2e_compress.simulator.scene import (
     ActorKind,
     Scene,
     SignalKind,

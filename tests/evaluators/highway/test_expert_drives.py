@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
+from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
+from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import CAN_BUS_SIZE, Observation
-from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.dry_run import rehearse
 from me2e_compress.evaluators.highway.expert import Expert, Memory, ceiling, decide
-from me2e_compress.evaluators.highway.rehearsal import rehearse
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scene import Control
-from me2e_compress.evaluators.highway.world import INFRACTIONS
-from me2e_compress.evaluators.highway.world.world import World
-from me2e_compress.evaluators.realtime import HeldControl
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.scene import Control
+from me2e_compress.simulator.world import INFRACTIONS
+from me2e_compress.simulator.world.world import World
 
 SEED = 77_001
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast, forecast
-from me2e_compress.evaluators.highway.expert.signals import somebody_comes
-from me2e_compress.evaluators.highway.expert.speed import LATERAL_MPS2, ceiling
-from me2e_compress.evaluators.highway.expert.targets import (
+from me2e_compress.evaluators.highway.expert.lateral_targets import (
     Place,
     blocked_stretch,
     lateral_targets,
 )
-from me2e_compress.evaluators.highway.geometry import RoutePath
-from me2e_compress.evaluators.highway.scene import Actor, ActorKind, Scene
-from me2e_compress.evaluators.highway.world.privileged import Intent
+from me2e_compress.evaluators.highway.expert.speed import LATERAL_MPS2, ceiling
+from me2e_compress.evaluators.highway.expert.stops import somebody_comes
+from me2e_compress.simulator.plane_geometry import RoutePath
+from me2e_compress.simulator.scene import Actor, ActorKind, Scene
+from me2e_compress.simulator.world.privileged import Intent
 from tests.evaluators.highway.tiny_world import actor, circle, ego_at, straight
 
 

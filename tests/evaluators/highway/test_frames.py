@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import FramesError
-from me2e_compress.evaluators.highway import frames as room
-from me2e_compress.evaluators.highway.cameras import CameraRig
-from me2e_compress.evaluators.highway.frames import driven_frames, fresh_routes
+from me2e_compress.evaluators.highway import recorder as room
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.routes import load_routes
+from me2e_compress.evaluators.highway.recorder import driven_frames, fresh_routes
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import replay
+from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.routes import load_routes
 from tests.evaluators.highway.drivers import straight_on
 from tests.stand_in import write_model
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress.driving.contract import Evaluator
+from me2e_compress.driving.latency import FixedLatency, MeasuredLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import Evaluator
-from me2e_compress.evaluators.highway.abilities import SCENARIO_ABILITIES
 from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.durations import EXPERT_S, longest_first
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -21,11 +21,11 @@ from me2e_compress.evaluators.highway.jobs import (
     Progress,
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
-from me2e_compress.evaluators.highway.routes import Route, save_routes
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.evaluators.latency import FixedLatency, MeasuredLatency, TraceLatency
 from me2e_compress.metrics.episode import Ending, Episode
+from me2e_compress.simulator.routes import Route, save_routes
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from tests.evaluators.highway.drivers import (
     CROSSING,
     EXIT,
@@ -176,7 +176,7 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     save_routes(routes, manifest)
     program = (
         "import sys; from pathlib import Path;"
-        "from me2e_compress.evaluators.highway.routes import load_routes;"
+        "from me2e_compress.simulator.routes import load_routes;"
         "from me2e_compress.evaluators.highway.jobs import HighwayEvaluator;"
         "from me2e_compress.evaluators.highway.engine import LocalEngine;"
         "from me2e_compress.evaluators.highway.drivers import Driver;"

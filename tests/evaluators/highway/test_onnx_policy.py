@@ -5,19 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from me2e_compress.driving.contract import Observation, Plan
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import Observation, Plan
 from me2e_compress.evaluators.highway.adapter import (
     Adapter,
     Axes,
     ImageNormalization,
 )
-from me2e_compress.evaluators.highway.cameras import CameraRig
 from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.runner import Conditions, drive
 from me2e_compress.metrics.episode import Ending
+from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.routes import Route
 from tests.evaluators.highway.drivers import EXIT, PARKED, straight_on
 
 NORM = {"input": "img", "mean": [10, 20, 30], "std": [2, 4, 5], "order": "bgr"}

@@ -4,9 +4,9 @@ from typing import cast
 
 import pytest
 
-from me2e_compress.evaluators.highway.rules import Rules
-from me2e_compress.evaluators.highway.world import EndReason, World
+from me2e_compress.evaluators.highway.endings import Rules
 from me2e_compress.metrics.episode import Ending
+from me2e_compress.simulator.world import EndReason, World
 
 
 @dataclass

@@ -6,20 +6,20 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from me2e_compress.driving.contract import Observation
+from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import Observation
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.observe import can_bus_of
-from me2e_compress.evaluators.highway.picture import Moment
 from me2e_compress.evaluators.highway.record import junction_m
-from me2e_compress.evaluators.highway.routes import Route
 from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
-from me2e_compress.evaluators.highway.scene import Ego
-from me2e_compress.evaluators.highway.world import World
-from me2e_compress.evaluators.latency import FixedLatency
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.simulator.pictures import Moment
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scene import Ego
+from me2e_compress.simulator.world import World
 from tests.evaluators.highway.drivers import (
     CROSSING,
     EXIT,

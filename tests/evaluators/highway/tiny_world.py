@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.bicycle import advance
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.expert import Memory, ceiling, decide
-from me2e_compress.evaluators.highway.geometry import (
+from me2e_compress.simulator.bicycle import advance
+from me2e_compress.simulator.plane_geometry import (
     Command,
     Floats,
     RoutePath,
     polyline_headings,
     resample,
 )
-from me2e_compress.evaluators.highway.scene import (
+from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
     ActorKind,
@@ -26,7 +26,7 @@ from me2e_compress.evaluators.highway.scene import (
     SignalKind,
     SignalState,
 )
-from me2e_compress.evaluators.highway.world.privileged import (
+from me2e_compress.simulator.world.privileged import (
     Intent,
     Phase,
     Privileged,

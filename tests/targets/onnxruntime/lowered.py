@@ -13,9 +13,9 @@ import onnxruntime as ort
 
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.plan import make_plan
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.scheme import QuantScheme
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import place, tensors
 from tests.frames import record

@@ -4,8 +4,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan import make_plan
 from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets import tensorrt
 from me2e_compress.targets.onnxruntime import convert, unranged
 from tests.nets import conv_attention

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan import make_plan
-from me2e_compress.calibration.rules import paper_rules
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.rules import paper_rules
 from me2e_compress.targets.onnxruntime import place, tensors
 from tests.nets import net
 from tests.targets.onnxruntime.lowered import (

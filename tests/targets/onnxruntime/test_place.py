@@ -4,10 +4,10 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.plan import make_plan
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.lint import lint
 from me2e_compress.targets.onnxruntime import int8_layers, kept_float, place, tensors
 from tests.nets import conv_attention

@@ -2,7 +2,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.calibration.plan import make_plan
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import tensors
 from tests.nets import net
 from tests.targets.onnxruntime.lowered import (

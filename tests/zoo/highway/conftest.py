@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import nn
 
-from me2e_compress.zoo.highway.export import write
 from me2e_compress.zoo.highway.stack import Highway
+from me2e_compress.zoo.highway.to_onnx import write
 
 
 @pytest.fixture(scope="package")

@@ -8,13 +8,13 @@ import onnx
 import pytest
 import torch
 
-from me2e_compress.evaluators.highway.cameras import CameraRig
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.session import Session
+from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of
 from me2e_compress.zoo.highway.config import HighwayConfig
-from me2e_compress.zoo.highway.export import parameters
 from me2e_compress.zoo.highway.stack import Highway, stood_lately
+from me2e_compress.zoo.highway.to_onnx import parameters
 from me2e_compress.zoo.stacks import find
 
 Feeds = dict[str, npt.NDArray[np.generic]]

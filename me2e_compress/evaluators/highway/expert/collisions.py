@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.expert.candidates import Candidates
 from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags, Forecast
-from me2e_compress.evaluators.highway.expert.targets import Place
-from me2e_compress.evaluators.highway.geometry import Floats
-from me2e_compress.evaluators.highway.scene import Ego
+from me2e_compress.evaluators.highway.expert.futures import Candidates
+from me2e_compress.evaluators.highway.expert.lateral_targets import Place
+from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.scene import Ego
 
 COLLISION, NEAR_MISS, CUT_OFF = 200.0, 8.0, 30.0
 FADE = np.exp(-TIMES_S / 3.0)

@@ -6,12 +6,12 @@ progress, progress outweighs comfort.
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.expert.candidates import Candidates
 from me2e_compress.evaluators.highway.expert.collisions import FADE, followers
 from me2e_compress.evaluators.highway.expert.forecast import Forecast
-from me2e_compress.evaluators.highway.expert.targets import SLOW_MPS, Place
-from me2e_compress.evaluators.highway.geometry import Floats
-from me2e_compress.evaluators.highway.scene import Ego, RoutePath
+from me2e_compress.evaluators.highway.expert.futures import Candidates
+from me2e_compress.evaluators.highway.expert.lateral_targets import SLOW_MPS, Place
+from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.scene import Ego, RoutePath
 
 OFF_ROAD, RUN_LINE, WRONG_SIDE, HEADWAY = 120.0, 500.0, 1.5, 24.0
 PROGRESS_PER_M, SPEED_PER_MPS = 0.40, 0.8

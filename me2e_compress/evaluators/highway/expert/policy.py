@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, field
 
+from me2e_compress.driving.contract import Observation, Plan
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.base import Observation, Plan
-from me2e_compress.evaluators.highway.expert.planner import Decision, Memory, decide
+from me2e_compress.evaluators.highway.expert.deciding import Decision, Memory, decide
 from me2e_compress.evaluators.highway.expert.speed import ceiling
-from me2e_compress.evaluators.highway.geometry import Floats
-from me2e_compress.evaluators.highway.routes import Route
-from me2e_compress.evaluators.highway.scene import RoutePath
+from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scene import RoutePath
 
 
 @dataclass

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.geometry import Floats
-from me2e_compress.evaluators.highway.scene import RoutePath
+from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.scene import RoutePath
 
 LATERAL_MPS2 = 2.2
 """Lateral acceleration in bends; the comfort bound of nuPlan is 4.89."""

@@ -1,0 +1,119 @@
+"""Sampled futures of the ego: accelerations times lateral targets."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags
+from me2e_compress.evaluators.highway.expert.lateral_targets import Options, Place
+from me2e_compress.evaluators.highway.reference import beyond, reentry
+from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.scene import Ego, RoutePath
+from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S
+
+ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)
+HARDEST_EASE_MPS2 = 3.0
+"""Braking for what the road allows, never more."""
+CHANGE_S = 2.6
+"""Duration of a whole lane change; shorter shifts take less."""
+SHORTEST_CHANGE_M = 9.0
+FULL_CHANGE_M = 3.5
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """K futures at the 18 times of `TIMES_S`.
+
+    Args:
+        x: [K, T] metres.
+        y: [K, T] metres.
+        heading: [K, T] radians, of the body: in a bend it points out of the way that
+            the centre goes, by the slip angle.
+        along_m: [K, T] arc length.
+        lateral_m: [K, T] metres left of the route.
+        speed_mps: [K, T].
+        acceleration: [K] what each begins with.
+        target_m: [K] lateral target.
+        oncoming: [K] whether the target is in the oncoming lane.
+    """
+
+    x: Floats
+    y: Floats
+    heading: Floats
+    along_m: Floats
+    lateral_m: Floats
+    speed_mps: Floats
+    acceleration: Floats
+    target_m: Floats
+    oncoming: Flags
+
+
+def sample(
+    path: RoutePath,
+    top: Floats,
+    ego: Ego,
+    place: Place,
+    options: Options,
+    stop_m: float | None,
+) -> Candidates:
+    """Roll out every pair of acceleration and lateral target.
+
+    Args:
+        path: The route.
+        top: [N] speed ceiling along it.
+        ego: The ego.
+        place: The same on its route.
+        options: Lateral targets.
+        stop_m: Arc length at which the ego's centre should stand, if any: one more
+            acceleration, that stops exactly there.
+    """
+    rates = list(ACCELERATIONS_MPS2)
+    if stop_m is not None:
+        room = max(stop_m - place.s_m, 0.05)
+        rates.append(max(-(place.speed_mps**2) / (2 * room), -8.0))
+    along, speed = _speeds(top, place, np.array(rates))
+    repeat, count = len(options.target_m), len(rates)
+    along, speed = np.tile(along, (repeat, 1)), np.tile(speed, (repeat, 1))
+    target = np.repeat(options.target_m, count)
+    lateral = _laterals(place, along - place.s_m, target)
+    x, y, heading = beyond(path, along, lateral)
+    moved = np.diff(along, axis=1, prepend=place.s_m)
+    shifted = np.diff(lateral, axis=1, prepend=place.lateral_m)
+    slip = np.clip(path.value(path.curvature, along) * ego.length / 2, -0.5, 0.5)
+    heading = heading + np.arctan2(shifted, np.maximum(moved, 0.3)) - np.arcsin(slip)
+    return Candidates(
+        *(x, y, heading, along, lateral, speed),
+        acceleration=np.tile(np.array(rates), repeat),
+        target_m=target,
+        oncoming=np.repeat(options.oncoming, count),
+    )
+
+
+def _speeds(top: Floats, place: Place, rates: Floats) -> tuple[Floats, Floats]:
+    """Arc lengths and speeds, each [rates, T], with the lag of the actuators."""
+    along = np.full_like(rates, max(place.s_m, 0.0))
+    speed = np.full_like(rates, place.speed_mps)
+    alongs, speeds = [], []
+    missing = place.acceleration_mps2 - rates
+    for step in np.diff(TIMES_S, prepend=0.0):
+        left = np.exp(-step / ACCELERATION_LAG_S)
+        mean = rates + missing * (1 - left) * ACCELERATION_LAG_S / step
+        missing = missing * left
+        limit = top[np.minimum(along.astype(np.int64), len(top) - 1)]
+        allowed = np.maximum(limit, speed - HARDEST_EASE_MPS2 * step)
+        after = np.clip(speed + mean * step, 0.0, allowed)
+        along = along + (speed + after) / 2 * step
+        speed = after
+        alongs.append(along)
+        speeds.append(speed)
+    return np.stack(alongs, axis=1), np.stack(speeds, axis=1)
+
+
+def _laterals(place: Place, travel: Floats, target: Floats) -> Floats:
+    """[K, T] offsets on the way to a lateral target."""
+    share = np.sqrt(np.abs(target - place.lateral_m) / FULL_CHANGE_M)
+    seconds = CHANGE_S * np.clip(share, 0.6, 1.2)
+    length = np.maximum(
+        place.speed_mps * seconds, SHORTEST_CHANGE_M * np.maximum(share, 0.6)
+    )
+    return reentry(travel, place.lateral_m, place.slope, target, length)

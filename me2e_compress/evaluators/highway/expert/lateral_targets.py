@@ -1,0 +1,186 @@
+"""Which lateral offsets the expert may aim at: lanes, nudges, the oncoming lane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.evaluators.highway.expert.forecast import Flags, Forecast
+from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.scene import Command, Ego, RoutePath
+
+NUDGES_M = (0.5, -0.5, 1.0, -1.0)
+"""Small shifts within what is drivable: past a door, away from who cuts the bend."""
+ASIDE_M = 0.7
+"""The same in the lane beside, away from what is passed."""
+JUNCTION = (int(Command.LEFT), int(Command.RIGHT), int(Command.STRAIGHT))
+"""Nobody overtakes here."""
+SLOW_MPS = 3.0
+"""What is slower than this in the own lane is passed, not followed."""
+CHAIN_M = 14.0
+"""Obstacles closer to each other than this are passed in one go."""
+CLEAR_S = 1.0
+"""Time that must be left between the return and the oncoming car."""
+PASS_MPS2 = 1.8
+"""How the expert accelerates while it passes."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """The ego on its route.
+
+    Args:
+        s_m: Arc length.
+        lateral_m: Metres left of the route.
+        slope: Metres to the left per metre of route, see `reference.slope_of`.
+        speed_mps: Speed.
+        acceleration_mps2: Along the route.
+        top_mps: What the road ahead allows.
+    """
+
+    s_m: float
+    lateral_m: float
+    slope: float
+    speed_mps: float
+    acceleration_mps2: float
+    top_mps: float
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """Where the expert may aim.
+
+    Args:
+        target_m: [L] metres left of the route.
+        oncoming: [L] whether that is in the oncoming lane.
+        passable: Whether there is any lane beside the own one, now or later.
+    """
+
+    target_m: Floats
+    oncoming: Flags
+    passable: bool
+
+
+@dataclass(frozen=True)
+class Block:
+    """What blocks the ego's lane.
+
+    Args:
+        start_m: From the ego's centre to the nearest end of it.
+        end_m: To its farthest end.
+        speed_mps: How fast it moves on.
+    """
+
+    start_m: float
+    end_m: float
+    speed_mps: float
+
+
+def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> Options:
+    """Look at the road a little ahead.
+
+    The oncoming lane is offered only behind a blocked own lane and with a gap, or to
+    who is already in it.
+    """
+    ahead = place.s_m + max(6.0, 0.8 * place.speed_mps)
+    columns = (path.lane_widths, path.left_m, path.right_m, path.oncoming_m)
+    lane, left, right, both = (float(path.value(c, ahead)) for c in columns)
+    room = ego.width / 2
+    beside = [lane, min(lane + ASIDE_M, left - room), 2 * lane]
+    beside += [-lane, max(-lane - ASIDE_M, room - right), -2 * lane]
+    offsets = [n for n in (*NUDGES_M, *beside) if room - right <= n <= left - room]
+    oncoming = [False] * (1 + len(offsets))
+    facing = left + lane / 2
+    around = both > facing + room
+    if around and left < 1.4 * lane and _may_face(path, place, ego, seen, left, lane):
+        extra = [facing + n for n in (0.0, ASIDE_M) if facing + n + room <= both]
+        offsets, oncoming = offsets + extra, oncoming + [True] * len(extra)
+    passable = around or max(left, right) > 1.4 * lane
+    return Options(np.array([0.0, *offsets]), np.array(oncoming), passable)
+
+
+def _may_face(
+    path: RoutePath,
+    place: Place,
+    ego: Ego,
+    seen: Forecast,
+    left_m: float,
+    lane_m: float,
+) -> bool:
+    """Whether the oncoming lane may be used: with a gap, or by who is in it."""
+    if place.lateral_m + ego.width / 2 > left_m + 0.3:
+        return True
+    block = blocked_stretch(place, ego, seen)
+    if block is None or block.start_m > max(30.0, 3.0 * place.speed_mps):
+        return False
+    low, high = int(max(place.s_m, 0.0)), int(place.s_m + block.end_m + 6.0)
+    if np.isin(path.commands[low:high], JUNCTION).any():
+        return False
+    return gap_for_passing(place, ego, seen, block, left_m, lane_m)
+
+
+def gap_for_passing(
+    place: Place,
+    ego: Ego,
+    seen: Forecast,
+    block: Block,
+    left_m: float,
+    lane_m: float,
+) -> bool:
+    """Whether what blocks the own lane can be passed before anybody comes.
+
+    The stretch beside the blockers must be left before the first oncoming car
+    reaches its end, with `CLEAR_S` to spare.
+    """
+    top, seconds = min(place.top_mps, 10.0), 0.0
+    beside = block.end_m + ego.length + 6.0
+    distance = beside
+    for _ in range(3):
+        distance = beside + block.speed_mps * seconds
+        seconds = _seconds_for(distance, place.speed_mps, top)
+    gap = seen.along_m[:, 0] - place.s_m
+    coming = (np.cos(seen.away[:, 0]) < -0.5) & (seen.speed_mps.max(axis=1) > 0.5)
+    coming &= np.abs(seen.lateral_m[:, 0] - left_m - lane_m / 2) < lane_m
+    coming &= gap > -2.0
+    closing = np.maximum(seen.speed_mps.max(axis=1), 3.0)
+    arrival = (gap - seen.length / 2 - distance) / closing
+    return bool(np.all(arrival[coming] > seconds + CLEAR_S))
+
+
+def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:
+    """Find what has to be driven around; None if the lane is free.
+
+    That is anything slow along the centre line (0.3 m to spare), but nobody who
+    crosses; neighbours within `CHAIN_M` count as one.
+    """
+    lateral, half = seen.lateral_m[:, 0], seen.half_breadth[:, 0]
+    fastest = np.max(seen.speed_mps[:, :9], axis=1)
+    crosses = (np.abs(np.sin(seen.away[:, 0])) > 0.5) & (fastest > 0.3)
+    in_way = np.abs(lateral) < half + ego.width / 2 + 0.3
+    gap = seen.along_m[:, 0] - place.s_m
+    ends = gap + seen.half_span[:, 0]
+    slow = (fastest < SLOW_MPS) & (seen.goal_mps < SLOW_MPS + 1.0)
+    blocking = in_way & slow & ~crosses & ~seen.walks
+    blocking &= ends > -ego.length / 2
+    if not np.any(blocking):
+        return None
+    order = np.argsort(gap[blocking])
+    starts = (gap - seen.half_span[:, 0])[blocking][order]
+    stops = ends[blocking][order]
+    end = float(stops[0])
+    for begin, stop in zip(starts[1:], stops[1:], strict=True):
+        if begin - end > CHAIN_M:
+            break
+        end = max(end, float(stop))
+    return Block(float(starts[0]), end, float(np.max(fastest[blocking])))
+
+
+def _seconds_for(distance_m: float, speed: float, top: float) -> float:
+    """Time for a distance from a speed, accelerating to ``top``."""
+    top = max(top, speed, 1.0)
+    ramp_s = (top - speed) / PASS_MPS2
+    ramp_m = (speed + top) / 2 * ramp_s
+    if ramp_m >= distance_m:
+        return float(
+            (np.sqrt(speed**2 + 2 * PASS_MPS2 * distance_m) - speed) / PASS_MPS2
+        )
+    return ramp_s + (distance_m - ramp_m) / top

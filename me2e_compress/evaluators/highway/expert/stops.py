@@ -1,0 +1,117 @@
+"""Where lights and signs make the expert stop."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast
+from me2e_compress.simulator.scene import (
+    Ego,
+    Scene,
+    Signal,
+    SignalKind,
+    SignalState,
+)
+from me2e_compress.simulator.world.privileged import Phase
+
+STANDING_MPS = 0.08
+"""Slower than this has stopped; Bench2Drive asks for less than 0.1 m/s."""
+BEFORE_LINE_M = 1.0
+"""Room left between the front bumper and the line."""
+SERVED_WITHIN_M = 4.0
+"""A stop counts if the bumper is at most this far from the line."""
+YELLOW_MPS2 = 3.0
+"""A yellow light is obeyed if braking no harder than this stops in time."""
+GIVE_WAY_S = 2.4
+"""Nobody with priority is met within this time after crossing a give-way line."""
+CONFLICT_M, MEETING_M = 30.0, 2.0
+"""How far behind the line, and how near the route, priority is looked for."""
+GIVE_WAY_MPS = 5.0
+"""Speed at a give-way line: slow enough to stop for who has priority."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What the signals ask for.
+
+    Args:
+        line_m: Arc length that the ego's centre must not pass now, or None.
+        slow_m: Arc length at which only `GIVE_WAY_MPS` is allowed, or None.
+        served: Stop signs at which the ego has stopped.
+    """
+
+    line_m: float | None
+    slow_m: float | None
+    served: frozenset[int]
+
+
+def obey(
+    scene: Scene,
+    phases: Iterable[Phase],
+    seen: Forecast,
+    ego_s_m: float,
+    served: frozenset[int],
+) -> Stop:
+    """Look at every signal ahead on the route.
+
+    Args:
+        scene: What there is.
+        phases: Which signals are on the route, and where.
+        seen: The other road users.
+        ego_s_m: Arc length of the ego.
+        served: Stop signs already obeyed.
+    """
+    ego, lines, slow = scene.ego, list[float](), list[float]()
+    line_of = {phase.signal_id: phase.line_s for phase in phases}
+    for signal in scene.signals:
+        line = line_of.get(signal.id)
+        if line is None:
+            continue
+        gap = line - ego.length / 2 - ego_s_m
+        if gap < 0:
+            continue
+        if signal.kind is SignalKind.STOP_SIGN and gap <= SERVED_WITHIN_M:
+            served = served | {signal.id} if _stands(ego) else served
+        if signal.kind is SignalKind.GIVE_WAY:
+            slow.append(line - ego.length / 2)
+            if somebody_comes(seen, line, _arrival(gap, ego.speed_mps)):
+                lines.append(line - ego.length / 2 - min(BEFORE_LINE_M, gap))
+        if _closed(signal, gap, ego.speed_mps, served):
+            lines.append(line - ego.length / 2 - min(BEFORE_LINE_M, gap))
+    return Stop(min(lines, default=None), min(slow, default=None), served)
+
+
+def somebody_comes(seen: Forecast, line_m: float, crossing_s: float) -> bool:
+    """Whether an actor with priority meets the route when the ego crosses a line.
+
+    Args:
+        seen: The other road users.
+        line_m: Arc length of the line.
+        crossing_s: When the ego will cross it.
+    """
+    in_reach = (seen.along_m > line_m) & (seen.along_m < line_m + CONFLICT_M)
+    meets = in_reach & (np.abs(seen.lateral_m) < MEETING_M)
+    meets &= (seen.speed_mps[:, :1] > 0.5) & ~seen.walks[:, None]
+    first = np.argmax(meets, axis=1)
+    leads = meets[:, 0] & (np.cos(seen.away[:, 0]) > 0.8)
+    due = NOW_S[first] - crossing_s
+    soon = (due > -0.5 - GIVE_WAY_S / 2) & (due < GIVE_WAY_S)
+    return bool(np.any(meets.any(axis=1) & ~leads & soon))
+
+
+def _arrival(gap_m: float, speed: float) -> float:
+    """When the front will be at a line, from a speed or from rest at 2 m/s2."""
+    return float(min(gap_m / max(speed, 0.1), np.sqrt(gap_m)))
+
+
+def _stands(ego: Ego) -> bool:
+    return ego.speed_mps < STANDING_MPS
+
+
+def _closed(signal: Signal, gap_m: float, speed: float, served: frozenset[int]) -> bool:
+    if signal.kind is SignalKind.STOP_SIGN:
+        return signal.id not in served
+    if signal.state is SignalState.YELLOW:
+        return speed**2 / (2 * max(gap_m, 0.1)) < YELLOW_MPS2
+    return signal.state is SignalState.RED

@@ -1,0 +1,106 @@
+"""Calibration frames on demand: the expert drives, the model's cameras look on."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from me2e_compress.driving.realtime import DT_US
+from me2e_compress.errors import FramesError
+from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
+from me2e_compress.evaluators.highway.durations import EXPERT_S
+from me2e_compress.evaluators.highway.endings import Rules
+from me2e_compress.evaluators.highway.expert import Expert
+from me2e_compress.evaluators.highway.generate import propose, seed_of
+from me2e_compress.evaluators.highway.observe import Observer
+from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
+from me2e_compress.simulator.routes import Route, load_routes
+from me2e_compress.simulator.world import World
+
+STEP_US = 500_000
+"""Between two frames of a scene: as far apart as the waypoints of a plan."""
+SEED_OFFSET = 1_000_000
+"""Added to every seed, so that no seed of frames is one of a set of routes."""
+
+
+def driven_frames(
+    policy: OnnxPolicy, count: int, *, seed: int, scene_length: int = 16
+) -> Iterator[Frame]:
+    """See fresh routes as a model would that is asked every half second.
+
+    A scene is a stretch of one route, driven by the expert without latency; which
+    stretch, the seed decides. Its clock, its CAN bus and (since they are left out) its
+    recurrent inputs begin anew with it. The scenario types take turns; none of the
+    routes is one of the shipped 220.
+
+    Args:
+        policy: Says what is seen and how it is laid out: image size, normalisation,
+            names, types.
+        count: Frames in all.
+        seed: Of routes and stretches, 0 or more.
+        scene_length: Frames a scene, fewer where the route ends before.
+
+    Yields:
+        Frames keyed by the graph's input names, without the recurrent inputs.
+
+    Raises:
+        FramesError: A count below 1, or a seed below 0.
+    """
+    if count < 1 or scene_length < 1:
+        raise FramesError(
+            f"{count} frames in scenes of {scene_length}: both must be >= 1"
+        )
+    if seed < 0:
+        raise FramesError(f"seed {seed}: it must be 0 or more")
+    done = 0
+    for place, route in enumerate(fresh_routes(seed)):
+        random = np.random.default_rng([SEED_OFFSET + seed, place])
+        spare_us = EXPERT_S[route.scenario] * 1_000_000 - scene_length * STEP_US
+        begin_us = int(random.integers(0, max(1, spare_us // DT_US))) * DT_US
+        for at, arrays in enumerate(
+            _look(policy, route, begin_us, min(scene_length, count - done))
+        ):
+            yield Frame(done, at == 0, arrays)
+            done += 1
+        if done == count:
+            return
+
+
+def fresh_routes(seed: int) -> Iterator[Route]:
+    """Propose routes without end, one type after the other, in an order of the seed.
+
+    Routes of the shipped 220 are passed over; nothing else is asked of a route.
+    """
+    judged = {(route.scenario, route.seed) for route in load_routes()}
+    types = np.random.default_rng(SEED_OFFSET + seed).permutation(sorted(EXPERT_S))
+    attempt = 0
+    while True:
+        for scenario in map(str, types):
+            drawn = seed_of(SEED_OFFSET + seed, scenario, attempt)
+            if (scenario, drawn) not in judged:
+                yield propose(scenario, drawn, f"{scenario}_{attempt}")
+        attempt += 1
+
+
+def _look(
+    policy: OnnxPolicy, route: Route, begin_us: int, count: int
+) -> Iterator[dict[str, Array]]:
+    """Feeds of the model from a moment on, until there are enough or the route ends."""
+    world, expert, controller, rules = World(route), Expert(), Controller(), Rules()
+    rig = CameraRig(*policy.image_size)
+    texture = paint_texture(world.roadmap, world.path.points)
+    cameras = Cameras(texture, rig) if policy.needs_images else None
+    driver = Observer(world, expert, rig, None)
+    passenger = Observer(world, policy, rig, cameras)
+    scene = world.scene()
+    while count and rules.ending(world, scene.ego.speed_mps) is None:
+        since_us = scene.time_us - begin_us
+        if since_us >= 0 and since_us % STEP_US == 0:
+            yield policy.feeds(replace(passenger.observe(scene), time_us=since_us))
+            count -= 1
+        plan = expert.plan(driver.observe(scene))
+        anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
+        world.step(controller.control(anchored, scene.ego, scene.time_us))
+        scene = world.scene()

@@ -1,0 +1,191 @@
+"""How close one model stays to another: signal to noise, and metres of the plan."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from typing import Self, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.frames import Array, Frame, Frames
+from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
+from me2e_compress.runtime.session import Session, replay
+
+Float64: TypeAlias = npt.NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class OutputFidelity:
+    """One output, all frames pooled.
+
+    Attributes:
+        name: of the output.
+        sqnr_db: 10 log10(sum a^2 / sum (a - b)^2) in dB; infinite where they are equal.
+        error: max|a - b| / max|a|; infinite where a is zero and b is not.
+    """
+
+    name: str
+    sqnr_db: float
+    error: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Displacement:
+    """How far waypoints moved, Euclidean, over all frames and waypoints.
+
+    Attributes:
+        mean_m: mean, metres.
+        max_m: largest, metres.
+    """
+
+    mean_m: float
+    max_m: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Fidelity:
+    """What comparing two models over a recording found.
+
+    Attributes:
+        outputs: those that both models have, in the first model's order.
+        missing: outputs of the first model that the second lacks.
+        plan: how far the plan moved; None where it was not measured.
+        plan_reason: why not; empty where it was.
+        frames: how many were compared.
+    """
+
+    outputs: tuple[OutputFidelity, ...]
+    missing: tuple[str, ...]
+    plan: Displacement | None
+    plan_reason: str
+    frames: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reference:
+    """What the model to be true to answered, for holding many others against it.
+
+    Attributes:
+        session: the model.
+        frames: the recording.
+        answers: its outputs on every frame, all in memory.
+    """
+
+    session: Session
+    frames: Frames
+    answers: tuple[dict[str, Array], ...]
+
+    @classmethod
+    def of(cls, session: Session, frames: Frames) -> Self:
+        """Run the model once over the frames."""
+        return cls(session, frames, tuple(replay(session, frames)))
+
+    def compare(self, other: Session) -> Fidelity:
+        """Hold another model against it, as :func:`compare` does."""
+        return _compare(self.session, iter(self.answers), other, self.frames)
+
+
+def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
+    """Run two models over the same frames, each with its own recurrent state.
+
+    All arithmetic is float64. One frame is in memory at a time.
+
+    Args:
+        a: the reference.
+        b: what was made of it.
+        frames: the recording.
+
+    Raises:
+        EvaluationError: no common output, no frame, an output changes its shape, or
+            is not a number; the message names it.
+        FramesError: a frame fits one of the models not.
+    """
+    here, there = itertools.tee(frames)
+    return _compare(a, replay(a, here), b, there)
+
+
+def _compare(
+    a: Session, answers: Iterator[dict[str, Array]], b: Session, frames: Iterable[Frame]
+) -> Fidelity:
+    shared = [name for name in a.outputs if name in b.outputs]
+    if not shared:
+        raise EvaluationError(
+            f"no output in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
+        )
+    tallies = {name: _Tally(name) for name in shared}
+    adapter, reason = _common_adapter(a, b)
+    moved: list[Float64] = []
+    count = 0
+    there, along = itertools.tee(frames)
+    runs = zip(answers, replay(b, there, shared), along, strict=True)
+    for left, right, frame in runs:
+        for name, tally in tallies.items():
+            tally.add(left[name], right[name], count)
+        if adapter is not None:
+            gap = adapter.plan(left, frame.arrays) - adapter.plan(right, frame.arrays)
+            moved.append(np.linalg.norm(gap, axis=1))
+        count += 1
+    if not count:
+        raise EvaluationError("no frames to compare on")
+    return Fidelity(
+        tuple(tally.result() for tally in tallies.values()),
+        tuple(name for name in a.outputs if name not in b.outputs),
+        Displacement(float(np.mean(moved)), float(np.max(moved))) if moved else None,
+        reason,
+        count,
+    )
+
+
+def _common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
+    adapter = PlanAdapter.of(a.metadata, list(a.outputs))
+    if adapter is None:
+        return None, "the model does not say which output is its plan"
+    shape = a.outputs[adapter.output].shape
+    if PLAN not in a.metadata and (len(shape) not in (3, 4) or shape[-1] != 2):
+        return None, f"{adapter.output} is {list(shape)}, a plan is [1, n, 2]"
+    if adapter.output not in b.outputs:
+        return None, f"the second model has no output {adapter.output}"
+    return adapter, ""
+
+
+class _Tally:
+    """Sums of one output."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.signal = self.noise = self.gap = self.reach = 0.0
+
+    def add(self, a: Array, b: Array, frame: int) -> None:
+        if a.shape != b.shape:
+            raise EvaluationError(
+                f"output {self.name} is {list(a.shape)} in the first model,"
+                f" {list(b.shape)} in the second"
+            )
+        x, y = self._wide(a, "first", frame), self._wide(b, "second", frame)
+        if not x.size:
+            return
+        gap = np.abs(x - y)
+        self.signal += float(np.vdot(x, x))
+        self.noise += float(np.vdot(gap, gap))
+        self.reach = max(self.reach, float(np.abs(x).max()))
+        self.gap = max(self.gap, float(gap.max()))
+
+    def result(self) -> OutputFidelity:
+        if self.noise == 0:
+            return OutputFidelity(self.name, math.inf, 0.0)
+        if self.signal == 0:
+            return OutputFidelity(self.name, -math.inf, math.inf)
+        sqnr = 10 * math.log10(self.signal / self.noise)
+        return OutputFidelity(self.name, sqnr, self.gap / self.reach)
+
+    def _wide(self, value: Array, which: str, frame: int) -> Float64:
+        wide = np.asarray(value, np.float64)
+        if not np.isfinite(wide).all():
+            kind = "NaN" if np.isnan(wide).any() else "infinite"
+            raise EvaluationError(
+                f"output {self.name} of the {which} model is {kind} at frame {frame}"
+            )
+        return wide

@@ -1,0 +1,1 @@
+"""What becomes int8 and why: scheme, rules, plan, overrides."""

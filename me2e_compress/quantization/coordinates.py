@@ -1,0 +1,142 @@
+"""Find the layers that positions come from."""
+
+from collections import deque
+from collections.abc import Collection, Iterator
+
+import onnx_ir as ir
+
+from me2e_compress.quantization.nearest import behind
+
+_POSITIONS: dict[str, tuple[int, ...]] = {
+    "DeformConv": (2,),
+    "Gather": (1,),
+    "GatherElements": (1,),
+    "GatherND": (1,),
+    "GridSample": (1,),
+    "GridSamplePlugin": (1,),
+    "GridSampler2DTRT": (1,),
+    "GridSampler2DTRT2": (1,),
+    "GridSampler3DTRT": (1,),
+    "GridSampler3DTRT2": (1,),
+    "Inverse": (0,),
+    "InversePlugin": (0,),
+    "InverseTRT": (0,),
+    "MMCVModulatedDeformConv2d": (1,),
+    "MMCVMultiScaleDeformableAttention": (3,),
+    "MSDAPlugin": (3,),
+    "ModulatedDeformConv2d": (1,),
+    "ModulatedDeformableConv2dTRT": (1,),
+    "ModulatedDeformableConv2dTRT2": (1,),
+    "MultiScaleDeformableAttention": (3,),
+    "MultiScaleDeformableAttentionPlugin": (3,),
+    "MultiScaleDeformableAttnTRT": (2, 3),
+    "MultiScaleDeformableAttnTRT2": (2, 3),
+    "MultiscaleDeformableAttnPlugin_TRT": (3,),
+    "RotatePlugin": (1, 2),
+    "RotateTRT": (1, 2),
+    "RotateTRT2": (1, 2),
+    "ScatterElements": (1,),
+    "ScatterND": (1,),
+    "grid_sampler": (1,),
+}
+"""Which inputs say where to look or which matrix to invert: standard operators, and the
+plugins of TensorRT OSS, DerryHub's BEVFormer_tensorrt, DL4AGX and mmdeploy."""
+
+_SAMPLING_WEIGHTS = {
+    "MultiScaleDeformableAttnTRT": 4,
+    "MultiScaleDeformableAttnTRT2": 4,
+}
+"""Plugins that take sampling weights before their softmax, and at which input."""
+
+_ARITHMETIC = frozenset(
+    {
+        "Abs", "Add", "Cast", "Ceil", "Clip", "Concat", "Cos", "Div", "Dropout", "Exp",
+        "Expand", "Flatten", "Floor", "Gather", "GatherElements", "GatherND",
+        "Identity", "Log", "Max", "Min", "Mod", "Mul", "Neg", "Pad", "Pow",
+        "Reciprocal", "Reshape", "Round", "Sigmoid", "Sin", "Slice", "Split", "Sqrt",
+        "Squeeze", "Sub", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
+    }
+)  # fmt: skip
+"""What positions are computed with, after the last layer that gave them."""
+
+_LAYOUT = frozenset(
+    {
+        "Add", "Cast", "Identity", "Reshape", "Slice", "Split", "Squeeze", "Transpose",
+        "Unsqueeze",
+    }
+)  # fmt: skip
+
+_LAYERS = ("Conv", "ConvTranspose", "Einsum", "Gemm", "MatMul")
+_DATA_ONLY = {"Gather": 1, "GatherElements": 1, "GatherND": 1, "Pad": 1, "Slice": 1}
+"""How many leading inputs hold data: the others are indices, looked at on their own."""
+
+
+def find_coordinates(
+    model: ir.Model, constants: Collection[ir.Value]
+) -> dict[ir.Node, str]:
+    """Map every layer that positions come from to what it gives.
+
+    From whatever takes positions (samplers, gathers, rotations) one walk goes back
+    through arithmetic and changes of layout to the layers that they come from: sampling
+    offsets, reference points, refinements of boxes. It enters no node twice, so it is
+    linear in the graph. Sampling weights whose layer reads the same tensor as such a
+    layer are mapped too.
+
+    Args:
+        model: the graph, in topological order.
+        constants: values that no input changes.
+    """
+    found: dict[ir.Node, str] = {}
+    queue = deque(_positions(model.graph))
+    seen: set[ir.Node] = set()
+    while queue:
+        value, reader = queue.popleft()
+        node = value.producer()
+        if node is None or node in seen or value in constants:
+            continue
+        seen.add(node)
+        if node.op_type in _LAYERS:
+            found[node] = f"positions that {reader} reads come from it"
+        elif node.op_type in _ARITHMETIC:
+            data = node.inputs[: _DATA_ONLY.get(node.op_type, len(node.inputs))]
+            queue.extend((each, reader) for each in data if each is not None)
+    return {**found, **_companions(model, found, constants)}
+
+
+def _positions(graph: ir.Graph) -> Iterator[tuple[ir.Value, str]]:
+    for node in graph:
+        for index in _POSITIONS.get(node.op_type, ()):
+            value = node.inputs[index] if index < len(node.inputs) else None
+            if value is not None:
+                yield value, node.op_type
+
+
+def _companions(
+    model: ir.Model, found: dict[ir.Node, str], constants: Collection[ir.Value]
+) -> dict[ir.Node, str]:
+    """Find layers of sampling weights beside layers of offsets."""
+    shared = {node.inputs[0] for node in found}
+
+    def is_beside(node: ir.Node) -> bool:
+        return (
+            node.op_type in _LAYERS
+            and node not in found
+            and node.inputs[0] in shared
+            and node.inputs[1] in constants
+        )
+
+    nearest = behind(model.graph, _LAYOUT, is_beside)
+    reason = "sampling weights: they read the tensor that the offsets read"
+    return {
+        node: reason
+        for value in _weights(model.graph)
+        for _, node in nearest.get(value, ())
+    }
+
+
+def _weights(graph: ir.Graph) -> Iterator[ir.Value]:
+    for node in graph:
+        index = 0 if node.op_type == "Softmax" else _SAMPLING_WEIGHTS.get(node.op_type)
+        value = None if index is None else node.inputs[index]
+        if value is not None:
+            yield value

@@ -1,0 +1,171 @@
+"""Find attention: the matrix products around every softmax."""
+
+import dataclasses
+import math
+from collections.abc import Collection, Iterable, Iterator
+
+import onnx_ir as ir
+
+from me2e_compress.graph import open_shape, static_shape
+from me2e_compress.quantization.nearest import Nearest, ahead, behind
+
+FUSED = frozenset(
+    {
+        "Attention", "GroupQueryAttention", "MultiHeadAttention", "PackedAttention",
+        "PackedMultiHeadAttention", "QAttention", "QKVTRT", "QKVTRT2",
+    }
+)  # fmt: skip
+"""Operators that are attention as a whole (ONNX 23, com.microsoft, DerryHub's
+BEVFormer_tensorrt)."""
+
+_PRODUCTS = ("Einsum", "Gemm", "MatMul")
+
+_LAYOUT = frozenset(
+    {
+        "Cast", "Div", "Dropout", "Expand", "Flatten", "Identity", "Mul", "Reshape",
+        "Squeeze", "Transpose", "Unsqueeze", "Where",
+    }
+)  # fmt: skip
+
+_SCORES = _LAYOUT | {"Add", "Clip", "Max", "Min", "Neg", "Sub"}
+"""What may stand between the product of queries and keys and the softmax: scale,
+masks (additive or boolean), relative positions, layout."""
+
+_WEIGHTS = _LAYOUT
+"""What may stand between the softmax and the product with the values: dropout, masks,
+layout."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Attention:
+    """One attention.
+
+    Attributes:
+        queries: number of query tokens; None if that is open.
+        keys: number of key tokens; None if that is open.
+    """
+
+    queries: int | None
+    keys: int | None
+
+    @property
+    def length(self) -> int | None:
+        """The longer of the two."""
+        if self.queries is None or self.keys is None:
+            return None
+        return max(self.queries, self.keys)
+
+
+def find_attention(
+    model: ir.Model, constants: Collection[ir.Value]
+) -> dict[ir.Node, Attention]:
+    """Map every node that takes part in an attention to that attention.
+
+    One sweep over the graph remembers, for every value, which products lie behind it,
+    another which lie ahead; scaling, masks, casts and changes of layout are looked
+    through. A softmax with a product behind it is an attention: that product is queries
+    by keys, the one ahead weights by values. Products may be MatMul, Gemm or Einsum,
+    the softmax may be decomposed into ``Div(Exp(x), ReduceSum(Exp(x)))``. What a mask
+    is made of is told from the scores by its size. The search is linear in the graph.
+
+    Operators that are attention as a whole (:data:`FUSED`) are mapped too.
+
+    Sampling weights of deformable attention come from a linear layer, not from such a
+    product, and are not attention here.
+
+    Args:
+        model: the graph, shapes inferred, in topological order.
+        constants: values that no input changes: what multiplies one of them from the
+            left is a layer, not an attention, unless it is a batch of matrices (keys
+            that are learned or known beforehand).
+    """
+
+    def is_product(node: ir.Node) -> bool:
+        return _is_product(node, constants)
+
+    scored = behind(model.graph, _SCORES, is_product)
+    weighed = ahead(model.graph, _WEIGHTS, is_product)
+    found = _fused(model.graph)
+    for weights, scores in _softmaxes(model.graph):
+        queries_by_keys = [
+            node for node in _products(scored, scores) if _fits(node.outputs[0], scores)
+        ]
+        if not queries_by_keys:
+            continue
+        attention = Attention(*_lengths(queries_by_keys[0].outputs[0]))
+        for product in (*queries_by_keys, *_products(weighed, weights)):
+            found.setdefault(product, attention)
+    return found
+
+
+def _products(nearest: Nearest, value: ir.Value) -> list[ir.Node]:
+    return [node for _, node in nearest.get(value, ())]
+
+
+def _is_product(node: ir.Node, constants: Collection[ir.Value]) -> bool:
+    """Say whether a node multiplies two things, neither of them a layer's weight.
+
+    The left one may be constant: learned queries that have not met the scene yet.
+    """
+    if node.op_type not in _PRODUCTS or node.domain not in ("", "ai.onnx"):
+        return False
+    right = node.inputs[1] if len(node.inputs) > 1 else None
+    if right is None:
+        return False
+    shape = static_shape(right) or ()
+    return right not in constants or math.prod(shape[:-2]) > 1
+
+
+def _fits(product: ir.Value, scores: ir.Value) -> bool:
+    """Say whether scores may be this product: as many, or as many a row."""
+    left, right = static_shape(product), static_shape(scores)
+    if not left or not right:
+        ends = [(open_shape(value) or (None,))[-1:] for value in (product, scores)]
+        return (None,) in ends or ends[0] == ends[1]
+    have, want = math.prod(left), math.prod(right)
+    return have == want or (left[-1] == right[-1] and have > 0 and want % have == 0)
+
+
+def _fused(nodes: Iterable[ir.Node]) -> dict[ir.Node, Attention]:
+    found: dict[ir.Node, Attention] = {}
+    for node in nodes:
+        if node.op_type in FUSED:
+            tokens = [_tokens(value) for value in node.inputs[:2]]
+            found[node] = Attention(tokens[0], tokens[-1])
+    return found
+
+
+def _tokens(value: ir.Value | None) -> int | None:
+    """Count the tokens of queries or keys, [batch, (heads,) tokens, width]."""
+    shape = open_shape(value)
+    return None if shape is None or len(shape) < 2 else shape[-2]
+
+
+def _softmaxes(nodes: Iterable[ir.Node]) -> Iterator[tuple[ir.Value, ir.Value]]:
+    """Give (weights, scores) of every softmax."""
+    for node in nodes:
+        if node.op_type == "Softmax" and node.inputs[0] is not None:
+            yield node.outputs[0], node.inputs[0]
+        elif node.op_type == "Div":
+            scores = _decomposed(node)
+            if scores is not None:
+                yield node.outputs[0], scores
+
+
+def _decomposed(division: ir.Node) -> ir.Value | None:
+    """Give the x of ``Div(Exp(x), ReduceSum(Exp(x)))``."""
+    above, below = division.inputs[:2]
+    power = above.producer() if above is not None else None
+    total = below.producer() if below is not None else None
+    if power is None or total is None:
+        return None
+    if power.op_type != "Exp" or total.op_type != "ReduceSum":
+        return None
+    return power.inputs[0] if total.inputs[0] is above else None
+
+
+def _lengths(scores: ir.Value) -> tuple[int | None, int | None]:
+    shape = open_shape(scores)
+    if shape is None or len(shape) < 2:
+        return None, None
+    return shape[-2], shape[-1]

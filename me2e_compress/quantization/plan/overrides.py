@@ -1,0 +1,215 @@
+"""What the user decides: a TOML file of exceptions to a plan.
+
+TOML::
+
+    [[override]]
+    nodes = "/head/decoder/*"     # glob over node names; * also crosses a slash
+    module = "planner"            # all that are given must hold
+    op = "MatMul"
+    reads = "/neck/out"           # glob over the tensors that they read: a whole group
+    dtype = "float"               # or "int8"
+    reason = "costs 3 dB"         # may be left out
+
+    [[concat]]
+    nodes = "/neck/Concat*"       # scales of what these join stay apart
+    scale = "own"
+
+Names are those of the nodes when they are quantized, or of the nodes of the source file
+that they stand for. Where two overrides match a node, the later counts.
+"""
+
+import dataclasses
+import fnmatch
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal, Self
+
+import onnx_ir as ir
+import pydantic
+
+from me2e_compress.errors import RecipeError
+from me2e_compress.graph import provenance
+from me2e_compress.quantization.plan.decision import FLOAT, INT8, Decision
+
+_UNSUPPORTED = "int8 and float are what there is (no int4, fp8 or mixed 16 bit)"
+
+
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Override(_Strict):
+    """One exception: which nodes, and what becomes of them."""
+
+    dtype: str
+    nodes: str | None = None
+    module: str | None = None
+    op: str | None = None
+    reads: str | None = None
+    reason: str = ""
+
+    @pydantic.model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.dtype not in (INT8, FLOAT):
+            raise ValueError(f"dtype {self.dtype}: {_UNSUPPORTED}")
+        if not self._given():
+            raise ValueError("it names no nodes, module, op or reads")
+        return self
+
+    def matches(self, node: ir.Node) -> bool:
+        """Say whether it speaks of a node."""
+        return (
+            (self.op is None or node.op_type == self.op)
+            and (self.module is None or provenance.module_of(node) == self.module)
+            and (self.nodes is None or _named(node, self.nodes))
+            and (self.reads is None or _reads(node, self.reads))
+        )
+
+    def __str__(self) -> str:
+        """Show what it matches by."""
+        return ", ".join(f"{key} {value!r}" for key, value in self._given().items())
+
+    def _given(self) -> dict[str, str]:
+        matchers = {
+            "nodes": self.nodes,
+            "module": self.module,
+            "op": self.op,
+            "reads": self.reads,
+        }
+        return {key: value for key, value in matchers.items() if value is not None}
+
+
+class ConcatScale(_Strict):
+    """Concats whose inputs keep scales of their own."""
+
+    nodes: str
+    scale: Literal["own"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Pin:
+    """What was decided for one node: ``int8`` or ``float``, and why."""
+
+    dtype: str
+    reason: str
+
+
+class Overrides(_Strict):
+    """A file of exceptions."""
+
+    override: tuple[Override, ...] = ()
+    concat: tuple[ConcatScale, ...] = ()
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a TOML file.
+
+        Raises:
+            RecipeError: no such file, not TOML, or not overrides.
+        """
+        if not path.is_file():
+            raise RecipeError(f"{path}: no such file of overrides")
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise RecipeError(f"{path}: not TOML ({error})") from error
+        return cls.parse(text, str(path))
+
+    @classmethod
+    def parse(cls, text: str, origin: str = "overrides") -> Self:
+        """Read TOML; ``origin`` is what an error message calls it."""
+        try:
+            return cls.model_validate(tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise RecipeError(f"{origin}: not TOML ({error})") from error
+        except pydantic.ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"]) or "file"
+            raise RecipeError(f"{origin}: {where}: {first['msg']}") from error
+
+    def bind(self, model: ir.Model) -> "Pins":
+        """Find the nodes of a graph that they speak of.
+
+        Raises:
+            RecipeError: one matches nothing.
+        """
+        main = tuple(model.graph)
+        pinned: dict[ir.Node, Override] = {}
+        for each in self.override:
+            pinned.update(dict.fromkeys(_some(main, each.matches, str(each)), each))
+        apart: dict[ir.Node, None] = {}
+        for rule in self.concat:
+
+            def joined(node: ir.Node, glob: str = rule.nodes) -> bool:
+                return node.op_type == "Concat" and _named(node, glob)
+
+            apart.update(dict.fromkeys(_some(main, joined, f"concat {rule.nodes!r}")))
+        return Pins(pinned, frozenset(apart))
+
+
+NONE = Overrides()
+
+
+class Pins:
+    """Overrides bound to the nodes of one graph.
+
+    Args:
+        pinned: the override of each node that has one.
+        apart: Concats whose inputs keep scales of their own.
+    """
+
+    def __init__(
+        self, pinned: Mapping[ir.Node, Override], apart: frozenset[ir.Node]
+    ) -> None:
+        self._pinned = pinned
+        self.apart = apart
+
+    def of(self, node: ir.Node) -> Pin | None:
+        """Give what the user decided for a node, if anything."""
+        found = self._pinned.get(node)
+        if found is None:
+            return None
+        return Pin(found.dtype, found.reason or f"override: {found}")
+
+    def check(self, decided: Mapping[ir.Node, Decision]) -> None:
+        """Refuse overrides to int8 that no node could follow.
+
+        Raises:
+            RecipeError: names the override and why its first node cannot be int8.
+        """
+        refused: dict[Override, Decision] = {}
+        followed: dict[Override, None] = {}
+        for node, override in self._pinned.items():
+            if override.dtype != INT8:
+                continue
+            if decided[node].dtype == INT8:
+                followed[override] = None
+            else:
+                refused.setdefault(override, decided[node])
+        for override, decision in refused.items():
+            if override not in followed:
+                raise RecipeError(
+                    f"override {override}: {decision.node or decision.output} cannot"
+                    f" be int8: {decision.reason}"
+                )
+
+
+def _named(node: ir.Node, glob: str) -> bool:
+    past = provenance.read(node)
+    names = (node.name or "", *(past.origins if past is not None else ()))
+    return any(fnmatch.fnmatchcase(name, glob) for name in names)
+
+
+def _reads(node: ir.Node, glob: str) -> bool:
+    names = (str(value.name) for value in node.inputs if value is not None)
+    return any(fnmatch.fnmatchcase(name, glob) for name in names)
+
+
+def _some(
+    nodes: tuple[ir.Node, ...], matches: Callable[[ir.Node], bool], what: str
+) -> list[ir.Node]:
+    found = [node for node in nodes if matches(node)]
+    if not found:
+        raise RecipeError(f"override {what} matches none of {len(nodes)} nodes")
+    return found

@@ -1,0 +1,25 @@
+"""Where to look is computed in float."""
+
+import dataclasses
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress.quantization.rules.base import Facts
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinates:
+    """Layers that positions come from stay float: offsets, reference points.
+
+    A position is right to a fraction of a cell or wrong; 8 bits over a map of 100
+    cells leave half a cell. Sampling weights that read the same tensor as the offsets
+    go with them: neither then needs it in int8.
+    """
+
+    id: ClassVar[str] = "coordinates"
+    firm: ClassVar[bool] = False
+
+    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+        """Object to what :func:`~me2e_compress.quantization.coordinates` found."""
+        return facts.coordinates.get(node)

@@ -1,0 +1,70 @@
+"""The two stages of the paper."""
+
+import dataclasses
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress.quantization.extents import extent
+from me2e_compress.quantization.rules.base import CONVOLUTIONS, Facts
+
+
+@dataclasses.dataclass(frozen=True)
+class AttentionLength:
+    """Stage 1: long attention stays float.
+
+    TensorRT fuses int8 attention up to 512 queries and 512 keys, and errors of the
+    product of queries and keys grow with the length in the softmax.
+    """
+
+    limit: int = 512
+    id: ClassVar[str] = "attention-length"
+    firm: ClassVar[bool] = False
+
+    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+        """Object if queries or keys are more than the limit, or unknown in number."""
+        attention = facts.attention.get(node)
+        if attention is None:
+            return None
+        if attention.length is None:
+            return f"attention of unknown length, limit {self.limit}"
+        if attention.length <= self.limit:
+            return None
+        return (
+            f"attention of {attention.queries} queries and {attention.keys} keys,"
+            f" more than {self.limit}"
+        )
+
+    def borderline(self, node: ir.Node, facts: Facts) -> str | None:
+        """Say what is close about a node: a reader may want to decide it otherwise.
+
+        Within an eighth of the limit; or only one of queries and keys is beyond it, so
+        that tools which look at one of the two decide otherwise.
+        """
+        attention = facts.attention.get(node)
+        if attention is None or attention.queries is None or attention.keys is None:
+            return None
+        sizes = f"{attention.queries} queries, {attention.keys} keys"
+        longest = max(attention.queries, attention.keys)
+        if abs(longest - self.limit) <= self.limit // 8:
+            return f"{sizes}: close to the limit of {self.limit}"
+        if min(attention.queries, attention.keys) <= self.limit < longest:
+            return f"{sizes}: one within the limit of {self.limit}, one beyond"
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class MatrixVector:
+    """Stage 2: a product that degenerates to GEMV gains nothing."""
+
+    id: ClassVar[str] = "gemv"
+    firm: ClassVar[bool] = False
+
+    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+        """Object if one side of the product is a single row or column."""
+        if node.op_type in CONVOLUTIONS:
+            return None
+        size = extent(node, weight=node.inputs[1] in facts.constants)
+        if not size.is_vector:
+            return None
+        return f"{size.rows} rows by {size.columns} columns: a matrix-vector product"

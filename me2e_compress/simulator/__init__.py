@@ -1,0 +1,15 @@
+"""The world that is driven in, on highway-env: routes, traffic, scenarios, cameras.
+
+It knows no model: whoever drives is somebody else's business.
+
+Raises:
+    MissingExtraError: On import, if the extra ``highway`` is not installed.
+"""
+
+from importlib.util import find_spec
+
+from me2e_compress.errors import MissingExtraError
+
+for _package in ("highway_env", "gymnasium", "scipy", "cv2"):
+    if find_spec(_package) is None:
+        raise MissingExtraError(_package, "highway")

@@ -1,0 +1,242 @@
+"""Solids as polygons in the six images."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.simulator.cameras.ordering import painting_order
+from me2e_compress.simulator.cameras.rig import (
+    CAMERA_HEIGHT_M,
+    CameraRig,
+)
+from me2e_compress.simulator.cameras.solids import Solid
+from me2e_compress.simulator.cameras.template import FIRST_LAMP
+from me2e_compress.simulator.scene import Ego
+
+Bytes = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.intp]
+Flags = npt.NDArray[np.bool_]
+
+NEAR_M = 0.2
+"""Polygons are cut at this depth."""
+LEAST_PX = np.array([2.0, 0.7])
+"""Details whose longer side is less are left out: others, lamps."""
+SUBPIXEL_BITS = 4
+LIMIT_PX = 20_000.0
+"""Far outside any image, and safe in cv2's fixed-point numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """Visible polygons of all cameras, in painting order.
+
+    Attributes:
+        cameras: [M] index of the camera.
+        polygons: M arrays int32 [N, 1 or 4.., 2], fixed-point pixels for cv2.
+        colours: [M, 3] RGB.
+        lamps: [M] whether it shines by itself.
+        details: [M] whether it lies on another face.
+        kinds: [M] `PixelClass`.
+        places: [M, 2] where its solid stands, metres in the ego frame.
+        distances: [M] metres from the camera to its solid.
+    """
+
+    cameras: Ints
+    polygons: list[npt.NDArray[np.int32]]
+    colours: Floats
+    lamps: Flags
+    details: Flags
+    kinds: Ints
+    places: Floats
+    distances: Floats
+
+
+NO_FACES = Faces(
+    cameras=np.zeros(0, np.intp),
+    polygons=[],
+    colours=np.zeros((0, 3)),
+    lamps=np.zeros(0, np.bool_),
+    details=np.zeros(0, np.bool_),
+    kinds=np.zeros(0, np.intp),
+    places=np.zeros((0, 2)),
+    distances=np.zeros(0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Painter:
+    """Turns solids into the polygons that a rig sees.
+
+    Args:
+        rig: The cameras.
+    """
+
+    rig: CameraRig
+
+    def faces(self, solids: list[Solid], ego: Ego) -> Faces:
+        """Cull, order, cut at the near plane and project."""
+        if not solids:
+            return NO_FACES
+        poses = _to_ego(np.array([s.pose for s in solids]), ego)
+        corners, footprints = _place(solids, poses)
+        camera, solid = painting_order(*self._views(footprints))
+        view, face = _spread(np.array([len(s.colours) for s in solids]), solid)
+        points = self._to_camera(corners[:, :, face], camera[view])
+        seen = self._seen(points, camera[view])
+        points, view, face = points[:, :, seen], view[seen], face[seen]
+        pixels = self._project(points, camera[view])
+        details = np.concatenate([s.template.details for s in solids])[face]
+        lamps = np.concatenate([s.template.slots for s in solids])[face] >= FIRST_LAMP
+        keep = np.flatnonzero(
+            ~details | (_extent(pixels) > LEAST_PX[lamps.astype(int)])
+        )
+        view, face = view[keep], face[keep]
+        camera, solid = camera[view], solid[view]
+        away = poses[solid, :2] - self.rig.positions[camera, :2]
+        return Faces(
+            cameras=camera,
+            polygons=self._polygons(points[..., keep], pixels[..., keep], camera),
+            colours=np.concatenate([s.colours for s in solids])[face],
+            lamps=lamps[keep],
+            details=details[keep],
+            kinds=np.array([s.kind for s in solids], np.intp)[solid],
+            places=poses[solid, :2],
+            distances=np.hypot(away[:, 0], away[:, 1]),
+        )
+
+    def _views(self, footprints: Floats) -> tuple[Floats, Floats, Flags]:
+        """Footprints [6, 4, S] in each camera's frame, and whether it may see them."""
+        positions, rotations = self.rig.positions, self.rig.rotations
+        dx = footprints[0] - positions[:, 0, None, None]
+        dy = footprints[1] - positions[:, 1, None, None]
+        axes = rotations[:, :, :2, None, None]
+        right = axes[:, 0, 0] * dx + axes[:, 0, 1] * dy
+        forward = axes[:, 2, 0] * dx + axes[:, 2, 1] * dy
+        edge = forward * (self.rig.centre_px[0] / self.rig.focals_px)[:, None, None]
+        hidden = (forward < NEAR_M).all(axis=1)
+        hidden |= (right > edge).all(axis=1) | (right < -edge).all(axis=1)
+        return right, forward, ~hidden
+
+    def _to_camera(self, points: Floats, camera: Ints) -> Floats:
+        """[3, 4, M] in the ego frame to [3, 4, M] right, down, forward."""
+        dx, dy = (points[i] - self.rig.positions[camera, i] for i in (0, 1))
+        axes = self.rig.rotations[camera]
+        right = axes[:, 0, 0] * dx + axes[:, 0, 1] * dy
+        forward = axes[:, 2, 0] * dx + axes[:, 2, 1] * dy
+        return np.stack([right, CAMERA_HEIGHT_M - points[2], forward])
+
+    def _seen(self, points: Floats, camera: Ints) -> Ints:
+        """Indices of the faces [3, 4, M] that look at the camera, in its frustum."""
+        front = np.flatnonzero(_towards(points))
+        right, down, depth = points[:, :, front]
+        centre_column, horizon = self.rig.centre_px
+        slope = depth / self.rig.focals_px[camera[front]]
+        outside = (depth < NEAR_M).all(axis=0)
+        for across, low, high in (
+            (right, centre_column, self.rig.width - centre_column),
+            (down, horizon, self.rig.height - horizon),
+        ):
+            outside |= (across < -(low + 1.0) * slope).all(axis=0)
+            outside |= (across > (high + 1.0) * slope).all(axis=0)
+        return np.asarray(front[~outside])
+
+    def _project(self, points: Floats, camera: Ints) -> Floats:
+        """[2, 4, M] pixels; corners before the near plane come out wrong."""
+        scale = self.rig.focals_px[camera] / np.maximum(points[2], NEAR_M)
+        pixels = points[:2] * scale
+        pixels += np.array(self.rig.centre_px)[:, None, None]
+        return np.asarray(pixels)
+
+    def _polygons(
+        self, points: Floats, pixels: Floats, camera: Ints
+    ) -> list[npt.NDArray[np.int32]]:
+        polygons = list(_fixed(pixels.transpose(2, 1, 0)))
+        for i in np.flatnonzero((points[2] < NEAR_M).any(axis=0)).tolist():
+            kept = _cut(points[:, :, i].T.tolist())
+            scale = self.rig.focals_px[camera[i]] / kept[:, 2:]
+            polygons[i] = _fixed(kept[:, :2] * scale + self.rig.centre_px)
+        return polygons
+
+
+def draw(images: Bytes, faces: Faces, colours: Bytes) -> None:
+    """Paint faces with uint8 colours [M, 3] into uint8 [6, H, W, 3], antialiased."""
+    fill, planes = cv2.fillConvexPoly, list(images)
+    rows = zip(faces.cameras.tolist(), faces.polygons, colours.tolist(), strict=True)
+    for camera, polygon, colour in rows:
+        fill(planes[camera], polygon, colour, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def label(labels: Bytes, faces: Faces) -> None:
+    """Paint the classes of faces, without details, into uint8 [6, H, W]."""
+    for i in np.flatnonzero(~faces.details).tolist():
+        plane, kind = labels[faces.cameras[i]], (int(faces.kinds[i]),)
+        cv2.fillConvexPoly(plane, faces.polygons[i], kind, cv2.LINE_8, SUBPIXEL_BITS)
+
+
+def _to_ego(poses: Floats, ego: Ego) -> Floats:
+    """World poses [S, 3] (x, y, heading) in the ego frame."""
+    cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+    dx, dy = poses[:, 0] - ego.x, poses[:, 1] - ego.y
+    turned = poses[:, 2] - ego.heading
+    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, turned], axis=1)
+
+
+def _place(solids: list[Solid], poses: Floats) -> tuple[Floats, Floats]:
+    """Corners [3, 4, N] of all faces and footprints [2, 4, S], in the ego frame."""
+    sizes = np.array([solid.size for solid in solids]).T
+    owner = np.repeat(np.arange(len(solids)), [len(s.colours) for s in solids])
+    unit = np.concatenate([s.template.corners for s in solids], axis=2)
+    corners = unit * sizes[:, None, owner]
+    rectangles = np.stack([s.template.footprint for s in solids], axis=2)
+    footprints = rectangles * sizes[:2, None]
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    for points, who in ((corners, owner), (footprints, slice(None))):
+        x = cos[who] * points[0] - sin[who] * points[1] + poses[who, 0]
+        y = sin[who] * points[0] + cos[who] * points[1] + poses[who, 1]
+        points[0], points[1] = x, y
+    return corners, footprints
+
+
+def _spread(counts: Ints, solid: Ints) -> tuple[Ints, Ints]:
+    """For the faces of the solids seen: which view [M], and which face [M]."""
+    many = counts[solid]
+    view = np.repeat(np.arange(len(solid)), many)
+    within = np.arange(len(view)) - np.repeat(np.cumsum(many) - many, many)
+    return view, (np.cumsum(counts) - counts)[solid][view] + within
+
+
+def _extent(pixels: Floats) -> Floats:
+    """[M] longer side of what encloses each polygon [2, 4, M], in pixels."""
+    return np.asarray((pixels.max(axis=1) - pixels.min(axis=1)).max(axis=0))
+
+
+def _towards(points: Floats) -> Flags:
+    """Whether faces [3, 4, M] look at the camera; their diagonals give the normal."""
+    (ax, ay, az), (bx, by, bz) = (
+        points[:, 2] - points[:, 0],
+        points[:, 3] - points[:, 1],
+    )
+    x, y, z = points[:, 0]
+    volume = x * (ay * bz - az * by) + y * (az * bx - ax * bz) + z * (ax * by - ay * bx)
+    return np.asarray(volume < 0.0)
+
+
+def _cut(polygon: list[list[float]]) -> Floats:
+    """The part in front of the near plane [N, 3] of a polygon of (x, y, depth)."""
+    kept = list[list[float]]()
+    for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+        if a[2] >= NEAR_M:
+            kept.append(a)
+        if (a[2] >= NEAR_M) != (b[2] >= NEAR_M):
+            part = (NEAR_M - a[2]) / (b[2] - a[2])
+            kept.append([p + part * (q - p) for p, q in zip(a, b, strict=True)])
+    return np.array(kept)
+
+
+def _fixed(pixels: Floats) -> npt.NDArray[np.int32]:
+    """Fixed-point pixels for cv2, which has pixel centres at whole numbers."""
+    scaled = np.clip(pixels - 0.5, -LIMIT_PX, LIMIT_PX) * (1 << SUBPIXEL_BITS)
+    return np.rint(scaled).astype(np.int32)

@@ -1,0 +1,110 @@
+"""Vehicles: a box with wheels, lamps and glass, and a cabin on it."""
+
+from me2e_compress.simulator.cameras.template import (
+    FULL,
+    Box,
+    Quad,
+    Slot,
+    Template,
+    shadow,
+    template,
+)
+
+VEHICLE_SHADOW = shadow((-0.53, 0.53), (-0.56, 0.56))
+
+
+def _wheels(box: Box, u: tuple[float, ...], radius: float, top: float) -> list[Quad]:
+    """Wheels on both sides of a box, from the ground up to v = top of its sides.
+
+    Args:
+        box: Where.
+        u: Their places, from the rear (0) to the front (1).
+        radius: As a part of the length of the box.
+        top: As a part of the height of the box.
+    """
+    low, high = box.faces["left"][0, 2], box.faces["left"][2, 2]
+    ground = -low / (high - low)
+    radii = radius, (top - ground) / 2
+    quads = list[Quad]()
+    for at in u:
+        for face, along in (("right", at), ("left", 1 - at)):
+            quads += box.disc(face, (along, (top + ground) / 2), radii, Slot.TYRE)
+    return quads
+
+
+def _lamps(box: Box, v: tuple[float, float], width: float) -> list[Quad]:
+    """Head lamps, tail lamps and the indicators at the four corners."""
+    ends = (0.03, 0.03 + width), (0.97 - width, 0.97)
+    # the front's lower edge runs from right to left, the back's from left to right
+    quads = [box.on("front", u, v, Slot.HEADLAMP) for u in ends]
+    quads += [box.on("back", u, v, Slot.TAIL_LAMP) for u in ends]
+    high = (v[0] - (v[1] - v[0]) * 0.9, v[0])
+    sides = (Slot.INDICATOR_RIGHT, Slot.INDICATOR_LEFT)
+    for u, front, back in zip(ends, sides, sides[::-1], strict=True):
+        quads += [box.on("front", u, high, front), box.on("back", u, high, back)]
+    return quads
+
+
+def car() -> Template:
+    """Return a car: wheels, lamps, plate, and a cabin with glass all round."""
+    body = Box(FULL, FULL, (0.17, 0.54), Slot.BODY)
+    cabin = Box(
+        (-0.46, 0.26), (-0.47, 0.47), (0.54, 1.0), Slot.BODY, (-0.36, 0.1), (-0.4, 0.4)
+    )
+    decals = [body.on("back", (0.3, 0.7), (0.3, 0.6), Slot.STRIPE)]
+    decals += _lamps(body, (0.52, 0.86), 0.2)
+    decals += _wheels(body, (0.19, 0.81), 0.075, 0.45)
+    glass = [
+        cabin.on(face, (0.07, 0.93), (0.12, 0.9), Slot.GLASS)
+        for face in ("front", "back", "left", "right")
+    ]
+    glass.append(cabin.on("back", (0.38, 0.62), (0.9, 1.0), Slot.THIRD_LAMP))
+    return template([VEHICLE_SHADOW, *body.quads(decals), *cabin.quads(glass)])
+
+
+def van(*, beacon: bool) -> Template:
+    """Return a van, or an ambulance with its stripes and its beacon."""
+    body = Box(FULL, FULL, (0.15, 0.5), Slot.BODY)
+    roof, front = (0.92 if beacon else 1.0), ((-0.5, 0.42), (-0.5, 0.3))
+    upper = Box(front[0], FULL, (0.5, roof), Slot.BODY, front[1], (-0.47, 0.47))
+    decals = _lamps(body, (0.5, 0.85), 0.16)
+    if beacon:
+        decals += [
+            body.on(f, (0.0, 1.0), (0.8, 1.0), Slot.STRIPE) for f in ("left", "right")
+        ]
+    decals += _wheels(body, (0.19, 0.81), 0.07, 0.45)
+    glass = [upper.on("front", (0.07, 0.93), (0.1, 0.85), Slot.GLASS)]
+    glass += [upper.on("right", (0.68, 0.95), (0.2, 0.8), Slot.GLASS)]
+    glass += [upper.on("left", (0.05, 0.32), (0.2, 0.8), Slot.GLASS)]
+    glass += [
+        upper.on("back", u, (0.35, 0.85), Slot.GLASS)
+        for u in ((0.08, 0.47), (0.53, 0.92))
+    ]
+    glass.append(upper.on("back", (0.4, 0.6), (0.9, 1.0), Slot.THIRD_LAMP))
+    quads = [VEHICLE_SHADOW, *body.quads(decals), *upper.quads(glass)]
+    if beacon:
+        bar = Box((0.0, 0.12), (-0.35, 0.35), (roof, 1.0), Slot.BEACON)
+        quads += bar.quads()
+    return template(quads)
+
+
+def truck() -> tuple[Template, Template]:
+    """Return cargo and cab: two solids, so that the nearer one is painted last."""
+    cargo_x, cab_x = (-0.5, 0.18), (0.21, 0.5)
+    bed = Box(cargo_x, FULL, (0.17, 0.32), Slot.TRIM)
+    cargo = Box(cargo_x, FULL, (0.32, 1.0), Slot.STRIPE)
+    rear = [quad for quad in _lamps(bed, (0.52, 0.95), 0.14) if quad.corners[0, 0] < 0]
+    rear += _wheels(bed, (0.3, 0.62), 0.09, 0.5)
+    back = [cargo.on("back", (0.49, 0.51), (0.0, 1.0), Slot.TRIM)]
+    cab = Box(cab_x, FULL, (0.14, 0.82), Slot.BODY)
+    front = [quad for quad in _lamps(cab, (0.17, 0.28), 0.14) if quad.corners[0, 0] > 0]
+    front += [cab.on("front", (0.06, 0.94), (0.5, 0.92), Slot.GLASS)]
+    front += [cab.on("right", (0.35, 0.92), (0.5, 0.9), Slot.GLASS)]
+    front += [cab.on("left", (0.08, 0.65), (0.5, 0.9), Slot.GLASS)]
+    front += _wheels(cab, (0.5,), 0.23, 0.16)
+    cargo_shadow = shadow((-0.52, 0.2), (-0.53, 0.53))
+    cab_shadow = shadow((0.2, 0.52), (-0.53, 0.53))
+    return (
+        template([cargo_shadow, *bed.quads(rear), *cargo.quads(back)], cargo_x, FULL),
+        template([cab_shadow, *cab.quads(front)], cab_x, FULL),
+    )

@@ -1,0 +1,176 @@
+"""Pictures of recorded moments."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.cameras import CAMERA_NAMES, GroundTexture
+from me2e_compress.simulator.pictures.canvas import Text, text_width, write
+from me2e_compress.simulator.pictures.top_view import INK, PAPER, BirdsEye
+from me2e_compress.simulator.scene import Scene
+from me2e_compress.simulator.traffic.events import INFRACTIONS, Event
+
+Bytes = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float64]
+
+MONTAGE = (("FRONT_LEFT", "FRONT", "FRONT_RIGHT"), ("BACK_LEFT", "BACK", "BACK_RIGHT"))
+"""As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left
+of the car is to the right of the image."""
+GAP = 4
+CAPTION = 30
+RED = (208, 16, 32)
+NO_IMAGE = (226, 228, 232)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """What was recorded at one frame.
+
+    Attributes:
+        scene: Everything there was.
+        images: The six cameras, uint8 [6, H, W, 3] RGB; None if not rendered.
+        plan: [6, 2] metres in the ego frame: the plan in force; None before the first.
+        events: What was noticed, at least since the moment before; an event that is
+            handed in again is marked once.
+        score: Driving score so far, 0 to 100; None if not computed.
+    """
+
+    scene: Scene
+    images: Bytes | None = None
+    plan: npt.NDArray[np.floating] | None = None
+    events: tuple[Event, ...] = ()
+    score: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RoutePicture:
+    """Draws a route from its recorded moments.
+
+    Args:
+        title: First words of the caption: the scenario, the route, the driver.
+        texture: The ground the route was driven on.
+        route: [N, 2] world points of the route.
+        moments: In order of time, at least one.
+        tile_width: Width of a camera's tile in pixels.
+
+    Raises:
+        EvaluationError: There is no moment.
+    """
+
+    title: str
+    texture: GroundTexture
+    route: Floats
+    moments: Sequence[Moment]
+    tile_width: int = 320
+
+    def __post_init__(self) -> None:
+        """Check that there is something to draw."""
+        if not self.moments:
+            raise EvaluationError(f"{self.title}: no moment was recorded to draw")
+
+    def frame(self, index: int) -> Bytes:
+        """The six cameras, the view from above and a caption: uint8 [rows, cols, 3]."""
+        rows = [
+            _beside([self._tile(index, name) for name in names]) for names in MONTAGE
+        ]
+        montage = _above(rows)
+        height = montage.shape[0]
+        above = self._from_above(index, (height, round(height * 0.82)))
+        picture = _beside([montage, above])
+        return self._captioned(picture, index)
+
+    def frames(self, every: int = 1) -> Iterable[Bytes]:
+        """All moments, or every n-th and the last one."""
+        last = len(self.moments) - 1
+        yield from (self.frame(i) for i in range(0, last, every))
+        yield self.frame(last)
+
+    def strip(self, indices: Sequence[int]) -> Bytes:
+        """Moments side by side, the front camera above the view from above."""
+        columns = []
+        for index in indices:
+            tile = self._tile(index, "FRONT")
+            side = tile.shape[1]
+            above = self._from_above(index, (side, side))
+            label = np.full((CAPTION, side, 3), PAPER, np.uint8)
+            write(label, [Text(_state(self.moments[index]), 4, 7, 14, INK)])
+            columns.append(_above([label, tile, above]))
+        return _beside(columns)
+
+    def _tile(self, index: int, name: str) -> Bytes:
+        images = self.moments[index].images
+        if images is None:
+            height, width = self._image_size
+            tile = np.full((height, width, 3), NO_IMAGE, np.uint8)
+        else:
+            tile = images[CAMERA_NAMES.index(name)]
+        height = round(self.tile_width * tile.shape[0] / tile.shape[1])
+        large = cv2.resize(
+            tile, (self.tile_width, height), interpolation=cv2.INTER_LINEAR
+        )
+        pixels = np.asarray(large, np.uint8)
+        write(pixels, [Text(name, 5, 3, 12, PAPER, INK)])
+        return pixels
+
+    @cached_property
+    def _image_size(self) -> tuple[int, int]:
+        """Size of the images that there are, or that of a default rig."""
+        sizes = (m.images.shape[1:3] for m in self.moments if m.images is not None)
+        height, width = next(sizes, (96, 160))
+        return int(height), int(width)
+
+    def _from_above(self, index: int, size: tuple[int, int]) -> Bytes:
+        moment = self.moments[index]
+        plan = None if moment.plan is None else np.asarray(moment.plan, float)
+        trail = self._trail[: index + 1]
+        return self._birdseye.draw(
+            moment.scene, trail, plan, self._infractions(index), size
+        )
+
+    def _captioned(self, picture: Bytes, index: int) -> Bytes:
+        caption = np.full((CAPTION, picture.shape[1], 3), PAPER, np.uint8)
+        words = f"{self.title}   {_state(self.moments[index])}"
+        texts = [Text(words, 6, 7, 15, INK)]
+        done = self._infractions(index)
+        if done:
+            names = list(dict.fromkeys(e.kind.replace("_", " ") for e in done))
+            left = 6 + text_width(words, 15) + 16
+            texts.append(Text(", ".join(names), left, 7, 15, RED))
+        write(caption, texts)
+        return _above([picture, caption])
+
+    def _infractions(self, index: int) -> tuple[Event, ...]:
+        """Infractions up to a moment, each once, in the order they came."""
+        events = (e for moment in self.moments[: index + 1] for e in moment.events)
+        return tuple(dict.fromkeys(e for e in events if e.kind in INFRACTIONS))
+
+    @cached_property
+    def _trail(self) -> Floats:
+        return np.array([(m.scene.ego.x, m.scene.ego.y) for m in self.moments])
+
+    @cached_property
+    def _birdseye(self) -> BirdsEye:
+        return BirdsEye(self.texture, self.route)
+
+
+def _state(moment: Moment) -> str:
+    scene = moment.scene
+    words = f"t = {scene.time_us / 1e6:.2f} s   {scene.ego.speed_mps:.1f} m/s"
+    return words if moment.score is None else f"{words}   score {moment.score:.1f}"
+
+
+def _beside(pictures: list[Bytes]) -> Bytes:
+    gap = np.full((pictures[0].shape[0], GAP, 3), PAPER, np.uint8)
+    parts = [part for picture in pictures for part in (picture, gap)]
+    return np.concatenate(parts[:-1], axis=1)
+
+
+def _above(pictures: list[Bytes]) -> Bytes:
+    gap = np.full((GAP, pictures[0].shape[1], 3), PAPER, np.uint8)
+    parts = [part for picture in pictures for part in (picture, gap)]
+    return np.concatenate(parts[:-1], axis=0)

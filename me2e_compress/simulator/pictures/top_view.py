@@ -1,0 +1,239 @@
+"""The view from above of a paper figure: light, few colours, what matters on top."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.simulator.cameras import GroundTexture, PixelClass
+from me2e_compress.simulator.cameras.texture import RESOLUTION_M
+from me2e_compress.simulator.pictures.canvas import (
+    Canvas,
+    Colour,
+    Text,
+    text_width,
+    write,
+)
+from me2e_compress.simulator.scene import (
+    Actor,
+    ActorKind,
+    Scene,
+    SignalKind,
+    SignalState,
+)
+from me2e_compress.simulator.traffic.events import Event
+
+Bytes = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float64]
+
+GROUND: dict[PixelClass, Colour] = {
+    PixelClass.TERRAIN: (237, 240, 231),
+    PixelClass.SHOULDER: (221, 219, 212),
+    PixelClass.DRIVABLE: (201, 204, 209),
+    PixelClass.LANE_MARKING: (255, 255, 255),
+    PixelClass.STOP_LINE: (255, 255, 255),
+    PixelClass.CROSSWALK: (250, 250, 250),
+}
+ACTORS: dict[ActorKind, Colour] = {
+    ActorKind.PEDESTRIAN: (162, 52, 150),
+    ActorKind.BICYCLE: (0, 134, 139),
+    ActorKind.CONE: (240, 120, 32),
+    ActorKind.BARRIER: (240, 120, 32),
+    ActorKind.EMERGENCY: (196, 60, 60),
+    ActorKind.PARKED: (146, 150, 158),
+}
+VEHICLE: Colour = (96, 104, 118)
+EGO: Colour = (24, 92, 190)
+TRAIL: Colour = (112, 158, 222)
+ROUTE: Colour = (176, 196, 224)
+PLAN: Colour = (226, 88, 22)
+BRAKE: Colour = (220, 32, 36)
+INFRACTION: Colour = (208, 16, 32)
+INK: Colour = (40, 44, 52)
+PAPER: Colour = (255, 255, 255)
+SIGNS: Colour = (204, 24, 34)
+STATES: dict[SignalState, Colour] = {
+    SignalState.RED: (220, 32, 36),
+    SignalState.YELLOW: (232, 172, 16),
+    SignalState.GREEN: (28, 164, 84),
+}
+AHEAD_M, BEHIND_M = 50.0, 22.0
+SCALE_BAR_M = 10.0
+LABEL_PX = 14
+
+
+@dataclass(frozen=True, eq=False)
+class BirdsEye:
+    """Draws moments of one route from above.
+
+    Args:
+        texture: The painted ground; its class raster is drawn, in the figure's colours.
+        route: [N, 2] world points of the route's centre line.
+    """
+
+    texture: GroundTexture
+    route: Floats
+
+    def draw(
+        self,
+        scene: Scene,
+        trail: Floats,
+        plan: Floats | None,
+        events: tuple[Event, ...],
+        size: tuple[int, int],
+    ) -> Bytes:
+        """One moment, uint8 [rows, columns, 3].
+
+        Args:
+            scene: What is there.
+            trail: [N, 2] where the ego was.
+            plan: [6, 2] metres in the ego frame, or None.
+            events: Infractions to mark.
+            size: Rows and columns of the picture; it shows 72 m from top to bottom.
+        """
+        rows, columns = size
+        scale = rows / (AHEAD_M + BEHIND_M)
+        ego = scene.ego
+        anchor = (columns / 2, AHEAD_M * scale)
+        pixels = np.empty((rows, columns, 3), np.uint8)
+        canvas = Canvas(pixels, (ego.x, ego.y), ego.heading, scale, anchor)
+        self._ground(canvas)
+        canvas.line(self.route, ROUTE, 2)
+        if len(trail) > 1:
+            canvas.line(trail, TRAIL, 3)
+        _signals(canvas, scene)
+        for actor in scene.actors:
+            _actor(canvas, actor)
+        corners = canvas.box(ego.x, ego.y, ego.heading, (ego.length, ego.width))
+        _vehicle(canvas, corners, EGO)
+        if plan is not None:
+            _plan(canvas, scene, plan)
+        _infractions(canvas, events)
+        _scale_bar(canvas)
+        return pixels
+
+    @cached_property
+    def _map(self) -> Bytes:
+        """The class raster in the figure's colours, at half its resolution."""
+        palette = np.zeros((256, 3), np.uint8)
+        for kind, colour in GROUND.items():
+            palette[kind] = colour
+        height, width = self.texture.classes.shape
+        return np.asarray(
+            cv2.resize(
+                palette[self.texture.classes],
+                (width // 2, height // 2),
+                interpolation=cv2.INTER_AREA,
+            ),
+            np.uint8,
+        )
+
+    def _ground(self, canvas: Canvas) -> None:
+        texel = 2 * RESOLUTION_M
+        inverse = np.linalg.inv(canvas.axes)  # pixels to metres east and north
+        corner = inverse @ (0.5 - np.array(canvas.anchor)) + canvas.centre
+        corner = corner - (self.texture.west_m, self.texture.north_m)
+        flip = np.array([1.0, -1.0]) / texel
+        affine = np.column_stack([inverse * flip[:, None], corner * flip - 0.5])
+        rows, columns = canvas.pixels.shape[:2]
+        canvas.pixels[:] = cv2.warpAffine(
+            self._map,
+            affine,
+            (columns, rows),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+
+
+def _vehicle(canvas: Canvas, corners: Floats, colour: Colour) -> None:
+    """A box with a lighter windscreen, so that one sees which way it faces."""
+    canvas.polygon(corners, colour)
+    front_left, rear_left, rear_right, front_right = corners
+    edges = (front_left, front_right, front_right, front_left)
+    rears = (rear_left, rear_right, rear_right, rear_left)
+    screen = [
+        edge + part * (rear - edge)
+        for edge, rear, part in zip(edges, rears, (0.2, 0.2, 0.38, 0.38), strict=True)
+    ]
+    shade: Colour = (198, 212, 230)
+    middle = np.mean(screen, axis=0)
+    canvas.polygon(middle + (np.array(screen) - middle) * 0.8, shade)
+
+
+def _actor(canvas: Canvas, actor: Actor) -> None:
+    colour = ACTORS.get(actor.kind, VEHICLE)
+    if actor.kind is ActorKind.PEDESTRIAN:
+        canvas.dot((actor.x, actor.y), PAPER, 5.0)
+        canvas.dot((actor.x, actor.y), colour, 3.5)
+        return
+    size = (actor.length, actor.width)
+    corners = canvas.box(actor.x, actor.y, actor.heading, size)
+    if actor.length < 2.5:
+        canvas.polygon(corners, colour)
+        canvas.line(corners, colour, 1, closed=True)
+        return
+    _vehicle(canvas, corners, colour)
+    if actor.braking:
+        canvas.line(corners[1:3], BRAKE, 3)
+
+
+def _signals(canvas: Canvas, scene: Scene) -> None:
+    for signal in scene.signals:
+        colour = SIGNS if signal.state is None else STATES[signal.state]
+        canvas.line(signal.stop_line, colour, 3)
+        place = (signal.x, signal.y)
+        canvas.dot(place, PAPER, 7.0)
+        if signal.kind is SignalKind.TRAFFIC_LIGHT:
+            canvas.dot(place, colour, 5.0)
+            continue
+        sides = 8 if signal.kind is SignalKind.STOP_SIGN else 3
+        turn = signal.heading + np.pi + (np.pi / 8 if sides == 8 else 0.0)
+        angle = turn + 2 * np.pi * np.arange(sides) / sides
+        ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) * 6.0 / canvas.scale
+        canvas.polygon(ring + place, colour)
+
+
+def _plan(canvas: Canvas, scene: Scene, plan: Floats) -> None:
+    ego = scene.ego
+    cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+    away = plan @ np.array([(cos, sin), (-sin, cos)]) + (ego.x, ego.y)
+    points = np.concatenate([[(ego.x, ego.y)], away])
+    canvas.line(points, PLAN, 2)
+    for point in points[1:]:
+        canvas.dot(point, PAPER, 4.0)
+        canvas.dot(point, PLAN, 3.0)
+
+
+def _infractions(canvas: Canvas, events: tuple[Event, ...]) -> None:
+    """A cross where the ego was, and the name beside it; one of a kind at a place."""
+    rows, columns = canvas.pixels.shape[:2]
+    arm, texts = 7.0 / canvas.scale, list[Text]()
+    for event in events:
+        column, row = canvas.to_pixels((event.x, event.y)).tolist()
+        name = event.kind.replace("_", " ")
+        left = min(column + 12, columns - text_width(name, LABEL_PX) - 4)
+        near = [t for t in texts if np.hypot(t.column - left, t.row - row) < 40]
+        inside = 0 <= column < columns and 0 <= row < rows
+        if not inside or name in (text.content for text in near):
+            continue
+        _cross(canvas, np.array([event.x, event.y]), arm)
+        top = row - LABEL_PX / 2 + (LABEL_PX + 2) * len(near)
+        texts.append(Text(name, left, top, LABEL_PX, INFRACTION, PAPER))
+    write(canvas.pixels, texts)
+
+
+def _cross(canvas: Canvas, place: Floats, arm_m: float) -> None:
+    for colour, width in ((PAPER, 7), (INFRACTION, 3)):
+        for slant in (1.0, -1.0):
+            offset = np.array([arm_m, slant * arm_m])
+            canvas.line((place - offset, place + offset), colour, width)
+
+
+def _scale_bar(canvas: Canvas) -> None:
+    rows = canvas.pixels.shape[0]
+    length = round(SCALE_BAR_M * canvas.scale)
+    cv2.line(canvas.pixels, (10, rows - 12), (10 + length, rows - 12), INK, 2)
+    label = Text(f"{SCALE_BAR_M:g} m", 12, rows - 30, 13, INK, PAPER)
+    write(canvas.pixels, [label])

@@ -1,0 +1,135 @@
+"""Routes and their manifest: a JSON list of objects."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+
+Parameter = bool | int | float | str
+
+SHIPPED = Path(__file__).with_name("routes_220.json")
+"""The routes that ship: 44 scenario types, 5 variants each."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """One route: a scenario type and everything that decides how it unfolds.
+
+    Args:
+        id: Unique in its manifest; letters, digits, ``_`` and ``-``.
+        scenario: One of the 44 types (`abilities.SCENARIO_ABILITIES`).
+        ability: The first ability that Bench2Drive counts the type under.
+        seed: Decides every parameter that is not given.
+        parameters: Values by name; what is given here is not drawn from the seed,
+            so editing one changes that one and nothing else.
+
+    Raises:
+        EvaluationError: An id that is no file name, or an unknown scenario.
+    """
+
+    id: str
+    scenario: str
+    ability: str
+    seed: int
+    parameters: dict[str, Parameter] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what no world could be built from."""
+        if not self.id or not all(c.isalnum() or c in "_-" for c in self.id):
+            raise EvaluationError(
+                f"route id {self.id!r}: only letters, digits, '_' and '-' are allowed"
+            )
+        known = SCENARIO_ABILITIES.get(self.scenario)
+        if known is None:
+            raise EvaluationError(
+                f"route {self.id}: no scenario {self.scenario!r}; there are "
+                f"{', '.join(sorted(SCENARIO_ABILITIES))}"
+            )
+        if self.ability not in known:
+            raise EvaluationError(
+                f"route {self.id}: {self.scenario} tests {' and '.join(known)}, "
+                f"not {self.ability!r}"
+            )
+
+    @property
+    def abilities(self) -> tuple[str, ...]:
+        """Every ability that the scenario type counts under."""
+        return SCENARIO_ABILITIES[self.scenario]
+
+
+_MANIFEST = TypeAdapter(list[Route])
+
+
+def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
+    """Read a manifest.
+
+    Raises:
+        EvaluationError: The file is missing, is no manifest, or repeats an id.
+    """
+    try:
+        routes = _MANIFEST.validate_json(path.read_bytes(), strict=True)
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise EvaluationError(f"{path}: {where}: {first['msg']}") from error
+    seen: dict[str, int] = {}
+    for index, route in enumerate(routes):
+        if route.id in seen:
+            raise EvaluationError(
+                f"{path}: routes {seen[route.id]} and {index} share the id {route.id}"
+            )
+        seen[route.id] = index
+    return tuple(routes)
+
+
+def save_routes(routes: Sequence[Route], path: Path) -> None:
+    """Write a manifest atomically, one route a line.
+
+    Raises:
+        EvaluationError: The file cannot be written.
+    """
+    lines = ",\n".join(json.dumps(asdict(route)) for route in routes)
+    try:
+        write_bytes(path, f"[\n{lines}\n]\n".encode())
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def pick_routes(routes: Sequence[Route], which: str) -> tuple[Route, ...]:
+    """The routes that ``which`` asks for.
+
+    Args:
+        routes: What there is.
+        which: ``all``, a number N (N routes spread evenly over the manifest), or
+            ids separated by commas.
+
+    Raises:
+        EvaluationError: An id that is not there, or a number that is too large.
+    """
+    if which == "all":
+        return tuple(routes)
+    if which.isdecimal():
+        count = int(which)
+        if not 0 < count <= len(routes):
+            raise EvaluationError(
+                f"{which} routes were asked for; there are {len(routes)}"
+            )
+        return tuple(routes[i * len(routes) // count] for i in range(count))
+    by_id = {route.id: route for route in routes}
+    picked = list[Route]()
+    for name in which.split(","):
+        if name.strip() not in by_id:
+            raise EvaluationError(
+                f"no route {name.strip()!r}; there are {len(by_id)}, "
+                f"for example {next(iter(by_id), 'none')}"
+            )
+        picked.append(by_id[name.strip()])
+    return tuple(picked)

@@ -1,0 +1,199 @@
+"""Junctions of up to four arms, named as the ego sees them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from me2e_compress.simulator.plane_geometry import Command, LaneMarking, Point
+from me2e_compress.simulator.scenarios.layouts.streets import (
+    origin,
+    start_speed,
+)
+from me2e_compress.simulator.scene import SignalKind, SignalState
+from me2e_compress.simulator.traffic.legs import Leg
+from me2e_compress.simulator.traffic.network import (
+    LANE_WIDTH_M,
+    PLAIN,
+    LaneIndex,
+    Network,
+    Pose,
+    Section,
+)
+from me2e_compress.simulator.traffic.signals import Regulator
+from me2e_compress.simulator.traffic.stage import Stage
+
+ARMS = ("ahead", "left", "back", "right")
+"""Counter-clockwise; the ego comes from "back"."""
+_TURNS = {"left": Command.LEFT, "right": Command.RIGHT, "ahead": Command.STRAIGHT}
+HALF_M = 12.0
+"""Half the side of a one-lane junction: a right turn of 10 m radius, which the ego's
+bicycle (7.6 m at full lock) can drive."""
+ARM_M = 130.0
+SETBACK_M = 3.0
+"""The stop line is this far before the junction (a crosswalk lies between)."""
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A finished junction.
+
+    Attributes:
+        network: Where it lies.
+        centre: Its middle, heading of the ego as it comes.
+        half_m: Half its side.
+        lanes: Lanes of each arm in each direction.
+        move: Where the ego goes: ahead, left or right.
+        approach_m: Route from the ego's start to the junction's edge.
+        signals: The regulator of each arm that has one.
+    """
+
+    network: Network
+    centre: Pose
+    half_m: float
+    lanes: int
+    move: str
+    approach_m: float
+    signals: dict[str, Regulator]
+
+    def way(self, origin: str, to: str, lane: int = 0) -> list[LaneIndex]:
+        """The chain of lanes from one arm to another."""
+        turn = (ARMS.index(to) - ARMS.index(origin)) % 4
+        entry = {1: self.lanes - 1, 2: lane, 3: 0}[turn]
+        inside = lane if turn == 2 else 0
+        return [
+            (f"{origin}.far", f"{origin}.in", entry),
+            (f"{origin}.in", f"{to}.out", inside),
+            (f"{to}.out", f"{to}.end", entry),
+        ]
+
+    def arm(self, name: str, out_m: float, left_m: float = 0.0) -> Pose:
+        """A place on an arm, ``out_m`` outside the junction, heading outwards.
+
+        ``left_m`` is measured from the arm's centre line.
+        """
+        angle = ARMS.index(name) * math.pi / 2
+        return self.centre.turned(angle).moved(self.half_m + out_m, left_m)
+
+
+def junction(
+    stage: Stage,
+    move: str,
+    sign: SignalKind | None = None,
+    arms: Sequence[str] = ARMS,
+    lanes: int = 1,
+    limit_mps: float = 13.0,
+) -> Crossing:
+    """A junction without lights; ``sign`` stands on the ego's arm."""
+    stage.layout = "junction"
+    crossing = _crossing(stage, move, arms, lanes, limit_mps)
+    if sign is not None:
+        line = _stop_line(crossing, "back")
+        width = lanes * LANE_WIDTH_M
+        crossing.signals["back"] = stage.regulate(sign, line, width_m=width)
+    return crossing
+
+
+def signal_junction(
+    stage: Stage, move: str, ego_light: SignalState = SignalState.GREEN
+) -> Crossing:
+    """A junction with lights; cross traffic has red where the ego has green."""
+    crossing = junction(stage, move)
+    stage.layout = "signal_junction"
+    green = ego_light is SignalState.GREEN
+    cross = SignalState.RED if green else SignalState.GREEN
+    for arm in ARMS:
+        state = ego_light if arm in ("back", "ahead") else cross
+        crossing.signals[arm] = stage.regulate(
+            SignalKind.TRAFFIC_LIGHT, _stop_line(crossing, arm), state
+        )
+    return crossing
+
+
+def t_junction(stage: Stage, move: str) -> Crossing:
+    """A side road that ends at a through road; the ego gives way and turns."""
+    crossing = junction(stage, move, SignalKind.GIVE_WAY, ("left", "back", "right"))
+    stage.layout = "t_junction"
+    return crossing
+
+
+def interurban_turnoff(stage: Stage) -> Crossing:
+    """A fast two-way road with a side road to the left, which the ego takes."""
+    arms = ("ahead", "left", "back")
+    crossing = junction(stage, "left", arms=arms, limit_mps=16.0)
+    stage.layout = "interurban_turnoff"
+    return crossing
+
+
+def interurban_entry(stage: Stage) -> Crossing:
+    """A side road that ends at a four-lane road; the ego turns left into it."""
+    arms, sign = ("left", "back", "right"), SignalKind.GIVE_WAY
+    crossing = junction(stage, "left", sign, arms, lanes=2, limit_mps=14.0)
+    stage.layout = "interurban_entry"
+    return crossing
+
+
+def crosswalk_on(stage: Stage, crossing: Crossing, arm: str) -> None:
+    """Paint a crosswalk across an arm."""
+    half = crossing.lanes * LANE_WIDTH_M
+    corners = [
+        crossing.arm(arm, out, left)
+        for out, left in ((0.5, half), (3.5, half), (3.5, -half), (0.5, -half))
+    ]
+    a, b, c, d = ((corner.x, corner.y) for corner in corners)
+    walk: tuple[Point, Point, Point, Point] = (a, b, c, d)
+    stage.crosswalks.append(walk)
+
+
+def _stop_line(crossing: Crossing, arm: str) -> Pose:
+    """Across the lanes that come in, heading inwards."""
+    across = crossing.lanes * LANE_WIDTH_M / 2
+    return crossing.arm(arm, SETBACK_M + 1.0, across).turned(math.pi)
+
+
+def _crossing(
+    stage: Stage, move: str, arms: Sequence[str], lanes: int, limit_mps: float
+) -> Crossing:
+    approach = stage.uniform("approach_m", 55.0, 70.0)
+    half = HALF_M + (lanes - 1) * LANE_WIDTH_M
+    centre = origin(stage).moved(approach + half)
+    crossing = Crossing(stage.network, centre, half, lanes, move, approach, {})
+    section = Section(lanes=lanes, limit_mps=limit_mps)
+    section = replace(section, left=LaneMarking.SOLID)
+    for arm in arms:
+        _arm(crossing, arm, section)
+    for start in arms:
+        for end in arms:
+            if start != end:
+                _connect(crossing, start, end, limit_mps)
+    incoming, inside, outgoing = crossing.way("back", move)
+    begin = stage.network.length(incoming) - approach
+    legs = [Leg(incoming, enter_m=begin), Leg(inside, _TURNS[move]), Leg(outgoing)]
+    stage.drive(legs, start_speed(stage))
+    return crossing
+
+
+def _arm(crossing: Crossing, name: str, section: Section) -> None:
+    network, half_lane = crossing.network, LANE_WIDTH_M / 2
+    away = crossing.arm(name, 0.0, -half_lane)
+    network.straight(f"{name}.out", f"{name}.end", away, ARM_M, section)
+    towards = crossing.arm(name, ARM_M, half_lane).turned(math.pi)
+    network.straight(f"{name}.far", f"{name}.in", towards, ARM_M, section)
+
+
+def _connect(crossing: Crossing, start: str, end: str, limit_mps: float) -> None:
+    network, lanes = crossing.network, crossing.lanes
+    first = crossing.arm(start, 0.0, LANE_WIDTH_M / 2).turned(math.pi)
+    here, there = f"{start}.in", f"{end}.out"
+    turn = (ARMS.index(end) - ARMS.index(start)) % 4
+    inside = replace(PLAIN, limit_mps=limit_mps)
+    if turn == 2:
+        through = replace(inside, lanes=lanes, between=LaneMarking.NONE)
+        network.straight(here, there, first, 2 * crossing.half_m, through)
+    elif turn == 1:
+        aside = (lanes - 0.5) * LANE_WIDTH_M
+        outer = first.moved(0.0, -(lanes - 1) * LANE_WIDTH_M)
+        radius = crossing.half_m - aside
+        network.arc(here, there, outer, radius, -math.pi / 2, inside)
+    else:
+        radius = crossing.half_m + LANE_WIDTH_M / 2
+        network.arc(here, there, first, radius, math.pi / 2, inside)

@@ -1,0 +1,137 @@
+"""People on foot and on bicycles who cross the ego's way."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
+from me2e_compress.simulator.scenarios.scripts.synchronise import steps_out
+from me2e_compress.simulator.scene import ActorKind
+from me2e_compress.simulator.traffic.bodies import Walker
+from me2e_compress.simulator.traffic.network import LANE_WIDTH_M
+from me2e_compress.simulator.traffic.stage import Script, Stage
+
+HALF_LANE_M = LANE_WIDTH_M / 2
+
+
+def walker_behind_van(stage: Stage) -> Script:
+    """A pedestrian walks out from behind a van that stands at the kerb."""
+    s = stage.uniform("crossing_m", 60.0, 85.0)
+    speed = stage.uniform("walk_mps", 1.5, 2.5)
+    van = stage.route_pose(s - 5.0, -(HALF_LANE_M + 1.1))
+    stage.thing(ActorKind.VAN, van)
+    walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.2), 6.5)
+    yield from steps_out(stage, walker, s, HALF_LANE_M + 2.2)
+    stage.fire("walker_behind_van", walker)
+
+
+def walker_between_cars(stage: Stage) -> Script:
+    """A pedestrian steps out between two parked cars."""
+    s = stage.uniform("crossing_m", 60.0, 85.0)
+    speed = stage.uniform("walk_mps", 1.4, 2.2)
+    for aside in (-16.5, -10.0, -3.3, 3.3, 9.9):
+        pose = stage.route_pose(s + aside, -(HALF_LANE_M + 1.3))
+        stage.thing(ActorKind.PARKED, pose)
+    walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.4), 7.0)
+    yield from steps_out(stage, walker, s, HALF_LANE_M + 2.4)
+    stage.fire("walker_between_cars", walker)
+
+
+def walkers_on_zebra(stage: Stage) -> Script:
+    """Two to four people cross at the crosswalk from both sides."""
+    s = float(stage.parameters["crosswalk_m"])
+    count = stage.integer("walkers", 2, 4)
+    walkers = list[Walker]()
+    for k in range(count):
+        speed = stage.uniform(f"walk_{k}_mps", 1.2, 1.7)
+        near = k % 2 == 0
+        start = -(HALF_LANE_M + 1.6) if near else HALF_LANE_M + LANE_WIDTH_M + 1.2
+        end = HALF_LANE_M + LANE_WIDTH_M + 2.0 if near else -(HALF_LANE_M + 2.0)
+        walkers.append(_across_route(stage, s + 0.7 * (k - 1), speed, start, end))
+    yield from steps_out(stage, walkers[0], s, HALF_LANE_M + 1.6)
+    for walker in walkers:
+        walker.going = True
+    stage.fire("walkers_on_zebra", walkers[0])
+
+
+def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:
+    """While the ego turns, three pedestrians cross the arm that it turns into."""
+    speed = stage.uniform("walk_mps", 1.3, 2.0)
+    row = _row(stage, crossing, ActorKind.PEDESTRIAN, speed, LANE_WIDTH_M + 1.5, 3, 1.3)
+    yield from _set_off(stage, row, 1, "pedestrians_on_exit")
+
+
+def cyclists_on_exit(stage: Stage, crossing: Crossing) -> Script:
+    """While the ego turns, three cyclists cross the arm that it turns into."""
+    speed = stage.uniform("ride_mps", 2.8, 4.0)
+    row = _row(stage, crossing, ActorKind.BICYCLE, speed, LANE_WIDTH_M + 4.0, 3, 2.4)
+    yield from _set_off(stage, row, 1, "cyclists_on_exit")
+
+
+def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
+    """A long row of cyclists crosses the arm that the ego turns into."""
+    speed = stage.uniform("ride_mps", 3.0, 4.0)
+    count = stage.integer("cyclists", 4, 7)
+    spacing = stage.uniform("spacing_m", 2.6, 3.6)
+    start = LANE_WIDTH_M + 4.0
+    row = _row(stage, crossing, ActorKind.BICYCLE, speed, start, count, spacing)
+    yield from _set_off(stage, row, 1, "bicycle_stream")
+
+
+@dataclass(frozen=True)
+class Row:
+    """People behind each other.
+
+    Attributes:
+        people: The first one first.
+        reach_m: How far each walks to the middle of the ego's lane.
+        route_s: Where that is on the route.
+    """
+
+    people: list[Walker]
+    reach_m: list[float]
+    route_s: float
+
+
+def _row(
+    stage: Stage,
+    crossing: Crossing,
+    kind: ActorKind,
+    speed: float,
+    start_m: float,
+    count: int,
+    spacing_m: float,
+) -> Row:
+    """People who cross the arm that the ego leaves by, from a drawn side."""
+    side = -1.0 if stage.choice("side", ("right", "left")) == "right" else 1.0
+    out_m = 2.0 if kind is ActorKind.PEDESTRIAN else 3.0
+    target = crossing.arm(crossing.move, out_m, -HALF_LANE_M)
+    s, _ = stage.path.project(target.x, target.y)
+    row = Row([], [], s)
+    for k in range(count):
+        start = start_m + spacing_m * k
+        end = LANE_WIDTH_M + 3.0 + spacing_m * (count - k)
+        begin = crossing.arm(crossing.move, out_m, side * start)
+        stop = crossing.arm(crossing.move, out_m, -side * end)
+        line = np.array([[begin.x, begin.y], [stop.x, stop.y]])
+        row.people.append(stage.walker(kind, line, speed))
+        row.reach_m.append(start + side * HALF_LANE_M)
+    return row
+
+
+def _set_off(stage: Stage, row: Row, timed: int, name: str) -> Script:
+    """Send a row off so that one of them meets the ego."""
+    who = row.people[timed]
+    yield from steps_out(stage, who, row.route_s, row.reach_m[timed])
+    for walker in row.people:
+        walker.going = True
+    stage.fire(name, who)
+
+
+def _across_route(
+    stage: Stage, s_m: float, speed: float, from_m: float, to_m: float
+) -> Walker:
+    """Somebody who crosses the route at a right angle, offsets to the left."""
+    begin, end = stage.route_pose(s_m, from_m), stage.route_pose(s_m, to_m)
+    line = np.array([[begin.x, begin.y], [end.x, end.y]])
+    return stage.walker(ActorKind.PEDESTRIAN, line, speed)

@@ -1,0 +1,216 @@
+"""Traffic that the ego must give way to, cross or join."""
+
+from me2e_compress.simulator.scenarios.layouts.circle import ring_way
+from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
+from me2e_compress.simulator.scenarios.layouts.ramps import Ramp
+from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.scripts.synchronise import (
+    arrive_together,
+    meeting,
+    on_chain,
+    release,
+)
+from me2e_compress.simulator.scene import SignalKind
+from me2e_compress.simulator.traffic.cars import Car, Manners
+from me2e_compress.simulator.traffic.network import LaneIndex
+from me2e_compress.simulator.traffic.signals import Regulator
+from me2e_compress.simulator.traffic.stage import Script, Stage
+
+HEEDLESS = Manners(sees_ego=False)
+DENSE = Manners(headway_s=0.8, jam_gap_m=3.0)
+
+
+def oncoming_platoon(stage: Stage, crossing: Crossing) -> Script:
+    """Oncoming traffic goes straight on while the ego wants to turn left."""
+    cars = stage.integer("cars", 2, 4)
+    chain = crossing.way("ahead", "back")
+    yield from _platoon(stage, chain, cars, "oncoming_platoon")
+
+
+def platoon_from_left(stage: Stage, crossing: Crossing) -> Script:
+    """Cars from the left drive straight into the arm that the ego turns into."""
+    cars = stage.integer("cars", 2, 4)
+    chain = crossing.way("left", "right")
+    yield from _platoon(stage, chain, cars, "platoon_from_left", _sign(crossing))
+
+
+def platoon_to_enter(stage: Stage, crossing: Crossing) -> Script:
+    """Cars from the right go where the ego turns left to: it joins their flow."""
+    cars = stage.integer("cars", 2, 4)
+    chain = crossing.way("right", "left")
+    yield from _platoon(stage, chain, cars, "platoon_to_enter", _sign(crossing))
+
+
+def priority_car(stage: Stage, crossing: Crossing) -> Script:
+    """One car, from a drawn side, that has the right of way."""
+    side = stage.choice("from", ("left", "right"))
+    other = "right" if side == "left" else "left"
+    chain = crossing.way(side, other)
+    if crossing.move == "right" and side == "right":
+        chain = crossing.way("left", "right")
+    yield from _platoon(stage, chain, 1, "priority_car", _sign(crossing))
+
+
+def crossing_car(stage: Stage, crossing: Crossing) -> Script:
+    """A car from the side that must wait, and does not."""
+    side = stage.choice("from", ("left", "right"))
+    chain = crossing.way(side, "right" if side == "left" else "left")
+    yield from _platoon(stage, chain, 1, "crossing_car")
+
+
+def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
+    """A platoon from the left and, a little later, cars from the right."""
+    late = stage.uniform("late_m", 8.0, 16.0)
+    other = crossing.way("right", "left", crossing.lanes - 1)
+    route_s, station = meeting(stage, other)
+    cars = 2 if crossing.move == "left" else 1
+    begin = max(station - route_s - late, 0.0)
+    for k in range(cars):
+        lanes, local = on_chain(stage.network, other, max(begin - 14.0 * k, 0.0))
+        stage.car(lanes, local, float(stage.ego.speed), manners=DENSE)
+    chain = crossing.way("left", "right", crossing.lanes - 1)
+    yield from _platoon(
+        stage,
+        chain,
+        stage.integer("cars", 2, 3),
+        "flows_from_both_sides",
+        _sign(crossing),
+    )
+
+
+def near_and_far_flow(stage: Stage, crossing: Crossing) -> Script:
+    """Fast traffic from the left to cross, slower from the right to join."""
+    far = crossing.way("right", "left", 0)
+    route_s, station = meeting(stage, far)
+    late = stage.uniform("late_m", 20.0, 30.0)
+    for k in range(2):
+        s = max(station - route_s - late - 15.0 * k, 0.0)
+        lanes, local = on_chain(stage.network, far, s)
+        stage.car(lanes, local, 9.0, 10.0, manners=DENSE)
+    chain = crossing.way("left", "right", 1)
+    cars = stage.integer("cars", 3, 5)
+    yield from _platoon(stage, chain, cars, "near_and_far_flow", _sign(crossing))
+
+
+def ring_flow(stage: Stage, sign: Regulator) -> Script:
+    """Cars circulate past the entry at which the ego waits."""
+    to = stage.choice("flow_to", ("right", "ahead"))
+    cars = stage.integer("cars", 2, 4)
+    yield from _platoon(stage, ring_way("left", to), cars, "ring_flow", sign)
+
+
+def exit_lane_flow(stage: Stage, ramp: Ramp) -> Script:
+    """Cars beside the ego, in the lane that it must cross to reach the exit."""
+    yield from _beside(
+        stage, ramp.main.ahead(1), 60.0, ramp.merge_s, "exit_lane_flow", 3
+    )
+
+
+def side_flows(stage: Stage, street: Street) -> Script:
+    """A car beside the ego at its first change, others in the lanes beyond."""
+    for lane in (2, 3):
+        ahead = stage.uniform(f"lane_{lane}_m", 8.0, 25.0) * (lane * 2 - 5)
+        chain, s = on_chain(
+            stage.network, street.ahead(lane), street.start_m + 20.0 + ahead
+        )
+        stage.car(chain, s, float(stage.ego.speed), manners=DENSE)
+    change = float(stage.parameters["first_m"]) + 12.5
+    yield from _beside(stage, street.ahead(1), 60.0, change, "side_flows", 2)
+
+
+def bay_flow(stage: Stage, street: Street) -> Script:
+    """Cars pass the parking bay that the ego wants to leave."""
+    chain = street.ahead(0)
+    route_s, _ = meeting(stage, chain)
+    begin = street.start_m - stage.uniform("behind_m", 3.0, 6.0)
+    lead = stage.car(chain, begin, 3.0, manners=HEEDLESS)
+    for k in range(stage.integer("followers", 1, 3)):
+        stage.car(chain, begin - 11.0 * (k + 1), 3.0, 8.0, manners=DENSE)
+    while stage.ahead_m(route_s) > 9.0:
+        _keep_beside(stage, lead, 0.0, 3.0)
+        yield
+    stage.fire("bay_flow", lead)
+    while stage.ahead_m(route_s) > -6.0 and stage.gap_m(lead) < 0.0:
+        _keep_beside(stage, lead, 0.0, 3.5)
+        yield
+    release(lead, 8.0)
+
+
+def _platoon(
+    stage: Stage,
+    chain: list[LaneIndex],
+    cars: int,
+    name: str,
+    sign: Regulator | None = None,
+) -> Script:
+    """A row of cars whose first one meets the ego, then drive on by IDM."""
+    route_s, station = meeting(stage, chain)
+    ratio = stage.uniform("flow_ratio", 0.9, 1.05)
+    gap = stage.uniform("flow_gap_m", 11.0, 15.0)
+    speed = float(stage.ego.speed)
+    row = list[Car]()
+    for k in range(cars):
+        s = station - ratio * route_s - gap * k
+        if s < 0:
+            break
+        lanes, local = on_chain(stage.network, chain, s)
+        manners = DENSE if k else HEEDLESS
+        row.append(stage.car(lanes, local, speed, 9.0, manners=manners))
+    points = [meeting(stage, car.lanes) for car in row]
+    if sign is not None and sign.kind is SignalKind.GIVE_WAY:
+        sign.nearest_s = lambda: _nearest(row, [at for _, at in points])
+        sign.conflict_s = route_s - 1.0
+    yield from arrive_together(stage, row[0], route_s, points[0][1], name)
+
+
+def _beside(
+    stage: Stage,
+    chain: list[LaneIndex],
+    start_m: float,
+    change_s: float,
+    name: str,
+    cars: int,
+) -> Script:
+    """Keep a car beside the ego until shortly before it changes lanes."""
+    speed = float(stage.ego.speed)
+    aside = stage.uniform("beside_m", -1.5, 1.5)
+    row = [
+        stage.car(chain, start_m + aside - 13.0 * k, speed, manners=DENSE)
+        for k in range(cars)
+    ]
+    lead = row[0]
+    lead.manners = HEEDLESS
+    while stage.ahead_m(change_s) > 22.0:
+        _keep_beside(stage, lead, aside)
+        yield
+    stage.fire(name, lead)
+    steady = float(stage.ego.speed)
+    while stage.ahead_m(change_s) > -14.0 and abs(stage.gap_m(lead)) < 12.0:
+        lead.forced_mps2 = min(max((steady - lead.speed) / 0.3, -3.0), 3.0)
+        yield
+    release(lead, max(steady, 7.0))
+
+
+def _keep_beside(
+    stage: Stage, car: Car, aside_m: float, slowest_mps: float = 0.0
+) -> None:
+    """Hold a car level with the ego, ``aside_m`` before it."""
+    pose = car.pose
+    s, _ = stage.path.project(pose.x, pose.y, stage.ego_s)
+    error = s - stage.ego_s - aside_m
+    wanted = max(stage.ego.speed - 0.8 * error, slowest_mps)
+    car.forced_mps2 = min(max((wanted - car.speed) / 0.3, -6.0), 5.0)
+
+
+def _sign(crossing: Crossing) -> Regulator | None:
+    return crossing.signals.get("back")
+
+
+def _nearest(row: list[Car], stations: list[float]) -> float:
+    """Seconds until the next car of a row is at its meeting point."""
+    soonest = float("inf")
+    for car, station in zip(row, stations, strict=True):
+        left = station - car.station_m
+        if not car.gone and left > -car.LENGTH / 2:
+            soonest = min(soonest, max(left, 0.0) / max(car.speed, 1.0))
+    return soonest

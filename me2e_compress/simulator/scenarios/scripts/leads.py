@@ -1,0 +1,190 @@
+"""Cars before the ego: braking, pulling out, cutting in, crawling."""
+
+from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
+from me2e_compress.simulator.scenarios.layouts.ramps import Ramp
+from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.scripts.synchronise import (
+    hold,
+    on_chain,
+    patience,
+    release,
+    stand,
+)
+from me2e_compress.simulator.scene import ActorKind
+from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.network import (
+    LANE_WIDTH_M,
+    LaneIndex,
+    Pose,
+)
+from me2e_compress.simulator.traffic.stage import Script, Stage
+
+CRAWL_S = 14.0
+"""How long whoever cut in crawls: long enough for a driver at 4 m/s to reach them."""
+AWAY_MPS = 10.0
+
+
+def hard_brake(stage: Stage, street: Street) -> Script:
+    """The car ahead keeps its distance, then brakes to a stop and waits."""
+    gap = stage.uniform("gap_m", 13.0, 18.0)
+    where = stage.uniform("brake_m", 35.0, 60.0)
+    hardest = stage.uniform("brake_mps2", 5.0, 7.0)
+    lanes = street.ahead(street.lane)
+    speed = float(stage.ego.speed)
+    car = stage.car(lanes, street.start_m + gap + 5.0, speed)
+    while stage.ahead_m(where) > 0:
+        error = stage.gap_m(car) - gap
+        wanted = max(stage.ego.speed - 0.5 * error, 0.0)
+        car.forced_mps2 = min(max((wanted - car.speed) / 0.5, -5.0), 4.0)
+        yield
+    stage.fire("hard_brake", car)
+    car.forced_mps2 = -hardest
+    waited = 0.0
+    while waited < 1.5:
+        yield
+        waited = waited + 0.1 if stage.ego.speed < 0.5 or stage.gap_m(car) < -9 else 0.0
+    release(car, AWAY_MPS)
+
+
+def pull_out(stage: Stage, street: Street) -> Script:
+    """A parked car pulls out before the ego and crawls."""
+    s = stage.uniform("pull_out_m", 55.0, 75.0)
+    lead_s = stage.uniform("lead_s", 3.0, 3.6)
+    for aside in (-13.0, -6.5, 14.0, 20.5):
+        _park(stage, s + aside)
+    lanes, local = on_chain(stage.network, street.road.shoulder(), street.start_m + s)
+    car = stage.car(lanes, local, 0.0)
+    stand(car)
+    while stage.arrival_s(s - 2.0) > lead_s:
+        yield
+    yield from _cut_in(stage, car, street.ahead(street.lane), 1, "pull_out", 2.2)
+
+
+def queue_cut_in(stage: Stage, street: Street) -> Script:
+    """Out of a standing queue in the next lane, somebody moves over."""
+    s = stage.uniform("cut_in_m", 55.0, 75.0)
+    lead_s = stage.uniform("lead_s", 3.0, 3.6)
+    lane = street.other_lane()
+    chain = street.ahead(lane)
+    cutter: Car | None = None
+    for aside in (-14.0, -7.0, 0.0, 11.0, 18.0):
+        lanes, local = on_chain(stage.network, chain, street.start_m + s + aside)
+        car = stage.car(lanes, local, 0.0)
+        stand(car)
+        cutter = car if aside == 0.0 else cutter
+    while stage.arrival_s(s - 2.0) > lead_s:
+        yield
+    if cutter is not None:
+        side = 1 if street.lane < lane else -1
+        yield from _cut_in(
+            stage, cutter, street.ahead(street.lane), side, "queue_cut_in", 2.2
+        )
+
+
+def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
+    """A car from the on-ramp merges right before the ego and crawls."""
+    gap = stage.uniform("gap_m", 9.0, 13.0)
+    car = stage.car(ramp.ramp, 75.0, float(stage.ego.speed))
+    stand_off = 0.0
+    while car.leg < 3 or not 4.0 < stand_off < gap + 3.0:
+        stand_off = stage.gap_m(car)
+        wanted = max(stage.ego.speed + 0.6 * (gap - stand_off), 0.0)
+        late = car.leg == 3 and car.lane_s > 40.0
+        wanted = 0.0 if late and stand_off < 0 else wanted
+        car.forced_mps2 = min(max((wanted - car.speed) / 0.4, -6.0), 4.0)
+        yield
+    car.forced_mps2 = None
+    main = ramp.main.ahead(1)
+    yield from _cut_in(stage, car, main, 1, "ramp_cut_in", 2.0)
+
+
+def slow_queue(stage: Stage, lane: list[LaneIndex], merge_m: float) -> Script:
+    """The lane that the ego must enter is full of crawling cars.
+
+    They speed up a while after the ego has come in among or behind them.
+    """
+    speed = stage.uniform("queue_mps", 1.6, 2.2)
+    spacing = stage.uniform("queue_spacing_m", 8.5, 10.0)
+    first = merge_m + 30.0
+    for k in range(10):
+        s = first - spacing * k
+        if s > 0:
+            lanes, local = on_chain(stage.network, lane, s)
+            stage.car(lanes, local, speed, speed)
+    queue = [body for body in stage.bodies if isinstance(body, Car)]
+    while min(abs(stage.gap_m(car)) for car in queue) > 15.0:
+        yield
+    stage.fire("slow_queue", queue[-1])
+    while stage.ego.speed > 3.0:
+        yield
+    yield from hold(stage, 8.0)
+    for car in queue:
+        car.target_speed = 7.0
+
+
+def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
+    """The light has turned green, but the queue before the ego still sleeps."""
+    line = crossing.signals["back"].line_s or crossing.approach_m
+    count = stage.integer("queue", 1, 3)
+    chain = crossing.way("back", crossing.move)
+    begin = stage.network.length(chain[0]) - crossing.approach_m
+    queue = [stage.car(chain, begin + line - 3.5 - 7.0 * k, 0.0) for k in range(count)]
+    for car in queue:
+        stand(car)
+    tail = line - 3.5 - 7.0 * (count - 1) - 2.5
+    while stage.ahead_m(tail) > 35.0:
+        yield
+    stage.fire("queue_at_light", queue[-1])
+    yield from patience(stage, tail, 12.0, 0.5)
+    for car in queue:
+        release(car, AWAY_MPS)
+        yield from hold(stage, 0.8)
+
+
+def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
+    """A truck stands where the ego wants to leave the junction."""
+    chain = crossing.way("back", crossing.move)
+    into = stage.uniform("into_m", 1.0, 5.0)
+    truck = stage.car(chain[2:], into + 2.0, 0.0, kind=ActorKind.TRUCK)
+    stand(truck)
+    pose = truck.pose
+    s, _ = stage.path.project(pose.x, pose.y)
+    while stage.ahead_m(s) > 40.0:
+        yield
+    stage.fire("blocked_exit", truck)
+    yield from patience(stage, s - truck.LENGTH / 2, 30.0, 1.5)
+    release(truck, AWAY_MPS)
+
+
+def _cut_in(
+    stage: Stage, car: Car, lanes: list[LaneIndex], side: int, name: str, crawl: float
+) -> Script:
+    """Move into the ego's lane, crawl there, drive off."""
+    stage.fire(name, car)
+    target, _ = on_chain(stage.network, lanes, _s_along(stage, lanes, car.pose))
+    car.change_lane(target, side)
+    release(car, crawl)
+    until = stage.time_s + CRAWL_S
+    waited = 0.0
+    while waited < 2.0 and stage.time_s < until:
+        yield
+        if car.speed > crawl + 1.0:
+            car.forced_mps2 = -5.0
+        else:
+            car.forced_mps2 = None
+        close = 0 < stage.gap_m(car) < 12.0 and stage.ego.speed < crawl + 0.7
+        waited = waited + 0.1 if close or stage.gap_m(car) < -9 else 0.0
+    car.indicator = 0
+    release(car, AWAY_MPS)
+
+
+def _s_along(stage: Stage, lanes: list[LaneIndex], pose: Pose) -> float:
+    """Arc length along a chain nearest to a pose, on its first lane."""
+    lane = stage.network.lane(lanes[0])
+    return float(lane.local_coordinates([pose.x, -pose.y])[0])
+
+
+def _park(stage: Stage, s_m: float) -> None:
+    """A parked car in the lane beside the route's."""
+    side = -(LANE_WIDTH_M / 2 + 1.25)
+    stage.thing(ActorKind.PARKED, stage.route_pose(s_m, side))

@@ -1,0 +1,136 @@
+"""Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
+
+from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.scripts.synchronise import (
+    NEAR_M,
+    met,
+    on_chain,
+)
+from me2e_compress.simulator.scene import ActorKind
+from me2e_compress.simulator.traffic.cars import Car
+from me2e_compress.simulator.traffic.network import LANE_WIDTH_M
+from me2e_compress.simulator.traffic.stage import Script, Stage
+
+
+def free_side(stage: Stage) -> float:
+    """+1 if the lane to pass by lies to the left of the route, -1 to the right."""
+    here = round(float(stage.parameters.get("obstacle_m", 60.0)))
+    left = float(stage.path.oncoming_m[here])
+    return 1.0 if left > LANE_WIDTH_M else -1.0
+
+
+def crashed_cars(stage: Stage) -> Script:
+    """Two cars stand askew in the lane after an accident, a police van before them."""
+    s = stage.uniform("obstacle_m", 62.0, 80.0)
+    for k, name in enumerate(("first", "second")):
+        askew = stage.uniform(f"{name}_askew_rad", -0.35, 0.35)
+        aside = -0.4 * free_side(stage)
+        place = stage.route_pose(s + 8.0 + 7.0 * k, aside)
+        stage.thing(ActorKind.PARKED, place.turned(askew))
+    stage.thing(ActorKind.EMERGENCY, stage.route_pose(s))
+    yield from met(stage, s, "crashed_cars")
+
+
+def construction(stage: Stage) -> Script:
+    """Cones lead to barriers that close the lane for a few metres."""
+    s = stage.uniform("obstacle_m", 62.0, 80.0)
+    length = stage.uniform("works_m", 8.0, 14.0)
+    for k in range(4):
+        stage.thing(ActorKind.CONE, stage.route_pose(s + 2.0 * k, -1.4 + 0.8 * k))
+    for along in (9.0, 9.0 + length):
+        stage.thing(ActorKind.BARRIER, stage.route_pose(s + along))
+    for k in range(int(length // 3)):
+        stage.thing(ActorKind.CONE, stage.route_pose(s + 10.5 + 3.0 * k, 1.3))
+    yield from met(stage, s, "construction")
+
+
+def parked_car(stage: Stage) -> Script:
+    """A car or van stands in the lane, its hazard lights on."""
+    s = stage.uniform("obstacle_m", 62.0, 85.0)
+    kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
+    aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
+    stage.thing(kind, stage.route_pose(s, aside))
+    yield from met(stage, s, "parked_car")
+
+
+def slow_cyclists(stage: Stage, street: Street) -> Script:
+    """Cyclists ride in a row, on the right part of the lane."""
+    count = stage.integer("cyclists", 2, 4)
+    speed = stage.uniform("cyclist_mps", 1.8, 2.4)
+    first = stage.uniform("cyclist_gap_m", 26.0, 34.0)
+    last: Car | None = None
+    for k in range(count):
+        s = street.start_m + first + 4.5 * k
+        lanes, local = on_chain(stage.network, street.ahead(street.lane), s)
+        rider = stage.car(lanes, local, speed, speed, ActorKind.BICYCLE)
+        rider.offset_m = -0.8
+        right = rider.pose.moved(0.0, -0.8)
+        rider.position[:] = (right.x, -right.y)
+        last = last or rider
+    while last and stage.gap_m(last) > NEAR_M - 10.0:
+        yield
+    stage.fire("slow_cyclists", last)
+
+
+def opening_door(stage: Stage) -> Script:
+    """One of a row of parked cars opens its door into the lane."""
+    s = stage.uniform("door_m", 60.0, 80.0)
+    side = -(LANE_WIDTH_M / 2 + 1.05)
+    for k in range(-2, 3):
+        stage.thing(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
+    lead_s = stage.uniform("door_lead_s", 2.8, 3.4)
+    while stage.arrival_s(s) > lead_s:
+        yield
+    hinge = side + 1.95 / 2
+    door = stage.thing(
+        ActorKind.DOOR, stage.route_pose(s + 0.6, hinge + 0.6), (0.2, 1.2, 1.2)
+    )
+    stage.fire("opening_door", door)
+
+
+def spun_car(stage: Stage) -> Script:
+    """A slick patch: the tyres lose grip, and somebody stands across the lane.
+
+    Stands in for Bench2Drive's ControlLoss, which adds noise to the controls: that
+    would punish the simulator's user for what the simulator does.
+    """
+    s = stage.uniform("spun_m", 80.0, 92.0)
+    grip = stage.uniform("grip_mps2", 3.0, 4.0)
+    begin = s - stage.uniform("slick_m", 35.0, 45.0)
+    askew = stage.uniform("askew_rad", 0.4, 0.7)
+    place = stage.route_pose(s, -0.7 * free_side(stage))
+    car = stage.thing(ActorKind.PARKED, place.turned(askew))
+    dry = stage.ego.grip_mps2
+    while stage.ahead_m(begin) > 0:
+        yield
+    stage.ego.grip_mps2 = grip
+    stage.fire("spun_car", car)
+    while stage.ahead_m(s + 5.0) > 0:
+        yield
+    stage.ego.grip_mps2 = dry
+
+
+def neighbours(stage: Stage, street: Street) -> Script:
+    """Ordinary cars in the lane beside the ego's: one ahead, one well behind."""
+    chain = street.ahead(street.other_lane())
+    for name, low, high in (("ahead", 35.0, 50.0), ("behind", -45.0, -30.0)):
+        s = street.start_m + stage.uniform(f"{name}_m", low, high)
+        speed = stage.uniform(f"{name}_mps", 8.0, 10.0)
+        lanes, local = on_chain(stage.network, chain, s)
+        stage.car(lanes, local, speed)
+    yield
+
+
+def oncoming_cars(stage: Stage, street: Street) -> Script:
+    """A few cars come the other way, then nobody."""
+    count = stage.integer("oncoming", 1, 3)
+    chain = street.road.oncoming()
+    total = sum(stage.network.length(index) for index in chain)
+    away = stage.uniform("oncoming_m", 80.0, 120.0)
+    speed = stage.uniform("oncoming_mps", 8.0, 10.0)
+    for k in range(count):
+        gap = k * stage.uniform(f"oncoming_gap_{k}_m", 16.0, 24.0)
+        s = total - street.start_m - away - gap
+        lanes, local = on_chain(stage.network, chain, max(s, 0.0))
+        stage.car(lanes, local, speed)
+    yield

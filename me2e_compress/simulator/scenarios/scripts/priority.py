@@ -1,0 +1,112 @@
+"""Lights, signs, and those who come anyway."""
+
+from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
+from me2e_compress.simulator.scenarios.layouts.streets import Street
+from me2e_compress.simulator.scenarios.scripts.synchronise import (
+    hold,
+    met,
+    nearest_station,
+    on_chain,
+    patience,
+)
+from me2e_compress.simulator.scene import ActorKind, SignalState
+from me2e_compress.simulator.traffic.cars import Manners
+from me2e_compress.simulator.traffic.events import Event, EventKind
+from me2e_compress.simulator.traffic.stage import Script, Stage
+
+YELLOW_S = 2.0
+ALL_RED_S = 1.0
+"""Phases of the cross traffic's light before the ego's turns green: our choice."""
+
+
+def red_light(stage: Stage, crossing: Crossing) -> Script:
+    """Red until the ego has waited at the line; a few cars cross meanwhile."""
+    light = crossing.signals["back"]
+    line_s = light.line_s or crossing.approach_m
+    ways = (("left", "right"), ("right", "left"))
+    for k, (start, end) in enumerate(ways):
+        chain = crossing.way(start, end)
+        away = stage.uniform(f"cross_{k}_m", 15.0, 60.0)
+        stage.car(chain, stage.network.length(chain[0]) - away, 8.0, 9.0)
+    while stage.ahead_m(line_s) > 35.0:
+        yield
+    stage.fire("red_light")
+    yield from patience(stage, line_s, 12.0)
+    for state, seconds in (
+        (SignalState.YELLOW, YELLOW_S),
+        (SignalState.RED, ALL_RED_S),
+    ):
+        for arm in ("left", "right"):
+            crossing.signals[arm].state = state
+        yield from hold(stage, seconds)
+    for arm in ("back", "ahead"):
+        crossing.signals[arm].state = SignalState.GREEN
+
+
+def stop_sign(stage: Stage, crossing: Crossing) -> Script:
+    """A stop sign and nobody there: only the stop counts."""
+    sign = crossing.signals["back"]
+    yield from met(stage, sign.line_s or crossing.approach_m, "stop_sign")
+
+
+def invader(stage: Stage, street: Street) -> Script:
+    """An oncoming car drives partly in the ego's lane."""
+    chain = street.road.oncoming()
+    total = sum(stage.network.length(index) for index in chain)
+    where = stage.uniform("meet_m", 55.0, 75.0)
+    away = stage.uniform("away_m", 50.0, 60.0)
+    kind = ActorKind(stage.choice("invader", ("car", "van")))
+    s = total - (street.start_m + where + away)
+    lanes, local = on_chain(stage.network, chain, s)
+    car = stage.car(lanes, local, 7.0, kind=kind, manners=Manners(sees_ego=False))
+    _, lateral = stage.path.project(car.pose.x, car.pose.y)
+    into = stage.uniform("invaded_m", 1.25, 1.45)
+    car.offset_m = lateral - into
+    begin = stage.route_pose(where)
+    station = nearest_station(stage, lanes, begin.x, begin.y)
+    while stage.arrival_s(where) > 4.0:
+        due = stage.ahead_m(where) / max(stage.ego.speed, 2.0)
+        wanted = min(max((station - car.station_m) / max(due, 0.2), 2.0), 13.0)
+        car.forced_mps2 = min(max((wanted - car.speed) / 0.4, -5.0), 4.0)
+        yield
+    stage.fire("invader", car)
+    car.forced_mps2, car.target_speed = 0.0, max(car.speed, 4.0)
+    while stage.ahead_m(where) > -25.0 and not car.gone:
+        pose = car.pose
+        if stage.path.project(pose.x, pose.y)[0] < stage.ego_s - 8.0:
+            break
+        yield
+    car.forced_mps2, car.offset_m = None, 0.0
+
+
+def emergency_behind(stage: Stage, street: Street) -> Script:
+    """An emergency vehicle comes from behind and wants to pass.
+
+    Judged as scenario_runner does (YieldToEmergencyVehicleTest): at the end of the
+    route it must be ahead of the ego.
+    """
+    gap = stage.uniform("behind_m", 18.0, 26.0)
+    lanes = street.ahead(street.lane)
+    car = stage.car(
+        lanes,
+        street.start_m - gap,
+        float(stage.ego.speed) + 5.0,
+        18.0,
+        ActorKind.EMERGENCY,
+        Manners(3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False),
+    )
+    passed = [False]
+
+    def judge() -> Event | None:
+        if passed[0]:
+            return None
+        words = "the emergency vehicle is still behind"
+        return stage.event(EventKind.YIELD_EMERGENCY, words, car)
+
+    stage.at_goal.append(judge)
+    while abs(stage.gap_m(car)) > 20.0:
+        yield
+    stage.fire("emergency_behind", car)
+    while stage.gap_m(car) < 0:
+        yield
+    passed[0] = True

@@ -1,0 +1,154 @@
+"""What can be seen of the world at one instant: frozen, metric, right-handed.
+
+The plane is x east, y north, headings in radians counter-clockwise from east; the
+ego frame is x forward, y left. highway-env's own world has its y axis pointing
+down; only `world` knows that, and converts once when it takes a snapshot.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from me2e_compress.simulator.plane_geometry import (
+    Command,
+    Lane,
+    LaneMarking,
+    Roadmap,
+    RoutePath,
+)
+
+__all__ = [
+    "DIMENSIONS",
+    "Actor",
+    "ActorKind",
+    "Command",
+    "Control",
+    "Ego",
+    "Lane",
+    "LaneMarking",
+    "Roadmap",
+    "RoutePath",
+    "Scene",
+    "Signal",
+    "SignalKind",
+    "SignalState",
+]
+
+
+class ActorKind(StrEnum):
+    """What an actor is; its size comes from `DIMENSIONS` unless a script says else."""
+
+    CAR = "car"
+    VAN = "van"
+    TRUCK = "truck"
+    EMERGENCY = "emergency"
+    BICYCLE = "bicycle"
+    PEDESTRIAN = "pedestrian"
+    PARKED = "parked"
+    """A car without a driver; never moves."""
+    DOOR = "door"
+    """The open door of a parked car."""
+    CONE = "cone"
+    BARRIER = "barrier"
+
+
+DIMENSIONS: dict[ActorKind, tuple[float, float, float]] = {
+    ActorKind.CAR: (4.6, 1.95, 1.73),
+    ActorKind.VAN: (5.3, 2.0, 2.1),
+    ActorKind.TRUCK: (6.93, 2.51, 2.84),
+    ActorKind.EMERGENCY: (5.3, 2.0, 2.3),
+    ActorKind.BICYCLE: (1.7, 0.6, 1.28),
+    ActorKind.PEDESTRIAN: (0.73, 0.67, 1.77),
+    ActorKind.PARKED: (4.6, 1.95, 1.73),
+    ActorKind.DOOR: (0.2, 1.0, 1.2),
+    ActorKind.CONE: (0.41, 0.41, 1.07),
+    ActorKind.BARRIER: (0.5, 2.53, 0.98),
+}
+"""(length, width, height) in metres: nuScenes' mean boxes (the anchor sizes of
+CenterPoint's nuScenes configuration, github.com/tianweiy/CenterPoint); van and
+emergency vehicle after a long-wheelbase delivery van; the door is our choice."""
+
+
+class SignalKind(StrEnum):
+    """What regulates a stop line."""
+
+    TRAFFIC_LIGHT = "traffic_light"
+    STOP_SIGN = "stop_sign"
+    GIVE_WAY = "give_way"
+
+
+class SignalState(StrEnum):
+    """Phase of a traffic light."""
+
+    RED = "red"
+    YELLOW = "yellow"
+    GREEN = "green"
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """What the ego's driver asks for; the actuators follow with a lag."""
+
+    acceleration_mps2: float
+    steering_rad: float
+    """Front wheel angle, positive to the left."""
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """A box that is not the ego. The position is the centre of the box."""
+
+    id: int
+    kind: ActorKind
+    x: float
+    y: float
+    heading: float
+    speed_mps: float
+    length: float
+    width: float
+    height: float
+    braking: bool
+    indicator: int
+    """-1 right, 0 off, +1 left."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ego:
+    """State of the ego. The position is the centre of the box."""
+
+    x: float
+    y: float
+    heading: float
+    speed_mps: float
+    acceleration_mps2: float
+    lateral_acceleration_mps2: float
+    """Positive to the left."""
+    yaw_rate_radps: float
+    steering_rad: float
+    """Front wheel angle as the actuator holds it, positive to the left."""
+    length: float
+    width: float
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """A light or a sign with the line at which it must be obeyed."""
+
+    id: int
+    kind: SignalKind
+    x: float
+    y: float
+    heading: float
+    """Direction of the traffic that must obey, not the way the lamp faces."""
+    state: SignalState | None
+    """None for signs."""
+    stop_line: tuple[tuple[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Everything at one instant."""
+
+    time_us: int
+    ego: Ego
+    actors: tuple[Actor, ...]
+    signals: tuple[Signal, ...]

@@ -1,0 +1,178 @@
+"""Bodies that follow no lane: the ego, pedestrians, things that stand."""
+
+import math
+
+import numpy as np
+from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import Obstacle
+
+from me2e_compress.simulator.bicycle import MAX_STEERING_RAD, slip_of
+from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.scene import (
+    DIMENSIONS,
+    ActorKind,
+    Control,
+    Ego,
+)
+from me2e_compress.simulator.traffic.network import Pose, flip
+
+GRAVITY_MPS2 = 9.81
+DRY_GRIP_MPS2 = 0.8 * GRAVITY_MPS2
+"""Largest acceleration that tyres hand on: friction 0.8, dry asphalt."""
+ACCELERATION_RANGE_MPS2 = (-8.0, 4.0)
+"""What the ego's brakes and motor can do."""
+ACCELERATION_LAG_S = 0.2
+STEERING_LAG_S = 0.1
+"""Time constants of the ego's first-order actuators: our choice. highway-env acts at
+once, which makes jerk, and so every comfort score, meaningless."""
+
+
+class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
+    """The ego: highway-env's kinematic bicycle with lag, grip and no reverse gear.
+
+    The dynamics are exact for held actuators, so a finer time step changes the
+    trajectory by the held control alone.
+    """
+
+    def __init__(self, pose: Pose, speed_mps: float) -> None:
+        super().__init__(None, flip(pose.x, pose.y), -pose.heading, speed_mps)
+        self.speed: float = speed_mps
+        self.position: Floats
+        self.id = 0
+        self.kind = ActorKind.CAR
+        self.grip_mps2 = DRY_GRIP_MPS2
+        self.wanted = Control(0.0, 0.0)
+        self.acceleration_mps2 = 0.0
+        self.yaw_rate_radps = 0.0
+        self.steering_rad = 0.0
+        self._thrust_mps2 = 0.0
+
+    @property
+    def pose(self) -> Pose:
+        """Right-handed pose."""
+        x, y = self.position
+        return Pose(float(x), -float(y), -float(self.heading))
+
+    def act(self, action: object = None) -> None:
+        """Nothing: the ego is driven from outside through `wanted`."""
+
+    def step(self, dt: float) -> None:
+        """Advance by ``dt`` seconds."""
+        low, high = ACCELERATION_RANGE_MPS2
+        thrust = min(max(self.wanted.acceleration_mps2, low), high)
+        wheel = min(max(self.wanted.steering_rad, -MAX_STEERING_RAD), MAX_STEERING_RAD)
+        follow = 1 - math.exp(-dt / ACCELERATION_LAG_S)
+        self._thrust_mps2 += follow * (thrust - self._thrust_mps2)
+        self.steering_rad += (1 - math.exp(-dt / STEERING_LAG_S)) * (
+            wheel - self.steering_rad
+        )
+        pushed = min(max(self._thrust_mps2, -self.grip_mps2), self.grip_mps2)
+        before = float(self.speed)
+        after = max(0.0, before + pushed * dt)
+        mean = (before + after) / 2
+        slip = slip_of(self.steering_rad)
+        curvature = math.sin(slip) / (self.LENGTH / 2)
+        tightest = self.grip_mps2 / max(mean, 0.1) ** 2
+        if abs(curvature) > tightest:
+            curvature = math.copysign(tightest, curvature)
+            slip = math.asin(curvature * self.LENGTH / 2)
+        turn = mean * curvature * dt
+        course = -self.heading + slip + turn / 2
+        self.position = self.position + mean * dt * flip(
+            math.cos(course), math.sin(course)
+        )
+        self.heading -= turn
+        self.speed = after
+        self.acceleration_mps2 = (after - before) / dt
+        self.yaw_rate_radps = mean * curvature
+
+    def snapshot(self) -> Ego:
+        """Right-handed state."""
+        pose = self.pose
+        return Ego(
+            pose.x,
+            pose.y,
+            pose.heading,
+            float(self.speed),
+            self.acceleration_mps2,
+            float(self.speed) * self.yaw_rate_radps,
+            self.yaw_rate_radps,
+            self.steering_rad,
+            float(self.LENGTH),
+            float(self.WIDTH),
+        )
+
+
+class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
+    """Somebody who crosses: walks a polyline once told to, and looks at nobody.
+
+    Args:
+        id: Unique.
+        kind: Pedestrian or bicycle.
+        line: [N, 2] right-handed metres.
+        speed_mps: Speed once walking.
+    """
+
+    def __init__(
+        self, id: int, kind: ActorKind, line: Floats, speed_mps: float
+    ) -> None:
+        step = line[1] - line[0]
+        heading = math.atan2(step[1], step[0])
+        super().__init__(None, flip(*line[0]), -heading, 0.0)
+        self.speed: float = 0.0
+        self.position: Floats
+        self.LENGTH, self.WIDTH, self.height = DIMENSIONS[kind]
+        self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
+        self.id, self.kind, self.line = id, kind, line
+        self.top_speed_mps = speed_mps
+        self.going = False
+        self.walked_m = 0.0
+        self.braking, self.indicator = False, 0
+        legs = np.hypot(*np.diff(line, axis=0).T)
+        self._arc = np.concatenate([[0.0], np.cumsum(legs)])
+
+    @property
+    def done(self) -> bool:
+        """Whether the end of the line is reached."""
+        return self.walked_m >= float(self._arc[-1])
+
+    def act(self, action: object = None) -> None:
+        """Nothing: only `going` matters."""
+
+    def step(self, dt: float) -> None:
+        """Advance by ``dt`` seconds; walking speed is reached within 0.5 s."""
+        target = self.top_speed_mps if self.going and not self.done else 0.0
+        change = 2 * max(self.top_speed_mps, 1.0) * dt
+        self.speed += min(max(target - self.speed, -change), change)
+        self.walked_m = min(self.walked_m + self.speed * dt, float(self._arc[-1]))
+        if self.done:
+            self.speed = 0.0
+        x = float(np.interp(self.walked_m, self._arc, self.line[:, 0]))
+        y = float(np.interp(self.walked_m, self._arc, self.line[:, 1]))
+        leg = int(np.searchsorted(self._arc, self.walked_m, side="right")) - 1
+        leg = min(max(leg, 0), len(self.line) - 2)
+        step = self.line[leg + 1] - self.line[leg]
+        self.heading = -math.atan2(step[1], step[0])
+        self.position = flip(x, y)
+
+    def rest(self) -> Floats:
+        """[M, 2] what is left of its line, where it stands first."""
+        ahead = self.line[self._arc > self.walked_m]
+        return np.vstack([flip(*self.position), ahead])
+
+
+class Standing(Obstacle):  # type: ignore[misc]  # highway-env is untyped
+    """A thing that stands: parked car, door, cone, barrier."""
+
+    def __init__(
+        self,
+        id: int,
+        kind: ActorKind,
+        pose: Pose,
+        size: tuple[float, float, float] | None = None,
+    ) -> None:
+        super().__init__(None, flip(pose.x, pose.y), -pose.heading, 0.0)
+        self.LENGTH, self.WIDTH, self.height = size or DIMENSIONS[kind]
+        self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
+        self.id, self.kind = id, kind
+        self.braking, self.indicator = False, 0

@@ -1,0 +1,54 @@
+"""What the world noticed."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from me2e_compress.simulator.scene import ActorKind
+
+
+class EventKind(StrEnum):
+    """Kinds of events."""
+
+    TRIGGER = "trigger"
+    """A scenario's script began to act."""
+    COLLISION = "collision"
+    """The ego and somebody or something else."""
+    ACTOR_COLLISION = "actor_collision"
+    """Two others; never in a well-written scenario."""
+    OUTSIDE_LANES = "outside_lanes"
+    RED_LIGHT = "red_light"
+    STOP_SIGN = "stop_sign"
+    GIVE_WAY = "give_way"
+    YIELD_EMERGENCY = "yield_emergency"
+
+
+INFRACTIONS: frozenset[EventKind] = frozenset(EventKind) - {
+    EventKind.TRIGGER,
+    EventKind.ACTOR_COLLISION,
+}
+"""What counts against the driver."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened at one instant.
+
+    Attributes:
+        time_us: When.
+        kind: What.
+        detail: Which script, or in words what happened.
+        x: Where the ego was, metres.
+        y: Where the ego was, metres.
+        ego_speed_mps: How fast the ego was.
+        actor_id: The other party, if any.
+        actor_kind: What the other party is.
+    """
+
+    time_us: int
+    kind: EventKind
+    detail: str
+    x: float
+    y: float
+    ego_speed_mps: float
+    actor_id: int | None = None
+    actor_kind: ActorKind | None = None

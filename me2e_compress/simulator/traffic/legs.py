@@ -1,0 +1,167 @@
+"""From the lanes that a route uses to its centre line."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.simulator.plane_geometry import (
+    SPACING_M,
+    Command,
+    Floats,
+    RoutePath,
+    polyline_headings,
+    resample,
+)
+from me2e_compress.simulator.traffic.lanes import LaneTable
+from me2e_compress.simulator.traffic.network import LaneIndex, Network, flip
+
+ANNOUNCED_M = 20.0
+"""How long before a junction or a lane change the command says so."""
+FINE_M = 0.1
+WIDEST_M = 9.0
+"""How far to the side we look for road."""
+PROBE_M = 0.25
+TOUCHING_M = 0.01
+"""Lanes side by side leave no hole, whatever the last digit says."""
+_CHANGES = (Command.CHANGE_LEFT, Command.CHANGE_RIGHT)
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A piece of the route on one lane.
+
+    A hole between the end of a leg and the beginning of the next is filled by a
+    smooth curve: that is how a route changes lanes.
+    """
+
+    lane: LaneIndex
+    command: Command = Command.FOLLOW
+    enter_m: float = 0.0
+    leave_m: float | None = None
+    offset_m: float = 0.0
+    """Metres left of the lane's centre."""
+
+
+def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePath:
+    """Join legs into a path of points 1 m apart."""
+    pieces, marks, owners = list[Floats](), list[tuple[float, float, Command]](), []
+    done = 0.0
+    for leg in legs:
+        end = network.length(leg.lane) if leg.leave_m is None else leg.leave_m
+        count = max(2, round((end - leg.enter_m) / FINE_M) + 1)
+        stations = np.linspace(leg.enter_m, end, count)
+        poses = [network.pose(leg.lane, float(s), leg.offset_m) for s in stations]
+        piece = np.array([(p.x, p.y) for p in poses])
+        begin = done
+        if pieces and np.hypot(*(piece[0] - pieces[-1][-1])) > 0.5:
+            bridge = _bridge(pieces[-1], piece)
+            pieces.append(bridge)
+            done += _length(bridge)
+            owners.append((done, leg))
+        change_end = done
+        pieces.append(piece)
+        done += _length(piece)
+        owners.append((done, leg))
+        stop = change_end if leg.command in _CHANGES else done
+        marks.append((begin - ANNOUNCED_M, stop, leg.command))
+    points = resample(_joined(pieces), SPACING_M)
+    owner = _owner_of(len(points), owners)
+    width = np.array([network.lane(legs[i].lane).width for i in owner], float)
+    limit = np.array([network.lane(legs[i].lane).speed_limit for i in owner], float)
+    headings = polyline_headings(points)
+    left, right, oncoming = _room_beside(network, points, headings)
+    return RoutePath(
+        points,
+        headings,
+        width,
+        limit,
+        _commands(len(points), marks),
+        goal_m,
+        left,
+        right,
+        oncoming,
+    )
+
+
+def _bridge(before: Floats, after: Floats) -> Floats:
+    """Cubic Hermite curve from the end of one piece to the start of the next."""
+    start, end = before[-1], after[0]
+    reach = float(np.hypot(*(end - start)))
+    out = (before[-1] - before[-2]) / np.hypot(*(before[-1] - before[-2])) * reach
+    into = (after[1] - after[0]) / np.hypot(*(after[1] - after[0])) * reach
+    t = np.linspace(0.0, 1.0, max(2, round(reach / FINE_M) + 1))[:, None]
+    points = (
+        (2 * t**3 - 3 * t**2 + 1) * start
+        + (t**3 - 2 * t**2 + t) * out
+        + (3 * t**2 - 2 * t**3) * end
+        + (t**3 - t**2) * into
+    )
+    return np.asarray(points)
+
+
+def _length(points: Floats) -> float:
+    return float(np.hypot(*np.diff(points, axis=0).T).sum())
+
+
+def _joined(pieces: Sequence[Floats]) -> Floats:
+    points = np.concatenate(pieces)
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    return np.asarray(points[np.concatenate([[True], steps > 1e-6])])
+
+
+def _owner_of(count: int, owners: Sequence[tuple[float, Leg]]) -> list[int]:
+    ends = np.array([end for end, _ in owners])
+    legs = list(dict.fromkeys(leg for _, leg in owners))
+    index = np.searchsorted(ends, np.arange(count) * SPACING_M)
+    index = np.minimum(index, len(owners) - 1)
+    return [legs.index(owners[int(i)][1]) for i in index]
+
+
+def _commands(
+    count: int, marks: Sequence[tuple[float, float, Command]]
+) -> npt.NDArray[np.int64]:
+    commands = np.full(count, int(Command.FOLLOW), dtype=np.int64)
+    stations = np.arange(count) * SPACING_M
+    for begin, end, command in marks:
+        if command is not Command.FOLLOW:
+            commands[(stations >= begin) & (stations < end)] = int(command)
+    return commands
+
+
+def _room_beside(
+    network: Network, points: Floats, headings: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Metres of road left (same way), right (with shoulders), left (all lanes)."""
+    table = LaneTable(network.graph)
+    shoulder = np.zeros(len(table.length), bool)
+    for index in network.shoulders:
+        shoulder[table.column[index]] = True
+    widths = np.array([network.lane(index).width for index in table.column])
+    reach = np.arange(PROBE_M, WIDEST_M, PROBE_M)
+    sides = list[Floats]()
+    for sign, same_way, with_shoulder in (
+        (1, True, False),
+        (-1, True, True),
+        (1, False, True),
+    ):
+        normal = np.stack([-np.sin(headings), np.cos(headings)], axis=1) * sign
+        probes = points[:, None, :] + reach[None, :, None] * normal[:, None, :]
+        flat = probes.reshape(-1, 2) @ np.diag(flip(1.0, 1.0))
+        s, r = table.coordinates(flat)
+        inside = (
+            (s > -0.5)
+            & (s < table.length + 0.5)
+            & (np.abs(r) <= widths / 2 + TOUCHING_M)
+        )
+        if same_way:
+            mine = -np.repeat(headings, len(reach))[:, None]
+            way = np.cos(table.headings(s) - mine) > 0.5
+            inside &= way | shoulder
+        if not with_shoulder:
+            inside &= ~shoulder
+        road = inside.any(axis=1).reshape(len(points), len(reach))
+        free = np.where(road.all(axis=1), len(reach), np.argmin(road, axis=1))
+        sides.append(free * PROBE_M)
+    return sides[0], sides[1], sides[2]

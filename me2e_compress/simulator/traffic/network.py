@@ -1,0 +1,200 @@
+"""Builds highway-env lanes from right-handed poses, and reads them back.
+
+highway-env's plane has y pointing down, so that a heading grows clockwise and a
+lane's positive side is its right. The sign flips live here and in `flip`, nowhere
+else.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from highway_env.road.lane import AbstractLane, CircularLane, LineType, StraightLane
+from highway_env.road.road import RoadNetwork
+
+from me2e_compress.simulator.plane_geometry import (
+    Floats,
+    Lane,
+    LaneMarking,
+    Point,
+    Roadmap,
+)
+
+LaneIndex = tuple[str, str, int]
+LANE_WIDTH_M = 3.5
+"""Width of an urban lane in CARLA's towns and of most lanes in nuScenes."""
+CHORD_M = 1.0
+"""Spacing of the points of a lane's centre line."""
+_LINE = {
+    LaneMarking.NONE: LineType.NONE,
+    LaneMarking.DASHED: LineType.STRIPED,
+    LaneMarking.SOLID: LineType.CONTINUOUS_LINE,
+}
+_MARKING = {line: marking for marking, line in _LINE.items()}
+
+
+def flip(x: float, y: float) -> Floats:
+    """A point of one plane in the other (the map is its own inverse)."""
+    return np.array([x, -y])
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A place and a direction in the right-handed plane."""
+
+    x: float
+    y: float
+    heading: float
+
+    def moved(self, forward_m: float, left_m: float = 0.0) -> "Pose":
+        """The pose after a step in its own frame."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return Pose(
+            self.x + c * forward_m - s * left_m,
+            self.y + s * forward_m + c * left_m,
+            self.heading,
+        )
+
+    def turned(self, angle_rad: float) -> "Pose":
+        """The pose turned on the spot, positive to the left."""
+        return Pose(self.x, self.y, self.heading + angle_rad)
+
+    def along_arc(self, radius_m: float, angle_rad: float) -> "Pose":
+        """The pose after an arc; a positive angle turns left."""
+        side = math.copysign(radius_m, angle_rad)
+        return self.moved(0.0, side).turned(angle_rad).moved(0.0, -side)
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Cross-section of one carriageway: parallel lanes, the leftmost first."""
+
+    lanes: int = 1
+    width: float = LANE_WIDTH_M
+    limit_mps: float = 50 / 3.6
+    left: LaneMarking = LaneMarking.SOLID
+    between: LaneMarking = LaneMarking.DASHED
+    right: LaneMarking = LaneMarking.SOLID
+    shoulder: bool = False
+
+    def markings(self, lane: int) -> tuple[LaneMarking, LaneMarking]:
+        """Left and right marking of one lane."""
+        left = self.left if lane == 0 else self.between
+        right = self.right if lane == self.lanes - 1 else self.between
+        return left, right
+
+
+PLAIN = Section(left=LaneMarking.NONE, right=LaneMarking.NONE)
+"""An unpainted lane, as inside a junction."""
+
+
+class Network:
+    """A highway-env road network under construction, in right-handed poses."""
+
+    def __init__(self) -> None:
+        self.graph = RoadNetwork()
+        self.shoulders: list[LaneIndex] = []
+        self._centres: dict[LaneIndex, Floats] = {}
+
+    def straight(
+        self, start: str, end: str, pose: Pose, length_m: float, section: Section
+    ) -> Pose:
+        """Add a straight piece; the pose is where the leftmost lane begins.
+
+        Returns:
+            The pose where the leftmost lane ends.
+        """
+        for i in range(section.lanes):
+            first = pose.moved(0.0, -i * section.width)
+            last = first.moved(length_m)
+            left, right = section.markings(i)
+            lane = StraightLane(
+                flip(first.x, first.y),
+                flip(last.x, last.y),
+                width=section.width,
+                line_types=(_LINE[left], _LINE[right]),
+                speed_limit=section.limit_mps,
+            )
+            self._add(start, end, lane, section)
+        return pose.moved(length_m)
+
+    def arc(
+        self,
+        start: str,
+        end: str,
+        pose: Pose,
+        radius_m: float,
+        angle_rad: float,
+        section: Section,
+    ) -> Pose:
+        """Add an arc; radius of the leftmost lane, positive angles turn left.
+
+        Returns:
+            The pose where the leftmost lane ends.
+        """
+        left_turn = angle_rad > 0
+        side = radius_m if left_turn else -radius_m
+        centre = pose.moved(0.0, side)
+        begin = pose.heading - math.copysign(math.pi / 2, angle_rad)
+        for i in range(section.lanes):
+            outwards = i * section.width
+            left, right = section.markings(i)
+            lane = CircularLane(
+                flip(centre.x, centre.y),
+                radius_m + outwards if left_turn else radius_m - outwards,
+                -begin,
+                -(begin + angle_rad),
+                clockwise=not left_turn,
+                width=section.width,
+                line_types=[_LINE[left], _LINE[right]],
+                speed_limit=section.limit_mps,
+            )
+            self._add(start, end, lane, section)
+        return pose.along_arc(radius_m, angle_rad)
+
+    def lane(self, index: LaneIndex) -> AbstractLane:
+        """The highway-env lane."""
+        return self.graph.get_lane(index)
+
+    def pose(self, index: LaneIndex, s_m: float, left_m: float = 0.0) -> Pose:
+        """Where a lane is at an arc length and an offset to the left."""
+        lane = self.lane(index)
+        x, y = lane.position(s_m, -left_m)
+        return Pose(float(x), -float(y), -float(lane.heading_at(s_m)))
+
+    def length(self, index: LaneIndex) -> float:
+        """Length of a lane in metres."""
+        return float(self.lane(index).length)
+
+    def centre(self, index: LaneIndex) -> Floats:
+        """[N, 2] centre line, at most `CHORD_M` apart, computed once."""
+        if index not in self._centres:
+            self._centres[index] = self._sampled(index)
+        return self._centres[index]
+
+    def _sampled(self, index: LaneIndex) -> Floats:
+        length = self.length(index)
+        stations = np.linspace(0.0, length, max(2, math.ceil(length / CHORD_M) + 1))
+        poses = [self.pose(index, float(s)) for s in stations]
+        return np.array([(pose.x, pose.y) for pose in poses])
+
+    def roadmap(
+        self,
+        stop_lines: tuple[tuple[Point, Point], ...],
+        crosswalks: tuple[tuple[Point, Point, Point, Point], ...],
+    ) -> Roadmap:
+        """Everything painted, in the right-handed plane."""
+        lanes = list[Lane]()
+        for index, lane in self.graph.lanes_dict().items():
+            left, right = (_MARKING[line] for line in lane.line_types)
+            name = f"{index[0]}>{index[1]}:{index[2]}"
+            centre, limit = self.centre(index), float(lane.speed_limit)
+            shoulder = index in self.shoulders
+            width = float(lane.width)
+            lanes.append(Lane(name, centre, width, left, right, limit, shoulder))
+        return Roadmap(tuple(lanes), stop_lines, crosswalks)
+
+    def _add(self, start: str, end: str, lane: AbstractLane, section: Section) -> None:
+        self.graph.add_lane(start, end, lane)
+        if section.shoulder:
+            self.shoulders.append((start, end, len(self.graph.graph[start][end]) - 1))

@@ -1,0 +1,256 @@
+"""Where a scenario is set up, and what its scripts see while it runs."""
+
+import math
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from types import GeneratorType
+
+import numpy as np
+from highway_env.vehicle.objects import RoadObject
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
+from me2e_compress.simulator.routes import Parameter, Route
+from me2e_compress.simulator.scene import ActorKind, SignalKind, SignalState
+from me2e_compress.simulator.traffic.bodies import (
+    EgoVehicle,
+    Standing,
+    Walker,
+)
+from me2e_compress.simulator.traffic.cars import Car, Manners
+from me2e_compress.simulator.traffic.events import Event, EventKind
+from me2e_compress.simulator.traffic.legs import Leg, build_path
+from me2e_compress.simulator.traffic.network import (
+    LANE_WIDTH_M,
+    LaneIndex,
+    Network,
+    Pose,
+)
+from me2e_compress.simulator.traffic.signals import Regulator
+
+Script = Iterator[None]
+"""One actor script: resumed at every decision, it yields until the next one."""
+GOAL_M = 150.0
+SLOWEST_MPS = 1.0
+"""Slower than this, the ego's arrival is reckoned at this speed."""
+
+
+class Stage:
+    """Everything a scenario is made of.
+
+    Layouts lay out the network and the route, scripts put actors on it; both do so
+    before the first frame. Afterwards scripts are resumed at every decision.
+
+    Parameters are drawn by name: the value depends on the route's seed and the name
+    alone, not on what was drawn before, and a value in the route's manifest wins.
+    """
+
+    def __init__(self, route: Route) -> None:
+        self.route = route
+        self.parameters: dict[str, Parameter] = {}
+        self.network = Network()
+        self.layout = ""
+        self.script_names: list[str] = []
+        self.scripts: list[Script] = []
+        self.bodies: list[Car | Walker] = []
+        self.things: list[Standing] = []
+        self.regulators: list[Regulator] = []
+        self.crosswalks: list[tuple[Point, Point, Point, Point]] = []
+        self.at_goal: list[Callable[[], Event | None]] = []
+        self.events: list[Event] = []
+        self.time_us = 0
+        self.ego_s = 0.0
+        self._path: RoutePath | None = None
+        self._ego: EgoVehicle | None = None
+        self._next_id = 1
+        self._complete = False
+
+    @property
+    def path(self) -> RoutePath:
+        """The ego's route."""
+        if self._path is None:
+            raise EvaluationError(f"{self.route.scenario}: its layout set no route")
+        return self._path
+
+    @property
+    def ego(self) -> EgoVehicle:
+        """The ego."""
+        if self._ego is None:
+            raise EvaluationError(f"{self.route.scenario}: its layout set no route")
+        return self._ego
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since the route began."""
+        return self.time_us / 1e6
+
+    def uniform(self, name: str, low: float, high: float) -> float:
+        """A parameter between two bounds, to the millimetre."""
+        drawn = round(float(self._random(name).uniform(low, high)), 3)
+        return float(self._given(name, drawn))
+
+    def integer(self, name: str, low: int, high: int) -> int:
+        """A whole parameter between two bounds, both included."""
+        return int(self._given(name, int(self._random(name).integers(low, high + 1))))
+
+    def choice(self, name: str, options: Sequence[str]) -> str:
+        """One of several words."""
+        drawn = options[int(self._random(name).integers(len(options)))]
+        value = str(self._given(name, drawn))
+        if value not in options:
+            raise EvaluationError(
+                f"route {self.route.id}: parameter {name} is {value!r}; "
+                f"there are {', '.join(options)}"
+            )
+        return value
+
+    def complete(self) -> None:
+        """Setting up is over: every parameter has been drawn.
+
+        Raises:
+            EvaluationError: The route gives a parameter that nothing asked for.
+        """
+        self._complete = True
+        unasked = [
+            name for name in self.route.parameters if name not in self.parameters
+        ]
+        if unasked:
+            raise EvaluationError(
+                f"route {self.route.id}: {self.route.scenario} has no parameter "
+                f"{', '.join(unasked)} here; there are {', '.join(self.parameters)}"
+            )
+
+    def play(self, script: Script) -> None:
+        """Let a generator play its part.
+
+        It runs up to its first ``yield`` at once, so that its actors stand there at
+        frame 0. Its function's name is how the scenario's script is known.
+        """
+        if isinstance(script, GeneratorType):
+            self.script_names.append(script.__name__)
+        if next(script, self) is not self:
+            self.scripts.append(script)
+
+    def drive(
+        self, legs: Sequence[Leg], speed_mps: float, goal_m: float = GOAL_M
+    ) -> None:
+        """Set the ego's route and put the ego at its beginning."""
+        self._path = build_path(self.network, legs, goal_m)
+        if self._path.length_m < goal_m:
+            raise EvaluationError(
+                f"{self.route.scenario}: the route is {self._path.length_m:.0f} m "
+                f"long, its goal {goal_m:.0f} m away"
+            )
+        (x, y), heading = self._path.points[0], self._path.headings[0]
+        self._ego = EgoVehicle(Pose(float(x), float(y), float(heading)), speed_mps)
+
+    def car(
+        self,
+        lanes: Sequence[LaneIndex],
+        s_m: float,
+        speed_mps: float,
+        target_mps: float | None = None,
+        kind: ActorKind = ActorKind.CAR,
+        manners: Manners | None = None,
+    ) -> Car:
+        """Put a car on a chain of lanes."""
+        car = Car(
+            self._id(), self.network, lanes, s_m, speed_mps, target_mps, kind, manners
+        )
+        self.bodies.append(car)
+        return car
+
+    def walker(self, kind: ActorKind, line: Floats, speed_mps: float) -> Walker:
+        """Put somebody at the beginning of a line; `going` sends them off."""
+        walker = Walker(self._id(), kind, line, speed_mps)
+        self.bodies.append(walker)
+        return walker
+
+    def thing(
+        self,
+        kind: ActorKind,
+        pose: Pose,
+        size: tuple[float, float, float] | None = None,
+    ) -> Standing:
+        """Put a thing somewhere."""
+        thing = Standing(self._id(), kind, pose, size)
+        self.things.append(thing)
+        return thing
+
+    def regulate(
+        self,
+        kind: SignalKind,
+        line: Pose,
+        state: SignalState | None = None,
+        width_m: float = LANE_WIDTH_M,
+    ) -> Regulator:
+        """Put a light or a sign at a stop line, given by its middle and width."""
+        s, lateral = self.path.project(line.x, line.y)
+        way = math.cos(float(self.path.value(self.path.headings, s)) - line.heading)
+        on_route = abs(lateral) < width_m / 2 and way > 0.5
+        number = len(self.regulators) + 1
+        line_s = s if on_route else None
+        regulator = Regulator(number, kind, line, line_s, state, width_m=width_m)
+        self.regulators.append(regulator)
+        return regulator
+
+    def route_pose(self, s_m: float, left_m: float = 0.0) -> Pose:
+        """A place beside the route."""
+        x, y, heading = self.path.at(s_m, left_m)
+        return Pose(float(x), float(y), float(heading))
+
+    def ahead_m(self, s_m: float) -> float:
+        """Metres of route from the ego's centre to an arc length."""
+        return s_m - self.ego_s
+
+    def gap_m(self, car: Car) -> float:
+        """Metres of route between the bumpers of the ego and a car before it."""
+        pose = car.pose
+        s, _ = self.path.project(pose.x, pose.y)
+        return float(s - self.ego_s - (self.ego.LENGTH + car.LENGTH) / 2)
+
+    def arrival_s(self, s_m: float) -> float:
+        """Seconds until the ego's front is there at its present speed."""
+        left = self.ahead_m(s_m) - self.ego.LENGTH / 2
+        return float(left / max(self.ego.speed, SLOWEST_MPS))
+
+    def fire(self, script: str, body: RoadObject | None = None) -> None:
+        """Note that a script's event happens now."""
+        self.events.append(self.event(EventKind.TRIGGER, script, body))
+
+    def event(
+        self, kind: EventKind, detail: str, body: RoadObject | None = None
+    ) -> Event:
+        """An event here and now."""
+        pose = self.ego.pose
+        return Event(
+            self.time_us,
+            kind,
+            detail,
+            pose.x,
+            pose.y,
+            float(self.ego.speed),
+            None if body is None else body.id,
+            None if body is None else body.kind,
+        )
+
+    def _given(self, name: str, drawn: Parameter) -> Parameter:
+        if self._complete:
+            raise EvaluationError(
+                f"{self.route.scenario}: parameter {name} is drawn after the setup"
+            )
+        value = self.route.parameters.get(name, drawn)
+        if isinstance(value, str) != isinstance(drawn, str):
+            raise EvaluationError(
+                f"route {self.route.id}: parameter {name} is {value!r}, "
+                f"expected something like {drawn!r}"
+            )
+        self.parameters[name] = value
+        return value
+
+    def _random(self, name: str) -> np.random.Generator:
+        return np.random.default_rng([self.route.seed, zlib.crc32(name.encode())])
+
+    def _id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1

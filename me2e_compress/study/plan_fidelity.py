@@ -1,0 +1,118 @@
+"""How far a scheme's plan moves from the baseline's, before anything drives."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import EvaluationError, FramesError
+from me2e_compress.fidelity.compare import Fidelity, compare
+from me2e_compress.metrics.measure import Measure
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.session import Session
+from me2e_compress.study.definition import Study
+from me2e_compress.study.prepared import Contender
+from me2e_compress.study.workplace import Listener
+
+EXACT = "no noise: equal to the bit"
+"""Why a plan that did not move has no signal to noise."""
+
+
+@dataclass(frozen=True)
+class Faithfulness:
+    """The plan of a scheme held against the baseline's on held-out frames.
+
+    Attributes:
+        mean_m: Mean displacement of the waypoints.
+        max_m: Largest.
+        plan_sqnr_db: Signal to noise of the plan.
+        frames: How many were compared.
+    """
+
+    mean_m: Measure
+    max_m: Measure
+    plan_sqnr_db: Measure
+    frames: int = 0
+
+    @classmethod
+    def unknown(cls, reason: str) -> "Faithfulness":
+        """Nothing was compared."""
+        return cls(
+            Measure(None, "m", reason),
+            Measure(None, "m", reason),
+            Measure(None, "dB", reason),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the three measures with their units, and the number of frames."""
+        return {
+            "plan_mean": measure_json(self.mean_m),
+            "plan_max": measure_json(self.max_m),
+            "plan_sqnr": measure_json(self.plan_sqnr_db),
+            "frames": self.frames,
+        }
+
+
+def judge(
+    study: Study, baseline: Contender, contender: Contender, listener: Listener
+) -> Faithfulness:
+    """Run both models over the held-out frames.
+
+    A model whose inputs or outputs are others is no error: it was not measured, and
+    the reason says why.
+    """
+    if study.held_out is None:
+        return Faithfulness.unknown("no held-out frames were given")
+    if contender.model is None or baseline.model is None:
+        lacks = contender if contender.model is None else baseline
+        return Faithfulness.unknown(f"{lacks.scheme.name} is no model")
+    if contender is baseline:
+        return Faithfulness.unknown("the baseline itself")
+    recording = CalibrationSet(study.held_out)
+    stage = f"fidelity of {contender.scheme.name}"
+    left, right = Session(baseline.model), Session(contender.model)
+
+    def told() -> Iterator[Frame]:
+        for frame in recording:
+            listener.on_progress(stage, frame.index, len(recording), "frames")
+            yield frame
+
+    try:
+        found = compare(left, right, told())
+    except (EvaluationError, FramesError) as error:
+        return Faithfulness.unknown(str(error))
+    return _of(found, right)
+
+
+def measure_json(measure: Measure) -> dict[str, float | str | None]:
+    """Return value, unit and reason."""
+    return {
+        "value": measure.value,
+        "unit": measure.unit,
+        "reason": measure.reason or None,
+    }
+
+
+def _of(found: Fidelity, session: Session) -> Faithfulness:
+    if found.plan is None:
+        return Faithfulness.unknown(found.plan_reason)
+    adapter = PlanAdapter.of(session.metadata, list(session.outputs))
+    sqnr_db = next(
+        (
+            output.sqnr_db
+            for output in found.outputs
+            if adapter is not None and output.name == adapter.output
+        ),
+        math.nan,
+    )
+    exact = sqnr_db == math.inf
+    return Faithfulness(
+        Measure(found.plan.mean_m, "m"),
+        Measure(found.plan.max_m, "m"),
+        Measure(sqnr_db, "dB")
+        if math.isfinite(sqnr_db)
+        else Measure(None, "dB", EXACT if exact else "no plan"),
+        found.frames,
+    )

@@ -1,0 +1,190 @@
+"""The same moment of a route as two drivers lived it, where they part."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from me2e_compress.evaluators.highway.runner import Listeners, drive
+from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.simulator.cameras import paint_texture
+from me2e_compress.simulator.pictures import Moment, RoutePicture, write_png
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.world import World
+from me2e_compress.study.definition import Condition
+from me2e_compress.study.drives import Drive, Road
+from me2e_compress.study.prepared import Contender
+from me2e_compress.study.route_outcomes import RouteOutcome
+
+SCORED, MOVED_M = 1.0, 0.5
+"""Two drives whose scores are closer, and that were never farther apart, look alike."""
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Two pictures of one moment.
+
+    Attributes:
+        route: What the baseline made of the route.
+        other: What the scheme made of it.
+        scheme: Its name.
+        condition: Under what both drove.
+        time_us: The moment; a drive that was over by then shows its end.
+        before: PNG of the baseline.
+        after: PNG of the scheme.
+    """
+
+    route: RouteOutcome
+    other: RouteOutcome
+    scheme: str
+    condition: str
+    time_us: int
+    before: Path
+    after: Path
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A route that two drives might be shown on."""
+
+    drive: Drive
+    route: RouteOutcome
+    other: RouteOutcome
+
+    @property
+    def gap(self) -> float:
+        return abs(self.route.driving_score - self.other.driving_score)
+
+    @property
+    def seen(self) -> bool:
+        """A drive without frames hung or crashed: it has nothing to show."""
+        return bool(self.route.duration_us and self.other.duration_us)
+
+    @property
+    def differs(self) -> bool:
+        return self.gap >= SCORED or (self.other.apart_m or 0.0) > MOVED_M
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        return -self.gap, -(self.other.apart_m or 0.0)
+
+    @property
+    def moment_us(self) -> int:
+        """When the worse one did what the other did not; else when they were apart."""
+        if self.gap < SCORED and self.other.apart_us is not None:
+            return self.other.apart_us
+        worse, better = self.route, self.other
+        if worse.driving_score > better.driving_score:
+            worse, better = better, worse
+        kinds = [kind for kind, _ in better.infractions]
+        alone = [us for kind, us in worse.infractions if kind not in kinds]
+        times = alone or [us for _, us in worse.infractions]
+        return times[0] if times else min(worse.duration_us, better.duration_us)
+
+
+def take_pictures(
+    road: Road, contenders: Sequence[Contender], drives: Sequence[Drive], limit: int
+) -> tuple[Contrast, ...]:
+    """Drive again, up to the moment, the routes on which schemes part the most.
+
+    Pictures that are there are not taken again.
+
+    Args:
+        road: What the drives share.
+        contenders: The schemes.
+        drives: What they did.
+        limit: How many routes; each is another, and schemes take turns.
+
+    Raises:
+        EvaluationError: A picture cannot be written.
+    """
+    found = list[Contrast]()
+    by_name = {each.scheme.name: each for each in contenders}
+    conditions = {each.name: each for each in road.study.conditions}
+    routes = {each.id: each for each in road.study.routes}
+    pairs = _chosen(road.study.baseline, drives, limit)
+    for done, pair in enumerate(pairs):
+        road.listener.on_progress("pictures", done, len(pairs), pair.route.route)
+        condition = conditions[pair.drive.condition]
+        where = routes[pair.route.route]
+        names = (road.study.baseline, pair.drive.scheme)
+        before, after = (
+            _picture(road, by_name[name], condition, where, pair.moment_us)
+            for name in names
+        )
+        found.append(
+            Contrast(
+                *(pair.route, pair.other, pair.drive.scheme, condition.name),
+                *(pair.moment_us, before, after),
+            )
+        )
+    return tuple(found)
+
+
+def _chosen(baseline: str, drives: Sequence[Drive], limit: int) -> list[_Pair]:
+    """Take the widest gaps: one of each scheme first, and no route twice."""
+    references = {each.condition: each for each in drives if each.scheme == baseline}
+    pairs = [
+        _Pair(drive, route, other)
+        for drive in drives
+        if drive.scheme != baseline and drive.routes
+        for route, other in zip(
+            references[drive.condition].routes, drive.routes, strict=True
+        )
+    ]
+    ranked = sorted((pair for pair in pairs if pair.seen), key=lambda p: p.rank)
+    # Where all look alike, one picture shows just that.
+    ranked = [pair for pair in ranked if pair.differs] or ranked[:1]
+    chosen = list[_Pair]()
+    for others_only in (True, False):
+        for pair in ranked:
+            shown = [each.drive.scheme for each in chosen]
+            if len(chosen) == limit or (others_only and pair.drive.scheme in shown):
+                continue
+            if pair.route.route not in [each.route.route for each in chosen]:
+                chosen.append(pair)
+    return chosen
+
+
+@dataclass
+class _Film:
+    """Keeps where everything was, and the cameras of the latest moment alone."""
+
+    until_us: int
+    moments: list[Moment] = field(default_factory=list)
+
+    def see(self, moment: Moment) -> None:
+        if self.moments:
+            self.moments[-1] = replace(self.moments[-1], images=None)
+        self.moments.append(moment)
+        if moment.scene.time_us >= self.until_us:
+            raise _Enough
+
+
+class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
+    """The moment was seen."""
+
+
+def _picture(
+    road: Road, contender: Contender, condition: Condition, route: Route, time_us: int
+) -> Path:
+    name = contender.scheme.name
+    path = road.workplace.picture(contender.scheme, condition, route.id, time_us)
+    job = road.job(contender, condition)
+    if path.is_file() or job is None:
+        return path
+    moments = _watched(job, route, time_us)
+    world = World(route)
+    texture = paint_texture(world.roadmap, world.path.points)
+    title = f"{route.scenario}   {name}"
+    picture = RoutePicture(title, texture, world.path.points, moments)
+    write_png(path, picture.frame(len(moments) - 1))
+    return path
+
+
+def _watched(job: Job, route: Route, time_us: int) -> list[Moment]:
+    film = _Film(time_us)
+    try:
+        drive(route, job.driver.open(), job.conditions, Listeners(moment=film.see))
+    except _Enough:
+        return film.moments
+    return film.moments

@@ -1,0 +1,152 @@
+"""Where pairs stand: channels, branches of Adds, outputs, half-quantized layers."""
+
+from collections.abc import Iterator
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.quantization.plan import channel_axis
+from me2e_compress.quantization.rules import CONVOLUTIONS, WEIGHTED
+from me2e_compress.targets.finding import (
+    Finding,
+    error,
+    is_standard,
+    nodes_of,
+    warning,
+)
+from me2e_compress.targets.tensorrt.lint.qdq import (
+    DEQUANTIZE,
+    QUANTIZE,
+    is_pair,
+    pairs_of,
+    stored,
+)
+
+
+def channel_scales(model: ir.Model) -> Iterator[Finding]:
+    """Activations have one scale; weights one, or one a channel of their layer."""
+    for node in pairs_of(model):
+        scale = graph.static_shape(node.inputs[1])
+        if not scale or scale == (1,):
+            continue
+        if len(scale) > 1:
+            yield error(
+                "channel-scale", node, f"scales of shape {list(scale)}: by block"
+            )
+        elif not _is_weight(node):
+            yield error("channel-scale", node, "an activation has one scale a channel")
+        elif "axis" not in node.attributes:
+            yield error("weight-axis", node, "no axis: ONNX takes 1, TensorRT takes 0")
+        elif node.op_type == DEQUANTIZE:
+            yield from _axis(node)
+
+
+def _axis(node: ir.Node) -> Iterator[Finding]:
+    shape, scale = (
+        graph.static_shape(node.inputs[0]),
+        graph.static_shape(node.inputs[1]),
+    )
+    axis = node.attributes.get_int("axis", 1)
+    if shape is None or scale is None:
+        return
+    axis += len(shape) if axis < 0 else 0
+    if axis >= len(shape) or shape[axis] != scale[0]:
+        yield error(
+            "weight-axis", node, f"{scale[0]} scales along axis {axis} of {list(shape)}"
+        )
+        return
+    for reader in node.outputs[0].consumers():
+        if reader.op_type in WEIGHTED and reader.inputs[1] is node.outputs[0]:
+            wanted = channel_axis(reader)
+            if axis != wanted:
+                yield error(
+                    "weight-axis",
+                    node,
+                    f"scales along axis {axis}; output channels of {reader.op_type}"
+                    f" run along {wanted}",
+                )
+
+
+def repeated_pairs(model: ir.Model) -> Iterator[Finding]:
+    """Nothing is quantized twice in a row."""
+    for node in pairs_of(model):
+        if node.op_type == QUANTIZE and is_pair(node.inputs[0]):
+            yield warning("repeated-pair", node, "quantizes what was just dequantized")
+
+
+def outputs(model: ir.Model) -> Iterator[Finding]:
+    """Outputs of the graph are as precise as their layer gives them."""
+    for value in model.graph.outputs:
+        if is_pair(value):
+            yield warning(
+                "output-pair", value.producer(), f"graph output {value.name} is rounded"
+            )
+
+
+def branches(model: ir.Model) -> Iterator[Finding]:
+    """Of an Add behind a convolution only the residual branch has a pair."""
+    for node in nodes_of(model):
+        if node.op_type != "Add" or not is_standard(node):
+            continue
+        rounded = [_rounds_convolution(value) for value in node.inputs]
+        if any(rounded) and not any(_is_convolution(value) for value in node.inputs):
+            yield warning(
+                "residual-branch",
+                node,
+                "a pair between a convolution and its Add keeps the two from fusing",
+            )
+
+
+def half_quantized(model: ir.Model) -> Iterator[Finding]:
+    """A layer reads int8 on both sides or on none."""
+    for node in nodes_of(model):
+        if node.op_type not in WEIGHTED or not is_standard(node):
+            continue
+        sides = [is_pair(value) for value in node.inputs[:2]]
+        if sides == [True, False]:
+            yield warning(
+                "half-quantized", node, "its weight is float: it runs in float"
+            )
+        elif sides == [False, True] and not _only_stored(node.inputs[1]):
+            yield warning("half-quantized", node, "only one operand is int8")
+        elif sides == [False, True]:
+            yield warning(
+                "half-quantized", node, "its activation is float: it runs in float"
+            )
+
+
+def float_weights(model: ir.Model) -> Iterator[Finding]:
+    """Weights are stored as int8, not as float that is quantized when it is built."""
+    for node in pairs_of(model):
+        value = node.inputs[0]
+        if node.op_type == QUANTIZE and stored(value):
+            yield warning("float-weight", node, "the weight is stored as float")
+
+
+def _is_weight(node: ir.Node) -> bool:
+    """Say whether a pair stands on a constant."""
+    value = node.inputs[0]
+    return stored(value) or (is_pair(value, QUANTIZE) and _only_stored(value))
+
+
+def _only_stored(value: ir.Value | None) -> bool:
+    """Say whether a value is a constant behind at most a pair."""
+    node = None if value is None else value.producer()
+    if node is not None and node.op_type in (QUANTIZE, DEQUANTIZE):
+        return _only_stored(node.inputs[0])
+    return stored(value)
+
+
+def _rounds_convolution(value: ir.Value | None) -> bool:
+    """Say whether a pair reads a convolution that nothing else reads."""
+    if value is None or not is_pair(value) or len(value.uses()) != 1:
+        return False
+    node = value.producer()
+    quantize = node.inputs[0].producer() if node and node.inputs[0] else None
+    source = quantize.inputs[0] if quantize is not None else None
+    return _is_convolution(source) and source is not None and len(source.uses()) == 1
+
+
+def _is_convolution(value: ir.Value | None) -> bool:
+    node = None if value is None else value.producer()
+    return node is not None and node.op_type in CONVOLUTIONS

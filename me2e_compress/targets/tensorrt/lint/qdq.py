@@ -1,0 +1,134 @@
+"""Explicit quantization: QuantizeLinear and DequantizeLinear as TensorRT wants them.
+
+Sources: NvInfer.h and the ONNX parser of TensorRT 10.7; its developer guide, "Explicit
+quantization". What TensorRT-RTX's parser lets pass silently (scales by channel on
+activations, uint8) is an error here.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.targets.finding import Finding, error, is_standard, nodes_of
+
+QUANTIZE, DEQUANTIZE = "QuantizeLinear", "DequantizeLinear"
+
+
+def pairs_of(model: ir.Model) -> Iterator[ir.Node]:
+    """Walk the QuantizeLinear and DequantizeLinear nodes."""
+    for node in nodes_of(model):
+        if is_standard(node) and node.op_type in (QUANTIZE, DEQUANTIZE):
+            yield node
+
+
+def is_pair(value: ir.Value | None, op: str = DEQUANTIZE) -> bool:
+    """Say whether a value comes out of a DequantizeLinear (or QuantizeLinear)."""
+    node = None if value is None else value.producer()
+    return node is not None and is_standard(node) and node.op_type == op
+
+
+def stored(value: ir.Value | None) -> bool:
+    """Say whether a value is an initializer or a Constant."""
+    return graph.array_of(value) is not None
+
+
+def scales(model: ir.Model) -> Iterator[Finding]:
+    """Scales are constants, finite and above zero."""
+    for node in pairs_of(model):
+        scale = graph.array_of(node.inputs[1])
+        if scale is None:
+            yield error("scale", node, "the scale is computed, must be a constant")
+            continue
+        numbers = scale.astype(np.float64)
+        if not np.isfinite(numbers).all() or not (numbers > 0).all():
+            worst = float(numbers.min())
+            yield error("scale", node, f"scale {worst:g}, must be finite and above 0")
+
+
+def zero_points(model: ir.Model) -> Iterator[Finding]:
+    """Quantization is symmetric and int8: zero points are 0, of type int8."""
+    for node in pairs_of(model):
+        value = node.inputs[2] if len(node.inputs) > 2 else None
+        kind = _integer_type(node, value)
+        if kind != ir.DataType.INT8:
+            name = "uint8" if kind is None else kind.name.lower()
+            yield error("quantized-type", node, f"{name}, must be int8")
+        zero = graph.array_of(value)
+        if value is not None and zero is None:
+            yield error("zero-point", node, "the zero point is computed")
+        elif zero is not None and zero.any():
+            found = int(zero.reshape(-1)[np.flatnonzero(zero)[0]])
+            yield error("zero-point", node, f"zero point {found}, must be 0")
+
+
+def biases(model: ir.Model) -> Iterator[Finding]:
+    """Biases stay float: no int32 behind a DequantizeLinear, no pair on a bias."""
+    for node in nodes_of(model):
+        if node.op_type not in ("Conv", "ConvTranspose", "Gemm"):
+            continue
+        if len(node.inputs) > 2 and is_pair(node.inputs[2]):
+            yield error("bias-pair", node, "the bias is quantized, must be float")
+
+
+def scalars(model: ir.Model) -> Iterator[Finding]:
+    """What is quantized has at least one dimension."""
+    for node in pairs_of(model):
+        if graph.static_shape(node.inputs[0]) == ():
+            yield error("scalar-pair", node, f"{node.op_type} of a 0-D tensor")
+
+
+def completeness(model: ir.Model) -> Iterator[Finding]:
+    """A QuantizeLinear is read by DequantizeLinears only, on the same scale."""
+    for node in pairs_of(model):
+        if node.op_type == QUANTIZE:
+            yield from _readers(node)
+        elif not stored(node.inputs[0]) and not is_pair(node.inputs[0], QUANTIZE):
+            made = node.inputs[0].producer() if node.inputs[0] is not None else None
+            what = "a graph input" if made is None else made.op_type
+            yield error("unpaired", node, f"reads integers of {what}")
+
+
+def _readers(node: ir.Node) -> Iterator[Finding]:
+    result = node.outputs[0]
+    if result.is_graph_output():
+        yield error("unpaired", node, "its integers are a graph output")
+    readers = list(result.consumers())
+    for reader in readers:
+        if reader.op_type != DEQUANTIZE or not is_standard(reader):
+            yield error("unpaired", node, f"its integers are read by {reader.op_type}")
+        elif not _same_scale(node, reader):
+            yield error("unpaired", node, "quantized and dequantized on two scales")
+    if not readers and not result.is_graph_output():
+        yield error("unpaired", node, "nothing reads its integers")
+
+
+def integers(model: ir.Model) -> Iterator[Finding]:
+    """Indices and shapes are not made of dequantized numbers."""
+    whole = {ir.DataType.INT32.value, ir.DataType.INT64.value}
+    for node in nodes_of(model):
+        if node.op_type != "Cast" or not is_pair(node.inputs[0]):
+            continue
+        if node.attributes.get_int("to", 0) in whole:
+            yield error(
+                "integer-pair",
+                node,
+                "a dequantized tensor is cast to an index or shape",
+            )
+
+
+def _same_scale(one: ir.Node, other: ir.Node) -> bool:
+    left, right = graph.array_of(one.inputs[1]), graph.array_of(other.inputs[1])
+    return left is None or right is None or np.array_equal(left, right)
+
+
+def _integer_type(node: ir.Node, zero: ir.Value | None) -> ir.DataType | None:
+    """Name the integer type: the zero point's, else the tensor's, else ONNX's uint8."""
+    if node.op_type == DEQUANTIZE and node.inputs[0] is not None:
+        kind = node.inputs[0].dtype
+        if kind is not None:
+            return kind
+    if zero is not None and zero.dtype is not None:
+        return zero.dtype
+    return ir.DataType.UINT8 if zero is None else None

@@ -1,0 +1,64 @@
+"""Take out of a graph what TensorRT-RTX has no library for."""
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import PreconditionError
+from me2e_compress.targets.finding import is_standard
+
+LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
+"""Operators that TensorRT takes, by its own plugins, and TensorRT-RTX does not."""
+
+
+def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
+    """Cut a graph at plugins: what they give becomes input, what they read output.
+
+    Nodes that the file brings a local function for are no plugins: the parser reads it.
+
+    Args:
+        model: the graph, shapes inferred; it stays as it is.
+
+    Returns:
+        The copy, and the names of the nodes that were cut out.
+
+    Raises:
+        PreconditionError: type or shape of what a plugin gives is not known.
+    """
+    copy = model.clone()
+    copy.metadata_props.clear()  # it speaks of inputs and outputs that change
+    gone = [node for node in copy.graph if _is_beyond(node, copy)]
+    names = tuple(node.name or str(node.outputs[0].name) for node in gone)
+    for node in gone:
+        _detach(copy.graph, node)
+    graph.sweep(copy)
+    return copy, names
+
+
+def _is_beyond(node: ir.Node, model: ir.Model) -> bool:
+    if is_standard(node):
+        return node.op_type in LACKING
+    return node.op_identifier() not in model.functions
+
+
+def _detach(where: ir.Graph, node: ir.Node) -> None:
+    for value in node.outputs:
+        if value.is_graph_output():
+            where.outputs.remove(value)
+        if not value.uses():
+            continue
+        if value.dtype is None or graph.static_shape(value) is None:
+            raise PreconditionError(
+                f"{node.op_type} {node.name!r} gives {value.name} of unknown type or"
+                " shape: the graph cannot be cut there"
+            )
+        name = str(value.name)
+        value.name = f"{name}_cut"
+        heir = ir.Value(name=name, shape=value.shape, type=value.type)
+        value.replace_all_uses_with(heir)
+        where.inputs.append(heir)
+    for index, read in enumerate(node.inputs):
+        computed = read is not None and read.producer() is not None
+        if read is not None and computed and not read.is_graph_output():
+            where.outputs.append(read)
+        node.replace_input_with(index, None)
+    where.remove(node)

@@ -1,0 +1,220 @@
+"""The whole way from nothing to a driver: collect, train, let it drive, train again."""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from me2e_compress.driving.latency import FixedLatency, LatencySource
+from me2e_compress.errors import TrainingError
+from me2e_compress.graph import sha256_of
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.runtime.atomic import write_json
+from me2e_compress.training import trial
+from me2e_compress.training.checkpoint import Start, fit
+from me2e_compress.training.curriculum import Course, Round, held_out_of
+from me2e_compress.training.episodes import Collection, collect
+from me2e_compress.training.log import Log
+from me2e_compress.training.loop import train
+from me2e_compress.training.options import difference
+from me2e_compress.training.process import LOG
+from me2e_compress.training.stored_episode import samples_in
+from me2e_compress.zoo.highway.config import HighwayConfig
+from me2e_compress.zoo.highway.stack import Highway
+from me2e_compress.zoo.highway.to_onnx import write
+
+MANIFEST = "course.json"
+NO_LATENCY = FixedLatency()
+
+
+@dataclass(frozen=True)
+class News:
+    """What a course is at.
+
+    Attributes:
+        what: in words.
+        done: of the present part.
+        total: of the present part.
+    """
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came of a round.
+
+    Attributes:
+        driver: the ``.onnx``.
+        scores: over the routes of the course's trial.
+        log: losses and scores, one JSON object a line.
+    """
+
+    driver: Path
+    scores: Scores
+    log: Path
+
+
+Listener = Callable[[News], None]
+
+
+def run(
+    course: Course,
+    folder: Path,
+    workers: int,
+    on_news: Listener = lambda news: None,
+    latency: LatencySource = NO_LATENCY,
+) -> tuple[Trained, ...]:
+    """Go the whole way, or what is left of it after an interruption.
+
+    The same course comes to the same bytes with as many workers, however often it was
+    interrupted.
+
+    Args:
+        course: the rounds.
+        folder: gets a folder a round: ``episodes/``, ``training-0/``, ``trial/``,
+            ``driver.onnx``.
+        workers: processes, for driving and for training.
+        on_news: told how far it is.
+        latency: what a decision costs in the trials.
+
+    Returns:
+        What came of each round; the last driver is the one that was asked for.
+
+    Raises:
+        TrainingError: the folder is of another course, an episode is damaged, or a
+            part failed.
+        EvaluationError: episodes or results of something else are in the way.
+    """
+    course = course.on(workers)
+    claim(folder, course)
+    way = _Way(course, folder, workers, on_news, latency)
+    return tuple(way.go(number, each) for number, each in enumerate(course.rounds))
+
+
+class _Way:
+    """What the rounds hand on to each other."""
+
+    def __init__(
+        self,
+        course: Course,
+        folder: Path,
+        workers: int,
+        on_news: Listener,
+        latency: LatencySource,
+    ) -> None:
+        self.course, self.folder, self.workers = course, folder, workers
+        self.on_news, self.latency = on_news, latency
+        self.learned, self.held_out = list[Path](), list[Path]()
+        self.start: Path | None = None
+        self.driver: Path | None = None
+
+    def go(self, number: int, each: Round) -> Trained:
+        """One round."""
+        place, label = self.folder / f"round-{number}", f"round {number}"
+        files = self._collect(each, place / "episodes", label)
+        if number == 0:
+            self.held_out = held_out_of(files)
+        fresh = [file for file in files if file not in self.held_out]
+        self.learned += fresh * each.repeat
+        self.start, log = self._train(each, place, label)
+        self.driver = place / "driver.onnx"
+        if not self.driver.exists():
+            write(load(self.start, self.course.config), self.driver)
+        scores = self._try(self.driver, place / "trial", label)
+        row = {"learned_frames": frames_in(self.learned), **trial.row_of(scores)}
+        log.add("closed_loop", each.trainings[-1].steps, row)
+        return Trained(self.driver, scores, log.path)
+
+    def _collect(self, each: Round, folder: Path, label: str) -> list[Path]:
+        student = None if each.expert_share == 1.0 else self.driver
+        what = Collection(
+            each.seed,
+            each.variants,
+            image_size=self.course.config.image_size,
+            scenarios=each.scenarios,
+            expert_share=each.expert_share,
+            student=None if student is None else sha256_of(student),
+        )
+        tell = self._teller(f"{label}: driving")
+        collect(
+            folder, what, student, self.workers, lambda now: tell(now.done, now.total)
+        )
+        return episodes_in(folder)
+
+    def _train(self, each: Round, place: Path, label: str) -> tuple[Path, Log]:
+        """All stages: the checkpoint and the log of the last."""
+        made, config = list[Path](), self.course.config
+        for number, training in enumerate(each.trainings):
+            tell = self._teller(f"{label}: training {number + 1}/{len(each.trainings)}")
+            folder = place / f"training-{number}"
+            files = (self.learned, self.held_out)
+            start = made[-1] if made else self.start
+            made.append(train(training, config, *files, start, folder, tell))
+        return made[-1], Log(made[-1].with_name(LOG))
+
+    def _try(self, driver: Path, folder: Path, label: str) -> Scores:
+        what, path = self.course.trial, self.folder / "trial.json"
+        tell = self._teller("finding routes to try the driver on")
+        routes = trial.routes_of(what, path, self.workers, tell)
+        tell = self._teller(f"{label}: trying the driver")
+        return trial.drive(driver, routes, folder, self.workers, tell, self.latency)
+
+    def _teller(self, what: str) -> Callable[[int, int], None]:
+        return lambda done, total: self.on_news(News(what, done, total))
+
+
+def load(checkpoint: Path, config: HighwayConfig) -> Highway:
+    """The driver of a checkpoint: its averaged weights.
+
+    Raises:
+        TrainingError: it is no checkpoint, or one of another model.
+    """
+    model = Highway(config)
+    fit(model, Start.load(checkpoint).mean, checkpoint)
+    return model.eval()
+
+
+def episodes_in(folder: Path) -> list[Path]:
+    """The episodes of a folder, in order, drafts left out."""
+    return sorted(
+        file for file in folder.glob("*.npz") if not file.name.startswith(".")
+    )
+
+
+def claim(folder: Path, course: Course) -> None:
+    """Make a folder that of a course, or check that it is.
+
+    Raises:
+        TrainingError: it is another one's, or holds something else.
+        OSError: it cannot be written.
+    """
+    manifest = folder / MANIFEST
+    folder.mkdir(parents=True, exist_ok=True)
+    if not manifest.exists():
+        if any(not file.name.startswith(".") for file in folder.iterdir()):
+            raise TrainingError(f"{folder}: not empty, and holds no {MANIFEST}")
+        write_json(manifest, asdict(course), indent=1)
+    try:
+        before = json.loads(manifest.read_bytes())
+    except ValueError as error:
+        raise TrainingError(f"{manifest}: not JSON") from error
+    if not isinstance(before, dict):
+        raise TrainingError(f"{manifest}: not a course")
+    if (words := difference(before, asdict(course))) is not None:
+        name, old, new = words
+        raise TrainingError(
+            f"{folder}: another course was begun here: its {name} is {old}, this one's "
+            f"{new}; take another folder, or the same options"
+        )
+
+
+def frames_in(files: Iterable[Path]) -> int:
+    """How many samples different episodes hold, six camera images each.
+
+    Raises:
+        TrainingError: a file is not an episode.
+    """
+    return sum(samples_in(file) for file in sorted(set(files)))

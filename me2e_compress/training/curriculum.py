@@ -1,0 +1,115 @@
+"""What a driver goes through: rounds of driving and learning."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Self
+
+from me2e_compress.errors import TrainingError
+from me2e_compress.training.process import Training
+from me2e_compress.zoo.highway.config import HighwayConfig
+
+HELD_OUT_FIRST, HELD_OUT_EVERY = 7, 28
+"""Of the expert's episodes these are only looked at: one of every other type, where
+there are 14 of each."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """Collect, then train on everything collected so far.
+
+    Attributes:
+        seed: of the routes that are driven.
+        variants: routes of each type.
+        expert_share: share of the driving that the expert does; less than 1 lets the
+            driver of the round before drive (DAgger, Ross et al., 2011).
+        trainings: what is learned then, one stage after the other.
+        scenarios: types of routes; empty for all 44.
+        repeat: how often its episodes are among those to learn from.
+    """
+
+    seed: int
+    variants: int
+    expert_share: float
+    trainings: tuple[Training, ...]
+    scenarios: tuple[str, ...] = ()
+    repeat: int = 1
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Fresh routes, admitted as those of the benchmark are, that nobody learns from.
+
+    Attributes:
+        seed: of the routes.
+        routes: how many, spread evenly over the types.
+        scenarios: types of routes; empty for all 44.
+    """
+
+    seed: int = 900
+    routes: int = 44
+    scenarios: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Course:
+    """All rounds. The first is driven by the expert alone.
+
+    Attributes:
+        rounds: in order.
+        trial: what the driver drives after every round, for the log.
+        config: sizes of the model.
+
+    Raises:
+        TrainingError: nobody could drive a round, nothing is learned in one, or the
+            trial's routes would be learned from.
+    """
+
+    rounds: tuple[Round, ...]
+    trial: Trial = field(default_factory=Trial)
+    config: HighwayConfig = field(default_factory=HighwayConfig)
+
+    def __post_init__(self) -> None:
+        """Check the rounds."""
+        if not self.rounds or self.rounds[0].expert_share != 1.0:
+            raise TrainingError("course: the expert drives alone in the first round")
+        for number, each in enumerate(self.rounds):
+            if not each.trainings:
+                raise TrainingError(f"course: nothing is learned in round {number}")
+            if each.seed == self.trial.seed:
+                raise TrainingError(
+                    f"course: the trial has the seed of round {number}, {each.seed}: "
+                    "it would drive what was learned by heart"
+                )
+
+    def on(self, workers: int) -> Self:
+        """The same with at most so many processes in training."""
+        rounds = tuple(
+            replace(
+                each,
+                trainings=tuple(
+                    replace(training, workers=min(workers, training.workers))
+                    for training in each.trainings
+                ),
+            )
+            for each in self.rounds
+        )
+        return replace(self, rounds=rounds)
+
+
+def held_out_of(files: Sequence[Path]) -> list[Path]:
+    """Those of the expert's episodes that are only looked at, at least one."""
+    return list(files[HELD_OUT_FIRST::HELD_OUT_EVERY] or files[:1])
+
+
+_PLANNER = Training(steps=600, rate=1.2e-3, modules=("planner",))
+FULL = Course(
+    (
+        Round(100, 14, 1.0, (Training(steps=1600), _PLANNER)),
+        Round(200, 4, 0.3, (Training(steps=600, rate=8e-4, seed=1), _PLANNER)),
+        Round(300, 4, 0.25, (Training(steps=600, rate=8e-4, seed=2), _PLANNER)),
+        Round(400, 4, 0.2, (Training(steps=800, rate=8e-4, seed=3), _PLANNER), (), 2),
+        Round(500, 4, 0.15, (Training(steps=600, rate=6e-4, seed=4), _PLANNER), (), 2),
+    )
+)
+"""A straight way to a driver such as the one that ships; hours on four cores."""

@@ -1,0 +1,105 @@
+"""Training in several processes that average their gradients; resumes after a kill."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from torch.multiprocessing.spawn import ProcessException, spawn
+
+from me2e_compress.errors import TrainingError
+from me2e_compress.runtime.parent import end_with_parent
+from me2e_compress.training.checkpoint import Checkpoint
+from me2e_compress.training.options import difference
+from me2e_compress.training.process import CHECKPOINT, Stage, Task, Training
+from me2e_compress.training.together import Together
+from me2e_compress.zoo.highway.config import HighwayConfig
+
+__all__ = ["Training", "train"]
+
+LOOK_S = 0.5
+"""Between two looks at how far the processes are."""
+MAY_CHANGE = ("steps", "save_every", "check_every", "check_count")
+"""Of a stage that goes on: the rest decides what its checkpoint means."""
+
+
+def train(
+    what: Training,
+    config: HighwayConfig,
+    files: Sequence[Path],
+    held_out: Sequence[Path],
+    start: Path | None,
+    folder: Path,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> Path:
+    """Run a stage, or what is left of it.
+
+    With the same arguments it comes to the same weights, however often it was
+    interrupted; another number of workers draws other batches.
+
+    Args:
+        what: the stage.
+        config: sizes of the model.
+        files: episodes to learn from; what is named twice is drawn twice as often.
+        held_out: episodes that are only looked at.
+        start: checkpoint to begin with, or the one that ships
+            (`me2e_compress.zoo.shipped.checkpoint`); None begins with random weights.
+        folder: gets ``last.pt`` and ``log.jsonl``.
+        on_step: told now and then how many steps of how many are done.
+
+    Returns:
+        The checkpoint.
+
+    Raises:
+        TrainingError: fewer episodes than processes, a file is not what it should be,
+            another stage was begun in the folder, or a process died.
+    """
+    if len(set(files)) < what.workers or not held_out:
+        raise TrainingError(
+            f"{len(set(files))} episodes and {len(held_out)} held out are too few for "
+            f"{what.workers} processes"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    last = folder / CHECKPOINT
+    if last.exists() and _steps(last, what) >= what.steps:
+        return last
+    task = Task(what, config, tuple(files), tuple(held_out), start, folder)
+    together = Together.of(what.workers, config)
+    try:
+        running = spawn(_process, (task, together), what.workers, join=False)
+        while running is not None and not running.join(LOOK_S):
+            on_step(together.told(), what.steps)
+    except ProcessException as error:
+        raise TrainingError(f"{folder}: training failed: {_told(error)}") from error
+    on_step(what.steps, what.steps)
+    return last
+
+
+def _process(rank: int, task: Task, together: Together) -> None:
+    end_with_parent()
+    torch.set_num_threads(1)
+    Stage(rank, together, task).run()
+
+
+def _told(error: ProcessException) -> str:
+    """The last line of what a process died of, without the name of our own errors."""
+    last = str(error).strip().splitlines()[-1]
+    kind, _, words = last.partition(": ")
+    return words if kind.startswith("me2e_compress.errors.") else last
+
+
+def _steps(checkpoint: Path, what: Training) -> int:
+    """How many steps a checkpoint of this stage has behind it.
+
+    Raises:
+        TrainingError: it is none, or of another stage.
+    """
+    found = Checkpoint.load(checkpoint)
+    words = difference(json.loads(found.what), asdict(what), MAY_CHANGE)
+    if words is not None:
+        raise TrainingError(
+            f"{checkpoint}: of another training: its {words[0]} is {words[1]}, this "
+            f"one's {words[2]}"
+        )
+    return found.step

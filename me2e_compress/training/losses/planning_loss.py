@@ -1,0 +1,123 @@
+"""The expert's plan: which candidate, and how it bends."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from me2e_compress.training.labels import Targets
+from me2e_compress.zoo.highway.config import STEP_S, STEPS, BevArea
+from me2e_compress.zoo.highway.costs import (
+    agent_costs,
+    between_travel,
+    beyond_lines,
+    discs_of,
+    ground,
+    swept,
+)
+from me2e_compress.zoo.highway.interfaces import Candidates
+
+NEAR_STEPS = (3.0, 2.0, 1.5, 1.0, 0.75, 0.75)
+"""Weights of the waypoints: the controller acts on the first two."""
+ASIDE = 2.0
+"""A metre to the side counts as two along the route."""
+SOFT_M = 0.2
+"""How much farther than the best a candidate may be and still count."""
+DOOMED = 0.5
+"""An overlap of the expert's plan with somebody, in its first two seconds, above which
+it is no example: it gave up, or the driver had brought it where nothing helps."""
+DOOMED_INSTANTS = 8
+"""Of a quarter of a second each."""
+STILL_M = 0.05
+"""A step shorter than this has no direction of its own."""
+DECISIVE = 2.0
+"""Extra weight of samples where the actors change the plan."""
+
+
+def plan_losses(
+    candidates: Candidates, wanted: Targets, area: BevArea
+) -> dict[str, Tensor]:
+    """Choice, the distance of the right candidate, and what the choice would hit.
+
+    Args:
+        candidates: of the planner.
+        wanted: labels.
+        area: of the bird's-eye view.
+    """
+    steps = torch.tensor(NEAR_STEPS) / sum(NEAR_STEPS)
+    side = torch.tensor([1.0, ASIDE])
+    aim = wanted.moves[:, None]
+    to_anchor = ((candidates.anchors - aim).abs() * side).sum(-1) @ steps
+    to_plan = ((candidates.moves.detach() - aim).abs() * side).sum(-1) @ steps
+    share = functional.softmax(-to_plan / SOFT_M, -1)
+    weight = 1 + DECISIVE * (wanted.shift_m > 0.5).float()
+    weight = weight * ~doomed(wanted)
+    weight = weight / weight.mean().clamp(min=1e-3)
+    choice = -(share * candidates.logits.log_softmax(-1)).sum(-1)
+    best = to_anchor.argmin(1)
+    rows = torch.arange(len(best))
+    bend = ((candidates.moves[rows, best] - wanted.moves).abs() * side).sum(-1) @ steps
+    place = (candidates.plans[rows, best] - wanted.plan).abs().sum(-1) @ steps
+    harm = true_harm(candidates, wanted, area)
+    more = (harm - harm[rows, best][:, None]).clamp(min=0)
+    return {
+        "choice": (choice * weight).mean(),
+        "bend": (bend * weight).mean(),
+        "place": (place * weight).mean(),
+        "safe": (candidates.logits.softmax(-1) * more).sum(-1).mean(),
+    }
+
+
+@torch.no_grad()
+def true_harm(candidates: Candidates, wanted: Targets, area: BevArea) -> Tensor:
+    """[B, K] what each candidate would have met (rules as targets: Hydra-MDP, 2024).
+
+    Overlap with where everybody really was, ground that is no road, lines of lights
+    that are not green.
+
+    Args:
+        candidates: of the planner.
+        wanted: labels.
+        area: of the bird's-eye view.
+    """
+    plans, headings = candidates.plans.detach(), candidates.headings.detach()
+    overlap = _overlap(plans, headings, wanted)
+    under = ground(discs_of(plans, headings), wanted.raster, area)
+    beside = (1 - under[..., 0] - under[..., 1]).clamp(min=0).amax(-1)
+    there, gap, state = wanted.signals[:, 0].unbind(-1)
+    closed = there * ((state == 0) | (state == 1))
+    past = beyond_lines(candidates.moves[..., 0].detach(), gap[:, None]).amax(2)[..., 0]
+    return overlap.amax(-1) + beside + past * closed[:, None]
+
+
+@torch.no_grad()
+def doomed(wanted: Targets) -> Tensor:
+    """[B] whether the expert's own plan meets somebody soon."""
+    plan = wanted.plan
+    step = torch.diff(plan, dim=1, prepend=torch.zeros_like(plan[:, :1]))
+    heading = torch.atan2(step[..., 1], step[..., 0])
+    heading = heading * (step.norm(dim=-1) > STILL_M)
+    overlap = _overlap(plan[:, None], heading[:, None], wanted)
+    soon: Tensor = overlap[:, 0, :DOOMED_INSTANTS].amax(-1) > DOOMED
+    return soon
+
+
+def _overlap(plans: Tensor, headings: Tensor, wanted: Targets) -> Tensor:
+    """[B, K, 12] with where everybody really was, every quarter of a second."""
+    agents = wanted.agents
+    columns = [1, 2, 5, 6, 3, 4, 7, 8]
+    drift = agents[:, :, None, 7:9] * STEP_S * torch.arange(1, 1 + STEPS)[:, None]
+    travel = torch.where(wanted.travel_known[..., None], wanted.travel, drift)
+    overlap, _ = agent_costs(
+        swept(plans, headings),
+        agents[..., columns],
+        wanted.there.float(),
+        between_travel(travel[:, :, None]),
+        torch.ones_like(agents[..., :1]),
+    )
+    return overlap
+
+
+def displacement(plans: Tensor, wanted: Targets) -> Tensor:
+    """[B] mean distance of plans [B, 6, 2] from the expert's, metres."""
+    away: Tensor = (plans - wanted.plan).norm(dim=-1)
+    return away.mean(-1)

@@ -1,0 +1,225 @@
+"""One of the processes that train."""
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.training.checkpoint import Checkpoint, Start, fit
+from me2e_compress.training.data import Episodes, Sequences
+from me2e_compress.training.descent import Descent, Mean
+from me2e_compress.training.frenet import anchors_of
+from me2e_compress.training.lessons import Lessons
+from me2e_compress.training.log import Log
+from me2e_compress.training.losses import LampHead
+from me2e_compress.training.step import Augmentation, total
+from me2e_compress.training.together import Together
+from me2e_compress.training.validation import validate
+from me2e_compress.zoo.highway.config import HighwayConfig
+from me2e_compress.zoo.highway.stack import Highway
+
+CHECKPOINT, LOG = "last.pt", "log.jsonl"
+WARM_UP = 100
+"""Steps in which the learning rate grows."""
+LAST_SHARE = 0.01
+"""Of the highest learning rate, when the cosine has come to its end."""
+SMOOTH = 0.97
+"""Decay of the losses that the log tells: they look back over about 30 steps."""
+PLANNER_ALONE = ("planner",)
+
+
+@dataclass(frozen=True)
+class Training:
+    """One stage of training.
+
+    Attributes:
+        steps: optimizer steps.
+        batch: sequences a step and process.
+        workers: processes.
+        rate: highest learning rate.
+        seed: of everything random.
+        save_every: steps between checkpoints.
+        check_every: steps between looks at held-out samples.
+        check_count: sequences of a look.
+        modules: which learn; empty: all. The planner alone learns from what the others
+            said once.
+        sequences: how sequences are drawn.
+        augmentation: what is made harder.
+    """
+
+    steps: int
+    batch: int = 6
+    workers: int = 4
+    rate: float = 1.5e-3
+    seed: int = 0
+    save_every: int = 100
+    check_every: int = 200
+    check_count: int = 240
+    modules: tuple[str, ...] = ()
+    sequences: Sequences = field(default_factory=Sequences)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A stage and its files.
+
+    Attributes:
+        what: the stage.
+        config: sizes of the model.
+        files: episodes to learn from.
+        held_out: episodes that are only looked at.
+        start: checkpoint to begin with, or what is left of one (`Start`); None begins
+            with random weights.
+        folder: gets ``last.pt`` and ``log.jsonl``.
+    """
+
+    what: Training
+    config: HighwayConfig
+    files: tuple[Path, ...]
+    held_out: tuple[Path, ...]
+    start: Path | None
+    folder: Path
+
+
+class Stage:
+    """What one process holds while it trains."""
+
+    def __init__(self, rank: int, together: Together, task: Task) -> None:
+        """Read the episodes and begin, or go on where the checkpoint is.
+
+        Args:
+            rank: of this process; the first one checks, saves and logs.
+            together: all processes.
+            task: the same in every process.
+
+        Raises:
+            TrainingError: a file is not what it should be.
+        """
+        self.rank, self.together, self.task = rank, together, task
+        what, size = task.what, task.config.image_size
+        torch.manual_seed(what.seed)
+        self.model, self.lamps = Highway(task.config), LampHead(task.config.channels)
+        mine = set(list(dict.fromkeys(task.files))[rank :: what.workers])
+        episodes = Episodes([file for file in task.files if file in mine], size)
+        self.held_out = Episodes(task.held_out, size) if rank == 0 else None
+        self.lidar2img = torch.from_numpy(CameraRig(*size).lidar2img)
+        self.lessons = Lessons(
+            episodes, self.lidar2img, what.batch, what.sequences, what.augmentation
+        )
+        self._begin(episodes)
+        # torch's stubs leave this form of `to` out
+        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.descent = Descent(self._learning(), what.rate, together)
+        self.mean, self.step = Mean(self.model), 0
+        self.log, self.running = Log(task.folder / LOG), dict[str, float]()
+        self._resume()
+        if what.modules == PLANNER_ALONE and self.step < what.steps:
+            self.lessons.freeze(self.model)
+        self.begun = time.monotonic() - self._spent_s()
+
+    def _begin(self, episodes: Episodes) -> None:
+        if self.task.start is not None:
+            found = Start.load(self.task.start)
+            fit(self.model, found.mean, self.task.start)
+            fit(self.lamps, found.lamps, self.task.start)
+            return
+        anchors = self.model.planner.anchors
+        mine = torch.zeros_like(anchors)
+        if self.rank == 0:
+            mine = torch.from_numpy(anchors_of(episodes.departures(), len(anchors)))
+        everybody = self.together.mean(self.rank, mine.flatten())
+        anchors.copy_(everybody.view_as(anchors) * self.task.what.workers)
+
+    def _learning(self) -> list[torch.nn.Parameter]:
+        names = self.task.what.modules
+        for name, child in self.model.named_children():
+            child.requires_grad_(not names or name in names)
+        everything = [*self.model.parameters(), *self.lamps.parameters()]
+        return [p for p in everything if p.requires_grad]
+
+    def _resume(self) -> None:
+        path = self.task.folder / CHECKPOINT
+        if path.exists():
+            found = Checkpoint.load(path)
+            fit(self.model, found.mean, path)
+            fit(self.model, found.model, path)
+            fit(self.lamps, found.lamps, path)
+            self.descent.optimizer.load_state_dict(found.optimizer)
+            self.mean.weights, self.step = dict(found.mean), found.step
+        if self.rank == 0:
+            self.log.rewind(self.step)
+
+    def _spent_s(self) -> float:
+        """What the log says that was spent before, seconds."""
+        rows = self.log.rows() if self.rank == 0 else []
+        return max((row.get("seconds", 0.0) for row in rows), default=0.0)
+
+    def run(self) -> None:
+        """Train to the end."""
+        what = self.task.what
+        while self.step < what.steps:
+            rng = np.random.default_rng([what.seed, self.step, self.rank])
+            losses = self.lessons.losses(self.model, self.lamps, rng)
+            self.descent.step(total(losses), rate_at(what, self.step), self.rank)
+            self._note(losses)
+            if self.rank == 0:
+                self.mean.follow(self.model, self.step)
+            self.step += 1
+            last = self.step == what.steps
+            if self.step % what.check_every == 0 or last:
+                self._check()
+            if self.step % what.save_every == 0 or last:
+                self._save()
+            if self.rank == 0:
+                self.together.tell(self.step)
+
+    def _note(self, losses: Mapping[str, Tensor]) -> None:
+        for name, loss in losses.items():
+            value = float(loss.detach())
+            old = self.running.get(name, value)
+            self.running[name] = SMOOTH * old + (1 - SMOOTH) * value
+
+    def _check(self) -> None:
+        """Look at held-out samples with the averaged weights; log."""
+        if self.held_out is None:
+            return
+        mine = {k: v.clone() for k, v in self.model.state_dict().items()}
+        self.model.load_state_dict(self.mean.weights)
+        self.model.eval()
+        count = self.task.what.check_count
+        found = validate(
+            self.model, self.lamps, self.held_out, self.lidar2img, count, min(count, 10)
+        )
+        self.model.load_state_dict(mine)
+        row = {
+            "seconds": round(time.monotonic() - self.begun, 1),
+            "held_out": found,
+            "training": {k: round(v, 4) for k, v in self.running.items()},
+        }
+        self.log.add("losses", self.step, row)
+
+    def _save(self) -> None:
+        if self.rank == 0:
+            Checkpoint(
+                self.model.state_dict(),
+                self.mean.weights,
+                self.lamps.state_dict(),
+                self.descent.optimizer.state_dict(),
+                self.step,
+                json.dumps(asdict(self.task.what)),
+            ).save(self.task.folder / CHECKPOINT)
+
+
+def rate_at(what: Training, step: int) -> float:
+    """The learning rate of a step: it warms up, then falls along a cosine."""
+    warm = min(1.0, (step + 1) / WARM_UP)
+    cosine = 0.5 * (1 + math.cos(math.pi * step / what.steps))
+    return what.rate * warm * (cosine + LAST_SHARE)

@@ -1,0 +1,105 @@
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.insert_probes import GAUGES, arrange, tap
+from me2e_compress.calibration.probes import Extremes
+from me2e_compress.calibration.statistics import BINS
+from me2e_compress.calibration.stream import gauged
+from me2e_compress.runtime.session import Session
+from tests.frames import record
+from tests.nets import conv_attention, image
+
+TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
+
+
+def test_gauges_stand_right_behind_what_they_watch() -> None:
+    ops = [node.op_type for node in tap(conv_attention(), ["a"], Extremes()).graph]
+
+    assert ops[:4] == ["Conv", "ReduceMin", "ReduceMax", "ReduceSumSquare"]
+
+
+@pytest.mark.parametrize("optimize", [False, True])
+def test_readings_are_those_of_numpy(optimize: bool) -> None:
+    model = conv_attention()
+    feeds = {**image(3), "memory": np.zeros((1, 8, 64), np.float32)}
+    bare = model.clone()
+    made = {value.name: value for node in bare.graph for value in node.outputs}
+    bare.graph.outputs.extend(made[name] for name in TENSORS[1:-1])
+    values = {**Session(bare, threads=1, optimize=False).run(feeds), **feeds}
+    session = gauged(model, TENSORS[:-1], Extremes(), threads=1, optimize=optimize)
+
+    readings = session.run(feeds, [GAUGES])[GAUGES].reshape(-1, 3)
+
+    for name, (low, high, square) in zip(TENSORS, readings, strict=False):
+        x = values[name].astype(np.float64)
+        expected = (x.min(), x.max(), np.mean(x * x))
+        assert (low, high, square) == pytest.approx(expected, rel=1e-4), name
+
+
+def test_gauged_models_still_answer_and_keep_their_metadata() -> None:
+    model = conv_attention()
+    model.metadata_props["me2e.recurrent"] = '{"memory": "memory_out"}'
+    feeds = {**image(3), "memory": np.zeros((1, 8, 64), np.float32)}
+    session = gauged(model, TENSORS, Extremes(), threads=1, optimize=True)
+    other = Session(model)
+
+    assert session.recurrent == {"memory": "memory_out"}
+    ours, plain = (np.asarray(s.run(feeds)["y"], float) for s in (session, other))
+    np.testing.assert_allclose(ours, plain, rtol=1e-5, atol=1e-5)
+
+
+def test_arranging_lets_gauges_run_as_soon_as_they_can() -> None:
+    model = tap(conv_attention(), TENSORS, Extremes())
+    late = [node for node in model.graph if (node.name or "").startswith(GAUGES)]
+    model.graph.remove(late)
+    model.graph.extend(late)
+
+    arrange(model)
+
+    nodes = list(model.graph)
+    assert {node.name for node in nodes} >= {node.name for node in late}
+    made = {value: at for at, node in enumerate(nodes) for value in node.outputs}
+    driving = [at for at, n in enumerate(nodes) if not str(n.name).startswith(GAUGES)]
+    for at, node in enumerate(nodes):
+        sources = [made[value] for value in node.inputs if value in made]
+        assert all(source < at for source in sources)
+        if at not in driving and sources and node.op_type != "Concat":
+            assert not [other for other in driving if max(sources) < other < at]
+
+
+def test_nodes_that_lead_nowhere_survive_the_arranging() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[2] x, bool c) => (float[2] y) { y = Relu(x)"
+        " z = If (c) <then_branch = t () => (float[2] a) { a = Abs(y) },"
+        " else_branch = e () => (float[2] b) { b = Neg(y) }> }"
+    )
+
+    arrange(model)
+
+    assert [node.op_type for node in model.graph] == ["Relu", "If"]
+
+
+@pytest.mark.parametrize("opset", [13, 17])
+def test_histograms_are_those_of_numpy(tmp_path: Path, opset: int) -> None:
+    model = ir.from_onnx_text(
+        f'<ir_version: 9, opset_import: ["" : {opset}]>\n'
+        "m (float[4,900] x) => (float[4,900] y) { y = Neg(x) }"
+    )
+    draws = np.random.default_rng(0)
+    arrays = [draws.normal(0, 3, (4, 900)).astype(np.float32) for _ in range(3)]
+    frames = CalibrationSet(record(tmp_path, [{"x": each} for each in arrays]))
+
+    seen = Calibrator("mse", threads=1).collect(model, ["x", "y"], frames)
+
+    together = np.abs(np.stack(arrays))
+    edge = 2.0 ** np.frexp(together.max())[1]
+    expected, _ = np.histogram(together, BINS, (0, edge))
+    np.testing.assert_array_equal(seen.counted(), [expected, expected])
+    assert graph.digest(model) == seen.model

@@ -1,0 +1,143 @@
+from itertools import islice
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.driving.latency import (
+    FixedLatency,
+    LatencySource,
+    MeasuredLatency,
+    TraceLatency,
+    parse_latency,
+)
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.latency_trace import LatencyTrace
+
+SAMPLES = (10_000, 20_000, 70_000)
+
+
+@pytest.fixture
+def trace(tmp_path: Path) -> Path:
+    path = tmp_path / "trace.json"
+    LatencyTrace("abc", "a bench", SAMPLES).save(path)
+    return path
+
+
+def charges(source: LatencySource, route: str, count: int = 60) -> list[int]:
+    charge = source.on_route(route)
+    return [charge(123) for _ in range(count)]
+
+
+def test_a_frame_rate_charges_its_period() -> None:
+    assert charges(parse_latency("fps:10"), "r", 2) == [100_000, 100_000]
+    assert charges(parse_latency(f"fps:{1 / 0.15}"), "r", 1) == [150_000]
+
+
+def test_none_charges_nothing() -> None:
+    assert parse_latency("none") == FixedLatency(0)
+
+
+def test_a_trace_in_order_starts_over_on_every_route(trace: Path) -> None:
+    source = parse_latency(f"trace:{trace}", in_order=True, scale=2.0)
+
+    for route in ("a", "b"):
+        assert charges(source, route, 4) == [20_000, 40_000, 140_000, 20_000]
+
+
+def test_a_trace_is_drawn_by_seed_and_route(trace: Path) -> None:
+    source = parse_latency(f"trace:{trace}", seed=1)
+    first = charges(source, "a")
+
+    assert set(first) == set(SAMPLES)
+    assert first == charges(source, "a")
+    assert first != charges(source, "b")
+    assert first != charges(parse_latency(f"trace:{trace}", seed=2), "a")
+
+
+@pytest.mark.parametrize("in_order", [False, True])
+def test_a_negative_seed_is_refused_before_anything_drives(
+    trace: Path, in_order: bool
+) -> None:
+    with pytest.raises(EvaluationError, match="latency: seed -1: must be 0 or more"):
+        parse_latency(f"trace:{trace}", in_order=in_order, seed=-1)
+
+
+def test_a_route_does_not_depend_on_what_drove_before() -> None:
+    source = TraceLatency(SAMPLES)
+    alone = charges(source, "a")
+    one, other = source.on_route("b"), source.on_route("a")
+
+    mixed = [(one(0), other(0))[1] for _ in range(60)]
+
+    assert mixed == alone
+
+
+def test_a_measurement_is_scaled_and_says_so() -> None:
+    source = parse_latency("measured", scale=3.0)
+
+    assert source == MeasuredLatency(3.0)
+    assert source.measures
+    assert charges(source, "r", 1) == [369]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("fps:0", "not a positive number"),
+        ("fps:-3", "not a positive number"),
+        ("fps:ten", "not a positive number"),
+        ("fps:nan", "not a positive number"),
+        ("fps:", "there are none, fps:F"),
+        ("10", "there are none, fps:F"),
+        ("trace:/no/such/file", "No such file"),
+    ],
+)
+def test_other_words_are_refused_on_one_line(text: str, words: str) -> None:
+    with pytest.raises(EvaluationError, match=words) as caught:
+        parse_latency(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_scale_is_positive(scale: float) -> None:
+    with pytest.raises(EvaluationError, match="scale"):
+        parse_latency("measured", scale=scale)
+
+
+def test_percentiles_are_samples() -> None:
+    trace = LatencyTrace("abc", "a bench", tuple(range(1, 101)))
+
+    record = trace.to_json()
+
+    assert [record[f"p{p}_us"] for p in (50, 90, 99)] == [50, 90, 99]
+    assert record["max_us"] == 100
+
+
+def test_a_trace_comes_back(trace: Path) -> None:
+    assert LatencyTrace.load(trace) == LatencyTrace("abc", "a bench", SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        '{"model_sha256": "a", "machine": "b", "samples_us": []}',
+        '{"model_sha256": "a", "machine": "b", "samples_us": [-1]}',
+        '{"model_sha256": "a", "machine": "b", "samples_us": [1.5]}',
+    ],
+)
+def test_another_file_is_no_trace(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "trace.json"
+    path.write_text(text)
+
+    with pytest.raises(EvaluationError, match=r"trace.json: not a latency trace"):
+        LatencyTrace.load(path)
+
+
+def test_the_fingerprint_of_a_trace_is_its_samples() -> None:
+    same = [TraceLatency(SAMPLES).to_json(), TraceLatency(SAMPLES).to_json()]
+    other = TraceLatency((*SAMPLES, 1)).to_json()
+
+    assert same[0] == same[1] != other
+    assert list(islice(other, 1)) == ["trace_sha256"]

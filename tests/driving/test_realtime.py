@@ -1,0 +1,91 @@
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from me2e_compress.driving.realtime import HeldControl, skipped_decisions
+
+latencies = st.lists(st.integers(0, 600_000), min_size=1, max_size=12)
+steps = st.sampled_from([50_000, 25_000, 10_000])
+
+
+@pytest.mark.parametrize(
+    ("latency_us", "skipped"),
+    [
+        (0, 0),
+        (49_999, 0),
+        (50_000, 0),
+        (99_999, 0),
+        (100_000, 1),
+        (130_000, 1),
+        (149_999, 1),
+        (150_000, 2),
+        (250_000, 4),
+        (850_000, 16),
+    ],
+)
+def test_equation_4_at_20_hz(latency_us: int, skipped: int) -> None:
+    assert skipped_decisions(latency_us) == skipped
+
+
+@given(st.integers(0, 5_000_000), steps)
+def test_equation_4_in_exact_fractions(latency_us: int, dt_us: int) -> None:
+    seconds, dt = Fraction(latency_us, 10**6), Fraction(dt_us, 10**6)
+
+    assert skipped_decisions(latency_us, dt_us) == max(0, int(seconds / dt) - 1)
+
+
+def test_a_finer_step_tells_fast_policies_apart() -> None:
+    assert skipped_decisions(20_000) == skipped_decisions(90_000) == 0
+    assert skipped_decisions(20_000, 10_000) == 1
+    assert skipped_decisions(90_000, 10_000) == 8
+
+
+def by_the_text(latencies_us: list[int], dt_us: int) -> tuple[list[int], list[int]]:
+    """Decision d is number d, the initial control -1: (acting, deciding) frames.
+
+    Written frame by frame from the rule: the control in force before frame k stays
+    for k .. k + n, the new one acts from k + n + 1, where the next is decided; with
+    n = 0 it acts at once.
+    """
+    acting: list[int] = []
+    deciding: list[int] = []
+    before = -1
+    for number, latency_us in enumerate(latencies_us):
+        n = max(0, latency_us // dt_us - 1)
+        deciding.append(len(acting))
+        acting += [number if n == 0 else before] * (n + 1)
+        before = number
+    return acting, deciding
+
+
+@given(latencies, steps)
+def test_the_clock_follows_the_rule(latencies_us: list[int], dt_us: int) -> None:
+    held = HeldControl(-1, dt_us)
+    expected, expected_decisions = by_the_text(latencies_us, dt_us)
+
+    acting, decided_at = list[int](), list[int]()
+    for frame in range(len(expected)):
+        if held.decision_is_due:
+            held.decide(len(decided_at), latencies_us[len(decided_at)])
+            decided_at.append(frame)
+        acting.append(held.advance())
+
+    assert acting == expected
+    assert decided_at == expected_decisions
+    assert held.decision_is_due
+
+
+@given(latencies)
+def test_every_frame_has_a_control_and_none_decides_twice(
+    latencies_us: list[int],
+) -> None:
+    held = HeldControl(-1)
+    for number, latency_us in enumerate(latencies_us):
+        assert held.decision_is_due
+        held.decide(number, latency_us)
+        for _ in range(skipped_decisions(latency_us)):
+            held.advance()
+            assert not held.decision_is_due
+        held.advance()

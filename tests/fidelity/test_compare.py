@@ -1,0 +1,193 @@
+import json
+import math
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.fidelity.compare import Displacement, compare
+from me2e_compress.fidelity.reaction import plan_reaction
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.session import Session
+
+SCALED = """
+<ir_version: 9, opset_import: ["" : 17]>
+scaled (float[1,2] x, float[1,2] s) => (float[1,2] y, float[1,2] s_out)
+<float gain = {%s}> {
+    sum = Add(x, s)
+    s_out = Mul(sum, gain)
+    y = Identity(s_out)
+}
+"""
+
+PLANNER = """
+<ir_version: 9, opset_import: ["" : 17]>
+planner (float[1,3,6,2] x, int64[1] command) => (float[1,3,6,2] modes, int64[1] c)
+<float step = {%s}> {
+    modes = Add(x, step)
+    c = Identity(command)
+}
+"""
+
+VIEWER = """
+<ir_version: 9, opset_import: ["" : 17]>
+viewer (float[1,2,3,2,2] img) => (float[1,6,2] plan)
+<int64[3] shape = {1, 6, 2}, int64[1] first = {0}, int64[1] second = {1},
+ int64[1] axis = {1}> {
+    one = Slice(img, first, second, axis)
+    plan = Reshape(one, shape)
+}
+"""
+
+
+def scaled(gain: float) -> Session:
+    return Session(ir.from_onnx_text(SCALED % gain))
+
+
+def ones(index: int, starts: bool = False) -> Frame:
+    return Frame(index, starts, {"x": np.ones((1, 2), np.float32)})
+
+
+def planner(step: float, **adapter: object) -> Session:
+    model = ir.from_onnx_text(PLANNER % step)
+    if adapter:
+        model.metadata_props["me2e.plan"] = json.dumps(adapter)
+    return Session(model)
+
+
+def modes(command: int = 0) -> Frame:
+    arrays = {"x": np.zeros((1, 3, 6, 2), np.float32), "command": np.array([command])}
+    return Frame(0, True, arrays)
+
+
+def test_equal_models_are_infinitely_faithful() -> None:
+    found = compare(scaled(0.5), scaled(0.5), [ones(0, True), ones(1)])
+
+    assert [(each.name, each.sqnr_db, each.error) for each in found.outputs] == [
+        ("y", math.inf, 0.0),
+        ("s_out", math.inf, 0.0),
+    ]
+    assert (found.frames, found.missing, found.plan) == (2, (), None)
+    assert "does not say" in found.plan_reason
+
+
+def test_signal_to_noise_pools_all_frames_each_model_with_its_own_state() -> None:
+    found = compare(scaled(1.0), scaled(0.5), [ones(0, True), ones(1), ones(2, True)])
+
+    # a: 1, 2, 1; b: 0.5, 0.75, 0.5
+    noise, signal = 0.25 + 1.5625 + 0.25, 1 + 4 + 1
+    assert found.outputs[0].sqnr_db == pytest.approx(10 * math.log10(signal / noise))
+    assert found.outputs[0].error == pytest.approx(1.25 / 2)
+
+
+@pytest.mark.parametrize(
+    ("adapter", "mean", "largest"),
+    [
+        ({"output": "modes"}, math.sqrt(2), math.sqrt(2)),
+        ({"output": "modes", "deltas": True}, 3.5 * math.sqrt(2), 6 * math.sqrt(2)),
+    ],
+)
+def test_the_plan_moves_in_metres(
+    adapter: dict[str, object], mean: float, largest: float
+) -> None:
+    found = compare(planner(0, **adapter), planner(1, **adapter), [modes()])
+
+    assert found.plan is not None
+    assert found.plan.mean_m == pytest.approx(mean)
+    assert found.plan.max_m == pytest.approx(largest)
+    assert found.plan_reason == ""
+
+
+@pytest.mark.parametrize(
+    ("command_input", "default", "mode"), [("command", 0, 2), (None, 1, 1)]
+)
+def test_the_command_picks_the_mode(
+    command_input: str | None, default: int, mode: int
+) -> None:
+    adapter = PlanAdapter(
+        output="modes", command_input=command_input, default_mode=default
+    )
+    value = np.arange(36, dtype=np.float32).reshape(1, 3, 6, 2)
+
+    plan = adapter.plan({"modes": value}, {"command": np.array([2])})
+
+    np.testing.assert_array_equal(plan, value[0, mode])
+
+
+def test_a_mode_that_is_not_there_is_an_error() -> None:
+    adapter = PlanAdapter(output="modes", default_mode=3)
+
+    with pytest.raises(GraphError, match="mode 3 of modes: it has 3"):
+        adapter.plan({"modes": np.zeros((1, 3, 6, 2))}, {})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not a plan"),
+        ("{}", "is not a plan"),
+        ('{"output": "y", "stride": 1}', "is not a plan"),
+        ('{"output": "z"}', "names output z; there is y"),
+    ],
+)
+def test_metadata_that_describes_no_plan_is_refused(text: str, message: str) -> None:
+    with pytest.raises(GraphError, match=message):
+        PlanAdapter.of({"me2e.plan": text}, ["y"])
+
+
+def test_an_output_called_plan_is_the_plan() -> None:
+    assert PlanAdapter.of({}, ["bev", "plan"]) == PlanAdapter(output="plan")
+    assert PlanAdapter.of({}, ["bev"]) is None
+
+
+def test_a_number_that_is_none_is_an_error_by_name() -> None:
+    bad = Frame(0, True, {"x": np.array([[1, np.nan]], np.float32)})
+
+    with pytest.raises(EvaluationError, match="output y of the first model is NaN at"):
+        compare(scaled(1.0), scaled(1.0), [bad])
+
+
+def test_models_with_nothing_in_common_are_not_compared() -> None:
+    with pytest.raises(EvaluationError, match=r"no output in common: y, .*modes"):
+        compare(scaled(1.0), planner(0), [ones(0, True)])
+
+
+def test_no_frames_is_an_error() -> None:
+    with pytest.raises(EvaluationError, match="no frames"):
+        compare(scaled(1.0), scaled(1.0), [])
+
+
+def test_outputs_that_went_are_listed_and_a_lost_plan_has_a_reason() -> None:
+    model = ir.from_onnx_text(PLANNER % 0)
+    model.graph.outputs.pop(0)
+    adapter = {"output": "modes"}
+
+    found = compare(planner(0, **adapter), Session(model), [modes()])
+
+    assert found.missing == ("modes",)
+    assert found.plan is None
+    assert found.plan_reason == "the second model has no output modes"
+
+
+def test_displacement_of_equal_plans_is_zero_not_unknown() -> None:
+    found = compare(planner(0, output="modes"), planner(0, output="modes"), [modes()])
+
+    assert found.plan == Displacement(0.0, 0.0)
+
+
+def test_a_plan_reacts_only_to_the_cameras_it_reads() -> None:
+    session = Session(ir.from_onnx_text(VIEWER))
+    generator = np.random.default_rng(0)
+    frame, other = (
+        Frame(0, True, {"img": generator.random((1, 2, 3, 2, 2), np.float32)})
+        for _ in range(2)
+    )
+
+    assert plan_reaction(session, frame, other, camera=0) > 0.05
+    assert plan_reaction(session, frame, other, camera=1) == 0.0
+    with pytest.raises(EvaluationError, match="no camera 2"):
+        plan_reaction(session, frame, other, camera=2)
+    with pytest.raises(EvaluationError, match="no input images; it has img"):
+        plan_reaction(session, frame, other, image="images")

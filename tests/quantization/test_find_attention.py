@@ -1,0 +1,155 @@
+"""Which products are one attention, where several stand close together."""
+
+import numpy as np
+import pytest
+
+from me2e_compress.quantization.find_attention import Attention, find_attention
+from me2e_compress.runtime.constant_values import constant_values
+from tests.nets import net
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1, "trt" : 1]>\n'
+
+
+def found(text: str, domain: str = HEAD) -> dict[str, Attention]:
+    model = net(domain + text, {})
+    attention = find_attention(model, constant_values(model))
+    return {str(node.outputs[0].name): each for node, each in attention.items()}
+
+
+def test_attentions_that_share_a_mask_keep_their_own_lengths() -> None:
+    """The mask is made of a product of its own, reached from both."""
+    text = """
+    two (float[1,2,30,8] a, float[1,2,8,700] b, float[1,2,700,8] c,
+         float[1,2,30,8] d, float[1,2,8,40] e, float[1,2,40,8] f,
+         float[1,1,4] m, float[1,4,1] n) => (float[1,2,30,8] y, float[1,2,30,8] z) {
+        common = MatMul(m, n)
+        s = MatMul(a, b)
+        masked = Add(s, common)
+        p = Softmax(masked)
+        y = MatMul(p, c)
+        t = MatMul(d, e)
+        covered = Add(common, t)
+        q = Softmax(covered)
+        z = MatMul(q, f)
+    }
+    """
+    assert found(text) == {
+        "s": Attention(30, 700),
+        "y": Attention(30, 700),
+        "t": Attention(30, 40),
+        "z": Attention(30, 40),
+    }
+
+
+def test_an_attention_that_reads_another_is_told_apart() -> None:
+    text = """
+    chain (float[2,8] x, float[8,9] k, float[9,8] v, float[8,7] l, float[7,5] w)
+        => (float[2,5] y) {
+        s = MatMul(x, k)
+        p = Softmax(s)
+        mixed = MatMul(p, v)
+        t = MatMul(mixed, l)
+        q = Softmax(t)
+        y = MatMul(q, w)
+    }
+    """
+    assert found(text) == {
+        "s": Attention(2, 9),
+        "mixed": Attention(2, 9),
+        "t": Attention(2, 7),
+        "y": Attention(2, 7),
+    }
+
+
+def test_two_products_added_up_are_one_attention() -> None:
+    """Relative positions: queries by keys and queries by positions."""
+    text = """
+    relative (float[6,8] q, float[8,9] k, float[8,9] r, float[9,8] v)
+        => (float[6,8] y) {
+        s = MatMul(q, k)
+        t = MatMul(q, r)
+        u = Add(s, t)
+        p = Softmax(u)
+        y = MatMul(p, v)
+    }
+    """
+    assert found(text) == dict.fromkeys("sty", Attention(6, 9))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "y = com.microsoft.MultiHeadAttention<num_heads=2>(q, k, v)",
+        "y = trt.QKVTRT(q, k, v)",
+    ],
+)
+def test_fused_attention_says_how_long_it_is(call: str) -> None:
+    text = f"""
+    fused (float[1,600,8] q, float[1,30,8] k, float[1,30,8] v)
+        => (float[1,600,8] y) {{ {call} }}
+    """
+    assert found(text) == {"y": Attention(600, 30)}
+
+
+def test_learned_keys_of_several_heads_are_keys() -> None:
+    model = net(
+        HEAD + "learned (float[1,2,5,8] q, float[1,2,8,6] k, float[1,2,6,8] v)"
+        " => (float[1,2,5,8] y) { s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v) }",
+        {"k": np.ones((1, 2, 8, 6))},
+    )
+
+    attention = find_attention(model, constant_values(model))
+
+    assert [each.length for each in attention.values()] == [6, 6]
+
+
+def test_heads_written_out_one_by_one_are_found() -> None:
+    heads = 12
+    lines = [
+        f"v{i} = Mul(v, g) h{i} = MatMul(p, v{i}) o{i} = Relu(h{i})"
+        for i in range(heads)
+    ]
+    total = ", ".join(f"o{i}" for i in range(heads))
+    text = (
+        "heads (float[5,8] q, float[8,9] k, float[9,8] v, float g) => (float[5,96] y)"
+        f" {{ s = MatMul(q, k) p = Softmax(s) {' '.join(lines)}"
+        f" y = Concat<axis=1>({total}) }}"
+    )
+    assert len(found(text)) == 1 + heads
+
+
+def test_an_open_batch_leaves_the_lengths_known() -> None:
+    text = """
+    batch (float[N,30,8] a, float[N,8,700] b, float[N,700,8] c) => (float[N,30,8] y) {
+        s = MatMul(a, b)
+        p = Softmax(s)
+        y = MatMul(p, c)
+    }
+    """
+    assert found(text) == {"s": Attention(30, 700), "y": Attention(30, 700)}
+
+
+def test_an_open_length_is_unknown() -> None:
+    text = """
+    batch (float[1,30,8] a, float[1,8,K] b, float[1,K,8] c) => (float[1,30,8] y) {
+        s = MatMul(a, b)
+        p = Softmax(s)
+        y = MatMul(p, c)
+    }
+    """
+    assert found(text) == {"s": Attention(30, None), "y": Attention(30, None)}
+
+
+def test_with_an_open_batch_a_mask_of_another_length_is_no_product_of_keys() -> None:
+    text = """
+    batch (float[N,30,8] a, float[N,8,700] b, float[N,700,8] c, float[N,30,4] m,
+           float[N,4,1] n) => (float[N,30,8] y) {
+        s = MatMul(a, b)
+        t = Mul(s, s)
+        mask = MatMul(m, n)
+        masked = Add(t, mask)
+        p = Softmax(masked)
+        y = MatMul(p, c)
+    }
+    """
+    assert found(text) == {"s": Attention(30, 700), "y": Attention(30, 700)}

@@ -1,0 +1,107 @@
+"""The user's exceptions to a plan."""
+
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import RecipeError
+from me2e_compress.graph import provenance
+from me2e_compress.graph.provenance import Provenance
+from me2e_compress.quantization.plan import Overrides, QuantPlan, make_plan
+from me2e_compress.quantization.scheme import QuantScheme
+from tests.nets import MODULES, conv_attention
+
+FULL = QuantScheme.named("full", MODULES)
+
+
+def planned(text: str, scheme: str = "full") -> QuantPlan:
+    overrides = Overrides.parse(text)
+    named = QuantScheme.named(scheme, MODULES)
+    return make_plan(conv_attention(), named, overrides=overrides)
+
+
+def chosen(plan: QuantPlan) -> list[str]:
+    return [each.node for each in plan.chosen]
+
+
+@pytest.mark.parametrize(
+    "matcher",
+    [
+        'nodes = "/head/?[KV]"',
+        'module = "head"\nop = "MatMul"\nnodes = "/head/[QA]*"',
+    ],
+)
+def test_nodes_are_kept_in_float_by_glob_module_and_operator(matcher: str) -> None:
+    plan = planned(f'[[override]]\n{matcher}\ndtype = "float"\nreason = "loses 3 dB"')
+
+    assert chosen(plan) == ["/backbone/Conv", "/head/Linear"]
+    said = [each for each in plan.decisions if each.rule == "override"]
+    assert [each.reason for each in said] == ["loses 3 dB"] * 2
+
+
+def test_all_readers_of_a_tensor_are_one_group() -> None:
+    plan = planned('[[override]]\nreads = "q"\ndtype = "float"')
+
+    # the product of queries and keys reads it, and so does that with the values
+    assert chosen(plan) == ["/backbone/Conv", "/head/Linear"]
+
+
+def test_an_override_beats_the_scheme() -> None:
+    text = '[[override]]\nmodule = "head"\ndtype = "int8"'
+
+    plan = planned(text, "feature-ext")
+
+    # what can be int8 in that module is; softmax and reshapes stay what they are
+    assert chosen(plan) == ["/backbone/Conv", "/head/QK", "/head/AV", "/head/Linear"]
+
+
+def test_the_later_of_two_overrides_counts() -> None:
+    text = (
+        '[[override]]\nmodule = "head"\ndtype = "float"\n'
+        '[[override]]\nnodes = "*Linear"\ndtype = "int8"'
+    )
+    assert chosen(planned(text)) == ["/backbone/Conv", "/head/Linear"]
+
+
+def test_names_of_the_source_file_match_too() -> None:
+    model = conv_attention()
+    node = model.graph[0]
+    provenance.stamp(node, Provenance("backbone", ("/stem/conv", "/stem/bn"), ("x",)))
+    overrides = Overrides.parse('[[override]]\nnodes = "/stem/*"\ndtype = "float"')
+
+    plan = make_plan(model, FULL, overrides=overrides)
+
+    assert plan.decisions[0].rule == "override"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            '[[override]]\nnodes = "/planner/*"\ndtype = "float"',
+            r"override nodes '/planner/\*' matches none of 10 nodes",
+        ),
+        (
+            '[[concat]]\nnodes = "*"\nscale = "own"',
+            r"override concat '\*' matches none of 10 nodes",
+        ),
+        (
+            '[[override]]\nop = "Softmax"\ndtype = "int8"',
+            "override op 'Softmax': /head/Softmax cannot be int8: Softmax in|is no",
+        ),
+        ('[[override]]\ndtype = "float"', "names no nodes, module, op or reads"),
+        ('[[override]]\nop = "Conv"\ndtype = "fp8"', "dtype fp8: int8 and float are"),
+        ('[[override]]\nop = "Conv"\ndtype = "int4"', "dtype int4: int8 and float"),
+        ('[[overide]]\nop = "Conv"\ndtype = "int8"', "overide: Extra inputs"),
+        ("[[override", "not TOML"),
+    ],
+)
+def test_what_is_wrong_with_overrides_is_one_line(text: str, message: str) -> None:
+    with pytest.raises(RecipeError, match=message) as caught:
+        planned(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_such_file(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"none\.toml: no such file of overrides"):
+        Overrides.load(tmp_path / "none.toml")

@@ -1,0 +1,283 @@
+import time
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import ModuleMapError, RecipeError
+from me2e_compress.quantization.plan import Decision, make_plan, tensors_of
+from me2e_compress.quantization.rules import (
+    Operator,
+    RuleSet,
+    Weight,
+    paper_rules,
+    tensorrt_rules,
+)
+from me2e_compress.quantization.scheme import QuantScheme
+from tests.nets import MODULES, conv_attention, net
+
+HEAD = QuantScheme.of(("head",), MODULES)
+
+ATTENTION = """
+<ir_version: 9, opset_import: ["" : 17]>
+attention (float[1,2,%(q)d,8] q, float[1,2,8,%(k)d] k, float[1,2,%(k)d,8] v,
+           float[1,2,%(q)d,%(k)d] mask, bool[1,2,%(q)d,%(k)d] seen)
+    => (float[1,2,%(q)d,8] y)
+    <float scale = {0.35}, float low = {-10000.0}, float zero = {0.0},
+     int64[1] last = {-1}> {
+    %(body)s
+}
+"""
+
+VARIANTS = {
+    "plain": "s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v)",
+    "scaled by Mul": "t = Mul(q, scale) s = MatMul(t, k) u = Mul(s, scale)"
+    " p = Softmax(u) y = MatMul(p, v)",
+    "scaled by Div": "s = MatMul(q, k) u = Div(s, scale) p = Softmax(u)"
+    " y = MatMul(p, v)",
+    "additive mask": "s = MatMul(q, k) u = Add(mask, s) p = Softmax(u)"
+    " y = MatMul(p, v)",
+    "boolean Where": "s = MatMul(q, k) u = Where(seen, s, low) p = Softmax(u)"
+    " y = MatMul(p, v)",
+    "Sub": "s = MatMul(q, k) u = Sub(s, mask) p = Softmax(u) y = MatMul(p, v)",
+    "Identity and Dropout": "s = MatMul(q, k) u = Identity(s) p = Softmax(u)"
+    " d = Dropout(p) y = MatMul(d, v)",
+    "Where after softmax": "s = MatMul(q, k) p = Softmax(s) w = Where(seen, p, zero)"
+    " y = MatMul(w, v)",
+    "decomposed softmax": "s = MatMul(q, k) m = ReduceMax<axes=[-1]>(s)"
+    " c = Sub(s, m) e = Exp(c) t = ReduceSum(e, last) p = Div(e, t) y = MatMul(p, v)",
+    "Einsum": 's = Einsum<equation="bhqd,bhdk->bhqk">(q, k) p = Softmax(s)'
+    ' y = Einsum<equation="bhqk,bhkd->bhqd">(p, v)',
+}
+
+
+def products(model: ir.Model) -> list[Decision]:
+    plan = make_plan(model, HEAD)
+    return [each for each in plan.decisions if each.op in ("MatMul", "Einsum")]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(("q", "k"), [(600, 16), (16, 600)])
+def test_long_attention_stays_float_however_it_is_written(
+    variant: str, q: int, k: int
+) -> None:
+    text = ATTENTION % {"q": q, "k": k, "body": VARIANTS[variant]}
+    found = products(net(text, {}))
+
+    assert len(found) == 2
+    for each in found:
+        assert each.dtype == "float"
+        if variant == "Einsum":
+            assert each.rule == "operator"
+            assert "attention" in each.reason
+        else:
+            assert each.rule == "attention-length"
+            assert f"{q} queries and {k} keys, more than 512" in each.reason
+
+
+@pytest.mark.parametrize("variant", [name for name in VARIANTS if name != "Einsum"])
+def test_short_attention_becomes_int8_on_both_sides(variant: str) -> None:
+    text = ATTENTION % {"q": 512, "k": 16, "body": VARIANTS[variant]}
+    found = products(net(text, {}))
+
+    assert [each.dtype for each in found] == ["int8", "int8"]
+    assert all(each.rule == "attention" for each in found)
+    assert all(each.activations == (0, 1) and each.weight is None for each in found)
+
+
+def test_the_limit_is_an_option() -> None:
+    model = net(ATTENTION % {"q": 65, "k": 16, "body": VARIANTS["plain"]}, {})
+
+    plan = make_plan(model, HEAD, paper_rules(attention_limit=64))
+
+    assert plan.counts() == {"attention-length": 2}
+
+
+def test_a_product_without_softmax_is_no_layer() -> None:
+    body = "s = MatMul(q, k) y = MatMul(s, v)"
+    found = products(net(ATTENTION % {"q": 16, "k": 16, "body": body}, {}))
+
+    assert {(each.dtype, each.rule) for each in found} == {("float", "weight")}
+
+
+def test_sampling_weights_are_a_layer_not_an_attention() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    weights (float[1,900,8] x, float[8,4] w, float[4] b) => (float[1,900,4] y) {
+        s = MatMul(x, w)
+        t = Add(s, b)
+        y = Softmax(t)
+    }
+    """
+    (found,) = products(net(text, {"w": np.ones((8, 4)), "b": np.ones(4)}))
+
+    assert (found.dtype, found.rule) == ("int8", "layer")
+
+
+LINEAR = """
+<ir_version: 9, opset_import: ["" : 17]>
+linear (float[%s] x, float[%s] w) => (float[%s] y) { y = MatMul(x, w) }
+"""
+
+
+@pytest.mark.parametrize(
+    ("x", "w", "y", "rule"),
+    [
+        ("1,64", "64,32", "1,32", "gemv"),
+        ("1,1,64", "64,32", "1,1,32", "gemv"),
+        ("1,1,1,64", "64,32", "1,1,1,32", "gemv"),
+        ("7,64", "64,1", "7,1", "gemv"),
+        ("1,7,64", "64,1", "1,7,1", "gemv"),
+        ("2,3,7,64", "64,1", "2,3,7,1", "gemv"),
+        ("7,64", "64,32", "7,32", "layer"),
+        ("1,2,64", "64,32", "1,2,32", "layer"),
+        ("2,1,64", "64,32", "2,1,32", "layer"),
+        ("2,1,64", "2,64,32", "2,1,32", "gemv"),
+    ],
+)
+def test_matrix_vector_products_stay_float_at_any_rank(
+    x: str, w: str, y: str, rule: str
+) -> None:
+    shape = [int(size) for size in w.split(",")]
+    (found,) = products(net(LINEAR % (x, w, y), {"w": np.ones(shape)}))
+
+    assert found.rule == rule
+    assert found.dtype == ("int8" if rule == "layer" else "float")
+
+
+@pytest.mark.parametrize("flip", [0, 1])
+@pytest.mark.parametrize(("rows", "rule"), [(1, "gemv"), (3, "layer")])
+def test_gemm_counts_rows_of_what_it_multiplies(
+    flip: int, rows: int, rule: str
+) -> None:
+    shape = (6, 4) if flip else (4, 6)
+    text = f"""
+    <ir_version: 9, opset_import: ["" : 17]>
+    gemm (float[{rows},4] x, float[{shape[0]},{shape[1]}] w) => (float[{rows},6] y) {{
+        y = Gemm<transB={flip}>(x, w)
+    }}
+    """
+    plan = make_plan(net(text, {"w": np.ones(shape)}), HEAD)
+
+    assert plan.decisions[0].rule == rule
+
+
+def test_weights_that_are_turned_at_run_time_are_weights() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    turned (float[2,4] x, float[6,4] w) => (float[2,6] y) {
+        t = Transpose(w)
+        y = MatMul(x, t)
+    }
+    """
+    (found,) = products(net(text, {"w": np.ones((6, 4))}))
+
+    assert (found.rule, found.axis) == ("layer", 1)
+
+
+def test_a_constant_on_the_left_is_coordinate_arithmetic() -> None:
+    (found,) = products(net(LINEAR % ("5,4", "4,6", "5,6"), {"x": np.ones((5, 4))}))
+
+    assert (found.dtype, found.rule) == ("float", "weight")
+    assert "left operand is constant" in found.reason
+
+
+def test_every_node_has_a_decision_a_module_and_a_reason() -> None:
+    model = conv_attention()
+
+    plan = make_plan(model, QuantScheme.named("full", MODULES))
+
+    assert [each.node for each in plan.decisions] == [node.name for node in model.graph]
+    assert all(each.reason and each.module for each in plan.decisions)
+    assert [each.node for each in plan.chosen] == [
+        "/backbone/Conv", "/head/QK", "/head/AV", "/head/Linear",
+    ]  # fmt: skip
+    assert tensors_of(plan, model) == ("image", "q", "seen", "p", "mixed")
+    assert plan.counts() == {"attention": 2, "layer": 2}
+
+
+@pytest.mark.parametrize(
+    ("scheme", "nodes"),
+    [
+        ("feature-ext", ["/backbone/Conv"]),
+        ("prediction", ["/head/QK", "/head/AV", "/head/Linear"]),
+    ],
+)
+def test_schemes_go_by_the_role_of_modules(scheme: str, nodes: list[str]) -> None:
+    plan = make_plan(conv_attention(), QuantScheme.named(scheme, MODULES))
+
+    assert [each.node for each in plan.chosen] == nodes
+
+
+def test_unknown_schemes_and_modules_are_errors() -> None:
+    with pytest.raises(RecipeError, match=r"no scheme int4; .*feature-ext"):
+        QuantScheme.named("int4", MODULES)
+    with pytest.raises(ModuleMapError, match=r"occ: .*backbone, head"):
+        QuantScheme.of(("occ",), MODULES)
+
+
+def test_a_rule_can_be_switched_off() -> None:
+    model = net(LINEAR % ("1,64", "64,32", "1,32"), {"w": np.ones((64, 32))})
+
+    plan = make_plan(model, HEAD, RuleSet("own", (Operator(), Weight())))
+
+    assert plan.counts() == {"layer": 1}
+
+
+def diamonds(count: int) -> ir.Model:
+    """Sampling-point arithmetic: each step reads the one before twice."""
+    body = ["s0 = MatMul(q, k)"]
+    for i in range(count):
+        body += [f"a{i} = Mul(s{i}, scale)", f"b{i} = Add(s{i}, mask)"]
+        body += [f"s{i + 1} = Add(a{i}, b{i})", f"p{i} = Softmax(s{i + 1})"]
+    body += [f"y = MatMul(p{count - 1}, v)"]
+    return net(ATTENTION % {"q": 16, "k": 16, "body": "\n".join(body)}, {})
+
+
+def test_planning_is_linear_on_diamonds_and_on_many_softmaxes() -> None:
+    seconds = []
+    for model in (diamonds(200), diamonds(1600)):
+        start = time.process_time()
+        plan = make_plan(model, HEAD)
+        seconds.append(time.process_time() - start)
+        assert plan.counts() == {"attention": 2}
+
+    # eight times the nodes; quadratic would be 64 times the time
+    assert seconds[1] < 24 * max(seconds[0], 0.01)
+
+
+def test_five_thousand_nodes_are_planned_in_two_seconds() -> None:
+    model = diamonds(1250)
+    start = time.process_time()
+
+    plan = make_plan(model, HEAD, tensorrt_rules())
+
+    assert len(plan.decisions) > 5000
+    assert time.process_time() - start < 2
+
+
+OPEN = """
+<ir_version: 9, opset_import: ["" : 17]>
+batch (float[N,%s,8] a, float[N,8,%s] b, float[N,%s,8] c) => (float[N,%s,8] y) {
+    s = MatMul(a, b)
+    p = Softmax(s)
+    y = MatMul(p, c)
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("sizes", "rule"),
+    [
+        ((16, 16, 16, 16), "attention"),
+        ((16, 600, 600, 16), "attention-length"),
+        ((1, 16, 16, 1), "gemv"),
+        (("Q", 16, 16, "Q"), "attention-length"),
+    ],
+)
+def test_an_open_batch_changes_no_decision(
+    sizes: tuple[int | str, ...], rule: str
+) -> None:
+    plan = make_plan(net(OPEN % sizes, {}), HEAD)
+
+    assert [each.rule for each in plan.decisions if each.op == "MatMul"] == [rule] * 2

@@ -1,0 +1,185 @@
+"""Adds behind convolutions, and scales that belong together."""
+
+import math
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.quantization.plan import (
+    Decision,
+    Overrides,
+    QuantPlan,
+    make_plan,
+    share_scales,
+    sharing_costs,
+)
+from me2e_compress.quantization.rules import paper_rules, tensorrt_rules
+from me2e_compress.quantization.scheme import QuantScheme
+from tests.nets import MODULES, net
+
+FULL = QuantScheme.named("full", MODULES)
+
+BLOCK = """
+<ir_version: 9, opset_import: ["" : 17]>
+block (float[1,16,8,8] x, float[16,16,1,1] w1, float[16,16,1,1] w2,
+       float[16,16,1,1] w3, float[16] b, float[16,16,1,1] w4) => (float[1,16,8,8] y) {
+    ["/backbone/1"] a = Conv(x, w1)
+    ["/backbone/2"] r = Relu(a)
+    ["/backbone/3"] main = Conv(r, w2)
+    ["/backbone/4"] %s
+    ["/backbone/5"] s = Add(%s)
+    ["/backbone/6"] y = Relu(s)
+}
+"""
+WEIGHTS = {name: np.ones((16, 16, 1, 1)) for name in ("w1", "w2", "w3", "w4")}
+
+
+def block(branch: str, operands: str) -> ir.Model:
+    return net(BLOCK % (branch, operands), {**WEIGHTS, "b": np.ones(16)})
+
+
+def addition(plan: QuantPlan) -> Decision:
+    return next(each for each in plan.decisions if each.op == "Add")
+
+
+@pytest.mark.parametrize(
+    ("branch", "operands", "residual"),
+    [
+        ("same = Identity(x)", "main, x", 1),
+        ("same = Identity(x)", "x, main", 0),
+        # a projection is the shorter of two branches that end in a convolution
+        ("down = Conv(x, w3)", "main, down", 1),
+        ("down = Conv(x, w3)", "down, main", 0),
+    ],
+)
+def test_the_residual_branch_is_read_as_int8(
+    branch: str, operands: str, residual: int
+) -> None:
+    found = addition(make_plan(block(branch, operands), FULL))
+
+    assert (found.dtype, found.rule) == ("int8", "residual")
+    assert found.activations == (residual,)
+    assert found.weight is None
+
+
+@pytest.mark.parametrize(
+    ("branch", "operands"),
+    [
+        ("bias = Relu(main)", "x, bias"),  # no convolution ends here
+        ("other = Relu(main)", "main, x"),  # the convolution is read elsewhere too
+        ("row = ReduceMean<axes=[2]>(x)", "main, row"),  # a broadcast
+    ],
+)
+def test_other_adds_stay_float(branch: str, operands: str) -> None:
+    found = addition(make_plan(block(branch, operands), FULL))
+
+    assert (found.dtype, found.rule) == ("float", "operator")
+
+
+def test_an_add_of_a_constant_is_no_residual() -> None:
+    model = block("same = Identity(x)", "main, x")
+    node = next(each for each in model.graph if each.op_type == "Add")
+    table = ir.tensor(np.ones((1, 16, 8, 8), np.float32), name="table")
+    value = ir.Value(name="table", const_value=table, shape=ir.Shape((1, 16, 8, 8)))
+    model.graph.register_initializer(value)
+    node.replace_input_with(1, value)
+
+    assert addition(make_plan(model, FULL)).dtype == "float"
+
+
+def test_a_batch_normalization_does_not_hide_the_convolution() -> None:
+    branch = "n = BatchNormalization(main, b, b, b, b)"
+
+    found = addition(make_plan(block(branch, "n, x"), FULL))
+
+    assert (found.rule, found.activations) == ("residual", (1,))
+
+
+def test_the_add_goes_with_its_convolution() -> None:
+    overrides = Overrides.parse('[[override]]\nnodes = "/backbone/3"\ndtype = "float"')
+
+    plan = make_plan(block("i = Identity(x)", "main, x"), FULL, overrides=overrides)
+
+    assert addition(plan).dtype == "float"
+
+
+def test_the_add_alone_can_be_kept_in_float() -> None:
+    overrides = Overrides.parse('[[override]]\nop = "Add"\ndtype = "float"')
+
+    plan = make_plan(block("i = Identity(x)", "main, x"), FULL, overrides=overrides)
+
+    assert (addition(plan).dtype, addition(plan).rule) == ("float", "override")
+    assert plan.counts() == {"layer": 2}
+
+
+def test_readers_of_a_tensor_are_a_group() -> None:
+    plan = make_plan(block("down = Conv(x, w3)", "main, down"), FULL)
+
+    (group,) = plan.groups
+    assert (group.kind, group.tensors) == ("shared-input", ("x",))
+    assert group.nodes == ("/backbone/1", "/backbone/4")
+
+
+CONCAT = """
+<ir_version: 9, opset_import: ["" : 17]>
+join (float[9,16] a, float[9,16] b, float[9,16] c, float[16,16] w, float[48,16] v,
+      float[80,16] u) => (float[9,16] k, float[9,16] l, float[9,16] m, float[9,16] n) {
+    ["/head/A"] k = MatMul(a, w)
+    ["/head/B"] l = MatMul(b, w)
+    ["/head/Concat"] ab = Concat<axis=1>(a, b, c)
+    ["/head/AB"] m = MatMul(ab, v)
+    ["/head/Outer"] abc = Concat<axis=1>(ab, a, b)
+    ["/head/ABC"] n = MatMul(abc, u)
+}
+"""
+
+
+def joined(overrides: str = "", rules: str = "tensorrt") -> QuantPlan:
+    model = net(
+        CONCAT, {"w": np.ones((16, 16)), "v": np.ones((48, 16)), "u": np.ones((80, 16))}
+    )
+    chosen = tensorrt_rules() if rules == "tensorrt" else paper_rules()
+    return make_plan(model, FULL, chosen, Overrides.parse(overrides))
+
+
+def concats(plan: QuantPlan) -> list[tuple[str, set[str]]]:
+    return [(g.name, set(g.tensors)) for g in plan.groups if g.kind == "concat"]
+
+
+RANGES = Ranges(
+    {"a": (-1.0, 1.0), "b": (-4.0, 2.0), "ab": (-4.0, 4.0), "abc": (-4.0, 4.0)},
+    "max-min",
+    1,
+    "",
+    "",
+)
+
+
+def test_concats_of_concats_are_one_group() -> None:
+    assert concats(joined()) == [("/head/Outer", {"a", "b", "ab", "abc"})]
+
+
+def test_a_concat_can_keep_scales_of_its_own() -> None:
+    plan = joined('[[concat]]\nnodes = "/head/Outer"\nscale = "own"')
+
+    assert concats(plan) == [("/head/Concat", {"a", "b", "ab"})]
+
+
+def test_the_paper_shares_no_scales() -> None:
+    plan = joined(rules="paper")
+
+    assert concats(plan) == []
+    assert share_scales(plan, RANGES) == RANGES
+
+
+def test_a_group_has_the_widest_range_and_says_what_that_costs() -> None:
+    plan = joined()
+
+    shared = share_scales(plan, RANGES)
+    (cost,) = sharing_costs(plan, RANGES)
+
+    assert set(shared.tensors.values()) == {(-4.0, 4.0)}
+    assert cost.tensor == "a"
+    assert cost.loss_db == pytest.approx(20 * math.log10(4), rel=1e-5)

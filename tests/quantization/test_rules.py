@@ -1,0 +1,213 @@
+"""The rules beyond the paper's two stages."""
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import RecipeError
+from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
+from me2e_compress.quantization.rules import rules_named, tensorrt_rules
+from me2e_compress.quantization.scheme import QuantScheme
+from tests.nets import MODULES, net
+
+HEAD = QuantScheme.of(("head",), MODULES)
+OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
+
+
+def planned(model: ir.Model, rules: str = "tensorrt") -> QuantPlan:
+    return make_plan(model, HEAD, rules_named(rules))
+
+
+def by_output(plan: QuantPlan) -> dict[str, Decision]:
+    return {each.output: each for each in plan.decisions}
+
+
+def test_no_such_rule_set() -> None:
+    with pytest.raises(RecipeError, match="no rule set nvidia; there are paper, tens"):
+        rules_named("nvidia")
+
+
+def test_rules_can_be_switched_off_one_by_one() -> None:
+    left = tensorrt_rules().without(("gemv", "coordinates"))
+
+    assert [rule.id for rule in left.rules] == [
+        "operator", "module", "weight", "attention-length", "small-product",
+        "narrow-convolution",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["weight", "speed"])
+def test_other_rules_cannot(name: str) -> None:
+    with pytest.raises(RecipeError, match=f"rule {name} cannot be switched off; of pa"):
+        rules_named("paper").without((name,))
+
+
+@pytest.mark.parametrize(
+    ("shape", "rule"),
+    [((16, 16), "layer"), ((15, 64), "small-product"), ((64, 15), "small-product")],
+)
+def test_products_below_one_tile_stay_float(shape: tuple[int, int], rule: str) -> None:
+    text = OPSETS + (
+        f"p (float[9,{shape[0]}] x, float[{shape[0]},{shape[1]}] w)"
+        f" => (float[9,{shape[1]}] y) {{ y = MatMul(x, w) }}"
+    )
+    plan = planned(net(text, {"w": np.ones(shape)}))
+
+    assert by_output(plan)["y"].rule == rule
+
+
+@pytest.mark.parametrize(
+    ("weight", "group", "behind", "rule"),
+    [
+        # outputs, inputs a group, kernel; behind another layer or at the image
+        ((64, 3, 7, 7), 1, False, "layer"),
+        ((64, 3, 7, 7), 1, True, "layer"),
+        ((8, 3, 3, 3), 1, False, "layer"),
+        ((8, 3, 3, 3), 1, True, "narrow-convolution"),
+        ((64, 3, 1, 3), 1, False, "narrow-convolution"),
+        ((12, 12, 3, 3), 1, False, "narrow-convolution"),
+        ((16, 16, 1, 1), 1, True, "layer"),
+        ((32, 1, 3, 3), 32, True, "layer"),
+        ((32, 1, 1, 1), 32, True, "narrow-convolution"),
+        ((36, 1, 3, 3), 36, True, "narrow-convolution"),
+    ],
+)
+def test_narrow_convolutions(
+    weight: tuple[int, ...], group: int, behind: bool, rule: str
+) -> None:
+    channels = weight[1] * group
+    text = OPSETS + (
+        f"c (float[1,{channels},9,9] x, float{list(weight)} w)"
+        f" => (float[1,{weight[0]},H,W] y) {{ r = Relu(x)"
+        f" y = Conv<group={group}>({'r' if behind else 'x'}, w) }}"
+    )
+    plan = planned(net(text, {"w": np.ones(weight)}))
+
+    assert by_output(plan)["y"].rule == rule
+
+
+def test_deconvolutions_count_channels_the_other_way_round() -> None:
+    text = OPSETS + (
+        "c (float[1,64,9,9] x, float[64,4,1,3] w) => (float[1,4,H,W] y)"
+        " { r = Relu(x) y = ConvTranspose(r, w) }"
+    )
+    (found,) = (
+        each
+        for each in planned(net(text, {"w": np.ones((64, 4, 1, 3))})).decisions
+        if each.output == "y"
+    )
+
+    assert found.rule == "narrow-convolution"
+    assert "64 to 4 channels" in found.reason
+
+
+SAMPLING = (
+    OPSETS
+    + """
+sampling (float[1,50,32] query, float[1,50,1,2] reference, float[1,16,9,9] value,
+          float[32,16] offsets, float[16] b, float[32,16] weights, float[32,32] ffn)
+    => (float[1,16,50,8] y, float[1,50,32] z)
+    <int64[4] points = {1, 50, 8, 2}, int64[4] each = {1, 50, 8, 2},
+     float two = {2.0}, float one = {1.0}> {
+    o = MatMul(query, offsets)
+    ob = Add(o, b)
+    o2 = Reshape(ob, points)
+    location = Add(reference, o2)
+    doubled = Mul(location, two)
+    grid = Sub(doubled, one)
+    w = MatMul(query, weights)
+    w2 = Reshape(w, each)
+    p = Softmax(w2)
+    %s
+    z = MatMul(query, ffn)
+}
+"""
+)
+SIZES = {"offsets": (32, 16), "b": (16,), "weights": (32, 16), "ffn": (32, 32)}
+ONNX = "y = GridSample(value, grid)"
+PLUGIN = "y = trt.MultiscaleDeformableAttnPlugin_TRT(value, value, value, grid, p)"
+
+
+@pytest.mark.parametrize("sampler", [ONNX, PLUGIN])
+def test_offsets_and_their_weights_stay_float(sampler: str) -> None:
+    model = net(SAMPLING % sampler, {n: np.ones(s) for n, s in SIZES.items()})
+
+    found = by_output(planned(model))
+
+    assert (found["o"].dtype, found["o"].rule) == ("float", "coordinates")
+    assert "come from it" in found["o"].reason
+    assert (found["w"].dtype, found["w"].rule) == ("float", "coordinates")
+    assert "the offsets read" in found["w"].reason
+    assert (found["z"].dtype, found["z"].rule) == ("int8", "layer")
+
+
+def test_the_paper_knows_no_coordinates() -> None:
+    model = net(SAMPLING % ONNX, {n: np.ones(s) for n, s in SIZES.items()})
+
+    assert planned(model, "paper").counts() == {"layer": 3}
+
+
+@pytest.mark.parametrize(
+    "reader",
+    [
+        "at = Floor(s) i = Cast<to=7>(at) y = Gather<axis=0>(table, i)",
+        "c = Cos(s) n = Reshape(c, square) m = trt.InverseTRT(n) y = MatMul(m, other)",
+    ],
+)
+def test_what_is_looked_up_or_inverted_is_a_position(reader: str) -> None:
+    text = f"""{OPSETS}
+    points (float[16,32] x, float[32,16] w, float[99,2] table, float[16,16] other)
+        => (float y) <int64[2] square = {{16, 16}}> {{
+        l = MatMul(x, w)
+        s = Sigmoid(l)
+        {reader}
+    }}
+    """
+    found = by_output(planned(net(text, {"w": np.ones((32, 16))})))
+
+    assert found["l"].rule == "coordinates"
+
+
+def test_a_layer_behind_a_layer_is_no_position() -> None:
+    """The walk ends at the layer that gives the offsets."""
+    text = (
+        OPSETS
+        + """
+    deep (float[1,50,32] x, float[32,32] a, float[32,16] b, float[1,3,9,9] value)
+        => (float[1,3,50,8] y) <int64[4] points = {1, 50, 8, 2}> {
+        h = MatMul(x, a)
+        r = Relu(h)
+        o = MatMul(r, b)
+        g = Reshape(o, points)
+        y = GridSample(value, g)
+    }
+    """
+    )
+    weights = {"a": np.ones((32, 32)), "b": np.ones((32, 16))}
+    found = by_output(planned(net(text, weights)))
+
+    assert (found["h"].rule, found["o"].rule) == ("layer", "coordinates")
+
+
+@pytest.mark.parametrize(
+    ("queries", "keys", "remark"),
+    [
+        (512, 300, "close to the limit of 512"),
+        (300, 530, "close to the limit of 512"),
+        (901, 300, "one within the limit of 512, one beyond"),
+        (300, 300, ""),
+        (900, 900, ""),
+    ],
+)
+def test_borderline_attention_is_reported(queries: int, keys: int, remark: str) -> None:
+    text = OPSETS + (
+        f"a (float[{queries},32] q, float[32,{keys}] k, float[{keys},32] v)"
+        f" => (float[{queries},32] y)"
+        " { s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v) }"
+    )
+    plan = make_plan(net(text, {}), HEAD, tensorrt_rules())
+
+    assert [remark in each.borderline for each in plan.decisions] == [
+        True, not remark, True,
+    ]  # fmt: skip
+    assert len(plan.borderline) == (2 if remark else 0)

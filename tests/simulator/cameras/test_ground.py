@@ -1,0 +1,171 @@
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.simulator.cameras import (
+    CAMERA_NAMES,
+    CameraRig,
+    Cameras,
+    GroundTexture,
+    PixelClass,
+    paint_texture,
+)
+from me2e_compress.simulator.scene import Ego, Roadmap
+from tests.simulator.cameras import town
+
+FRONT = CAMERA_NAMES.index("FRONT")
+
+
+def project(
+    rig: CameraRig, camera: int, ego: Ego, x: float, y: float
+) -> tuple[float, float, float]:
+    """Pixel and depth of a world point on the ground."""
+    cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+    dx, dy = x - ego.x, y - ego.y
+    point = (cos * dx + sin * dy, cos * dy - sin * dx, 0.0, 1.0)
+    u, v, depth, _ = rig.lidar2img[camera].astype(float) @ point
+    return float(u / depth), float(v / depth), float(depth)
+
+
+def bar(x: float, y: float) -> tuple[Roadmap, npt.NDArray[np.float64]]:
+    """Bare grass with a white bar of 1 m x 0.5 m around a point; its corners."""
+    ends = ((x - 0.5, y), (x + 0.5, y))
+    corners = np.array([(-0.5, -0.25), (0.5, -0.25), (0.5, 0.25), (-0.5, 0.25)])
+    return Roadmap((), (ends,)), corners + np.array([x, y])
+
+
+def centroid(polygon: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Of the area of a polygon [N, 2]."""
+    a, b = polygon, np.roll(polygon, -1, axis=0)
+    cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+    return np.asarray(((a + b) * cross[:, None]).sum(axis=0) / (3 * cross.sum()))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    distance=st.floats(6.0, 22.0),
+    azimuth=st.floats(-np.pi, np.pi),
+    heading=st.floats(-np.pi, np.pi),
+)
+def test_a_bar_on_the_road_is_drawn_where_lidar2img_says(
+    distance: float, azimuth: float, heading: float
+) -> None:
+    rig = CameraRig(128, 224)
+    x, y = distance * np.cos(azimuth), distance * np.sin(azimuth)
+    ego = town.ego(0.0, 0.0, heading)
+    roadmap, corners = bar(x, y)
+    route, scene = np.array([(0.0, 0.0), (1.0, 0.0)]), town.scene(seen_from=ego)
+    painted, bare = (
+        Cameras(paint_texture(roads, route), rig).render(scene).astype(float)
+        for roads in (roadmap, Roadmap(()))
+    )
+    added = (painted - bare).sum(axis=3)
+    seen = 0
+    for camera in range(6):
+        pixels = np.array([project(rig, camera, ego, *corner) for corner in corners])
+        if not is_judged(pixels):
+            continue
+        white = added[camera]
+        rows, columns = np.mgrid[0:128, 0:224] + 0.5
+        found = np.array([(columns * white).sum(), (rows * white).sum()]) / white.sum()
+        # One pixel; close by, where a texel of 0.125 m covers many, a quarter of it, as
+        # it is seen: turned against the camera it is wider than its side.
+        square = np.array([(x, y)]) + (corners - (x, y)) * (0.125, 0.25)
+        texel = np.array([project(rig, camera, ego, *corner) for corner in square])
+        allowed = max(1.0, np.ptp(texel[:, :2], axis=0).max() / 4)
+        np.testing.assert_allclose(found, centroid(pixels[:, :2]), atol=allowed)
+        seen += 1
+    assert seen >= 1 or not is_wide_in_view(rig, ego, corners)
+
+
+def is_judged(pixels: npt.NDArray[np.float64]) -> bool:
+    """Whether a bar's centroid says anything: whole in the image, two rows at least.
+
+    Thinner than that, a slanted bar is sampled in steps.
+    """
+    inside = (pixels[:, :2] > 4).all() and (pixels[:, :2] < (220, 124)).all()
+    return bool(inside and pixels[:, 2].min() >= 2.0 and np.ptp(pixels[:, 1]) >= 2.0)
+
+
+def is_wide_in_view(rig: CameraRig, ego: Ego, corners: npt.NDArray[np.float64]) -> bool:
+    """Whether some camera has the whole bar well inside its image, three rows high."""
+    for camera in range(6):
+        pixels = np.array([project(rig, camera, ego, *corner) for corner in corners])
+        whole = (np.abs(pixels[:, 0] - 112) < 100).all() and (pixels[:, 1] < 120).all()
+        if pixels[:, 2].min() > 2.0 and whole and np.ptp(pixels[:, 1]) >= 3.0:
+            return True
+    return False
+
+
+def edge_pixels(labels: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
+    """(column, row) of the first drivable or marked pixel from the left in each row."""
+    road = np.isin(labels, (PixelClass.DRIVABLE, PixelClass.LANE_MARKING))
+    rows = np.flatnonzero(road.any(axis=1))
+    columns = road[rows].argmax(axis=1)
+    inside = columns > 0
+    return np.stack([columns[inside], rows[inside]], axis=1).astype(float)
+
+
+@pytest.mark.parametrize("heading", [-0.15, 0.0, 0.1])
+def test_the_edge_of_a_straight_road_is_a_straight_line(
+    cameras: Cameras, heading: float
+) -> None:
+    ego = town.ego(-10.0, 2.0, heading)
+    labels = cameras.classes(town.scene(seen_from=ego))[FRONT]
+    edge = edge_pixels(labels)
+    slope, offset = np.polyfit(edge[:, 1], edge[:, 0], 1)
+    assert len(edge) > 20
+    assert np.abs(slope * edge[:, 1] + offset - edge[:, 0]).max() < 1.5
+
+
+def test_the_road_meets_the_horizon_where_it_leads(cameras: Cameras) -> None:
+    labels = cameras.classes(town.scene(seen_from=town.ego(0.0, 2.0)))[FRONT]
+    edge = edge_pixels(labels)
+    slope, offset = np.polyfit(edge[:, 1], edge[:, 0], 1)
+    assert slope * (128 * 0.42 - 0.5) + offset == pytest.approx(112.0, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "kind"),
+    [
+        (10.0, 0.0, PixelClass.DRIVABLE),
+        (10.0, -2.0, PixelClass.LANE_MARKING),
+        (20.0, 1.0, PixelClass.STOP_LINE),
+        (16.0, -6.0, PixelClass.TERRAIN),
+    ],
+)
+def test_a_pixel_has_the_class_of_what_it_shows(
+    cameras: Cameras, rig: CameraRig, x: float, y: float, kind: PixelClass
+) -> None:
+    ego = town.ego(2.0, 1.0)
+    u, v, _ = project(rig, FRONT, ego, x, y)
+    assert cameras.classes(town.scene(seen_from=ego))[FRONT, int(v), int(u)] == kind
+
+
+def test_the_sky_is_above_the_horizon_only(cameras: Cameras) -> None:
+    sky = cameras.classes(town.scene()) == PixelClass.SKY
+    assert sky[:, :54].all()
+    assert not sky[:, 54:].any()
+
+
+def test_beyond_the_texture_the_straight_road_goes_on(cameras: Cameras) -> None:
+    far = town.scene(seen_from=town.ego(180.0, 0.0))
+    assert (cameras.classes(far)[FRONT, 60:] == PixelClass.DRIVABLE).any()
+
+
+@pytest.mark.parametrize("size", [(33, 47), (96, 160), (241, 321)])
+def test_any_size_is_rendered(texture: GroundTexture, size: tuple[int, int]) -> None:
+    images = Cameras(texture, CameraRig(*size)).render(town.busy())
+    assert images.shape == (6, *size, 3)
+    assert images.dtype == np.uint8
+
+
+def test_the_texture_is_read_only_and_its_levels_nest(texture: GroundTexture) -> None:
+    sizes = [level.shape[:2] for level in texture.levels]
+    assert all(
+        (2 * a, 2 * b) == c for (a, b), c in zip(sizes[1:], sizes[:-1], strict=True)
+    )
+    with pytest.raises(ValueError, match="read-only"):
+        texture.classes[0, 0] = 0

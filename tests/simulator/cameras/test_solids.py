@@ -1,0 +1,279 @@
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.simulator.cameras import (
+    CAMERA_NAMES,
+    CameraRig,
+    Cameras,
+    PixelClass,
+)
+from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES
+from me2e_compress.simulator.cameras.ordering import painting_order
+from me2e_compress.simulator.cameras.solids import TEMPLATES
+from me2e_compress.simulator.scene import (
+    DIMENSIONS,
+    Actor,
+    ActorKind,
+    SignalState,
+)
+from tests.simulator.cameras import town
+
+Floats = npt.NDArray[np.float64]
+FRONT, FRONT_LEFT, FRONT_RIGHT, BACK = (
+    CAMERA_NAMES.index(name) for name in ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK")
+)
+TEXTURE = town.paint()
+PAINTS_APART = (0, 1)
+"""Numbers of two actors that get different colours."""
+
+
+def silhouette(rig: CameraRig, camera: int, actor: Actor) -> Floats:
+    """[N, 2] pixels of all corners of an actor's faces, by lidar2img alone."""
+    shapes = [t.corners[:, :, ~t.details] for t in TEMPLATES[actor.kind]]
+    corners = np.concatenate([s.reshape(3, -1) for s in shapes], axis=1)
+    x, y, z = corners * np.array([[actor.length], [actor.width], [actor.height]])
+    cos, sin = np.cos(actor.heading), np.sin(actor.heading)
+    points = [cos * x - sin * y + actor.x, sin * x + cos * y + actor.y, z]
+    homogeneous = np.stack([*points, np.ones_like(x)])
+    u, v, depth, _ = rig.lidar2img[camera].astype(float) @ homogeneous
+    return np.stack([u / depth, v / depth], axis=1)
+
+
+def bounds(mask: npt.NDArray[np.bool_]) -> Floats:
+    """left, top, right, bottom of the pixels in a mask."""
+    rows, columns = np.nonzero(mask)
+    ends = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+    return np.array(ends, float)
+
+
+@pytest.mark.parametrize("kind", list(ActorKind))
+@pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
+def test_an_actor_covers_the_pixels_that_lidar2img_gives_its_corners(
+    cameras: Cameras, rig: CameraRig, kind: ActorKind, heading: float
+) -> None:
+    actor = town.actor(13.0, 1.0, kind, heading=heading)
+    labels = cameras.classes(town.scene(actor))[FRONT]
+    mask = labels >= PixelClass.VEHICLE
+    pixels = silhouette(rig, FRONT, actor)
+    expected = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+    # cv2 rounds polygons out by half a pixel, and bounds are whole pixels
+    np.testing.assert_allclose(bounds(mask), expected, atol=1.2)
+
+
+@pytest.mark.parametrize("kind", list(ActorKind))
+def test_labels_and_images_agree_on_where_an_actor_is(
+    cameras: Cameras, kind: ActorKind
+) -> None:
+    scene = town.scene(town.actor(9.0, 0.0, kind, heading=0.5))
+    mask = (cameras.classes(scene)[FRONT] >= PixelClass.VEHICLE).astype(np.uint8)
+    empty = cameras.render(town.scene())[FRONT].astype(int)
+    image = cameras.render(scene)[FRONT].astype(int)
+    changed = np.abs(image - empty).max(axis=2) > 12
+    core = cv2.erode(mask, np.ones((3, 3), np.uint8)).astype(bool)
+    assert core.sum() > 20
+    assert changed[core].mean() > 0.97
+    # outside of it there is only its shadow, which is darker than any ground
+    outside = changed & ~cv2.dilate(mask, np.ones((3, 3), np.uint8)).astype(bool)
+    assert (image <= empty)[outside].all()
+
+
+def test_the_nearer_car_hides_the_farther_one_whatever_their_order(
+    cameras: Cameras,
+) -> None:
+    near = town.actor(10.0, 0.0, number=PAINTS_APART[0])
+    far = town.actor(18.0, 0.4, number=PAINTS_APART[1])
+    both = cameras.render(town.scene(near, far))
+    np.testing.assert_array_equal(both, cameras.render(town.scene(far, near)))
+    alone = cameras.render(town.scene(near))[FRONT]
+    mask = cameras.classes(town.scene(near))[FRONT] == PixelClass.VEHICLE
+    core = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    np.testing.assert_array_equal(both[FRONT][core], alone[core])
+
+
+def test_a_car_beside_a_long_truck_is_not_painted_over(cameras: Cameras) -> None:
+    # the truck's centre is farther than the car's, yet its tail is nearer, and the
+    # car behind its far side must not show through
+    truck = town.actor(12.0, 0.0, ActorKind.TRUCK, number=3)
+    hidden = town.actor(11.5, 2.6, ActorKind.PEDESTRIAN)
+    eye = town.ego(0.0, -4.0)
+    with_both = cameras.render(town.scene(hidden, truck, seen_from=eye))
+    alone = cameras.render(town.scene(truck, seen_from=eye))
+    mask = cameras.classes(town.scene(truck, seen_from=eye))[FRONT]
+    core = cv2.erode((mask == PixelClass.VEHICLE).astype(np.uint8), np.ones((5, 5)))
+    seen = core.astype(bool)
+    np.testing.assert_array_equal(with_both[FRONT][seen], alone[FRONT][seen])
+
+
+def rectangle(
+    x: float, y: float, heading: float, length: float, width: float
+) -> Floats:
+    half = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (length / 2, width / 2)
+    cos, sin = np.cos(heading), np.sin(heading)
+    turned = half @ np.array([(cos, sin), (-sin, cos)])
+    return np.asarray(turned + np.array([x, y]))
+
+
+def first_hit(corners: Floats, bearing: float) -> float:
+    """Distance at which a ray from the origin meets a convex polygon, or infinity."""
+    ray = np.array([np.sin(bearing), np.cos(bearing)])
+    hits = []
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        edge = b - a
+        cross = ray[0] * edge[1] - ray[1] * edge[0]
+        if abs(cross) < 1e-12:
+            continue
+        t = (a[0] * edge[1] - a[1] * edge[0]) / cross
+        s = (a[0] * ray[1] - a[1] * ray[0]) / cross
+        if t > 0 and 0 <= s <= 1:
+            hits.append(t)
+    return min(hits, default=float("inf"))
+
+
+rectangles = st.builds(
+    rectangle,
+    st.floats(-8, 8),
+    st.floats(4, 25),
+    st.floats(-3, 3),
+    st.floats(0.5, 9.0),
+    st.floats(0.5, 2.5),
+)
+
+
+@given(rectangles, rectangles)
+def test_of_two_boxes_the_one_hit_first_is_painted_last(a: Floats, b: Floats) -> None:
+    bearings = np.linspace(-1.2, 1.2, 241)
+    hits = np.array([[first_hit(box, t) for t in bearings] for box in (a, b)])
+    hits = hits[:, np.isfinite(hits).all(axis=0)]
+    gap = hits[0] - hits[1]
+    assume(len(gap) > 0 and (np.abs(gap) > 0.2).all())
+    assume(separate(a, b) or separate(b, a))
+    shapes = np.stack([a, b])
+    right, forward = (shapes[None, :, :, i].transpose(0, 2, 1) for i in (0, 1))
+    _, order = painting_order(right, forward, np.ones((1, 2), np.bool_))
+    assert (gap > 0).all() or (gap < 0).all()
+    assert order.tolist() == ([0, 1] if gap[0] > 0 else [1, 0])
+
+
+def separate(a: Floats, b: Floats) -> bool:
+    """Whether an edge of a has all of b outside of it."""
+    edges = np.roll(a, -1, axis=0) - a
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+    reach = np.einsum("ec,ekc->ek", normals, b[None] - a[:, None])
+    return bool((reach > 0).all(axis=1).any())
+
+
+def test_a_car_in_two_cameras_is_one_car(cameras: Cameras, rig: CameraRig) -> None:
+    car = town.actor(7.0, 4.8)
+    labels = cameras.classes(town.scene(car))
+    images = cameras.render(town.scene(car)).astype(int)
+    colours = []
+    for camera in (FRONT, FRONT_LEFT):
+        mask = labels[camera] == PixelClass.VEHICLE
+        assert mask.sum() > 100
+        columns = silhouette(rig, camera, car)[:, 0]
+        expected = np.clip([columns.min(), columns.max()], 0, 224)
+        np.testing.assert_allclose(bounds(mask)[[0, 2]], expected, atol=1.2)
+        colours.append(np.median(images[camera][mask], axis=0))
+    assert np.abs(colours[0] - colours[1]).max() < 40
+    assert (labels[[FRONT_RIGHT, BACK]] != PixelClass.VEHICLE).all()
+
+
+def test_behind_left_and_right_are_as_in_a_camera_not_in_a_mirror(
+    cameras: Cameras,
+) -> None:
+    labels = cameras.classes(town.scene(town.actor(-12.0, 3.0)))[BACK]
+    columns = np.nonzero(labels == PixelClass.VEHICLE)[1]
+    assert columns.min() > 112
+
+
+@pytest.mark.parametrize("kind", [ActorKind.CAR, ActorKind.VAN, ActorKind.TRUCK])
+def test_brake_lights_light_up_on_the_actor(cameras: Cameras, kind: ActorKind) -> None:
+    off = town.scene(town.actor(11.0, 0.0, kind))
+    on = town.scene(town.actor(11.0, 0.0, kind, braking=True))
+    before, after = (cameras.render(s)[FRONT].astype(int) for s in (off, on))
+    changed = (before != after).any(axis=2)
+    assert changed.sum() >= 8
+    assert (after - before)[changed][:, 0].max() > 60
+    mask = (cameras.classes(on)[FRONT] == PixelClass.VEHICLE).astype(np.uint8)
+    assert cv2.dilate(mask, np.ones((3, 3), np.uint8)).astype(bool)[changed].all()
+
+
+@pytest.mark.parametrize(
+    ("indicator", "half"), [(1, slice(0, 112)), (-1, slice(112, 224))]
+)
+def test_an_indicator_blinks_on_its_side(
+    cameras: Cameras, indicator: int, half: slice
+) -> None:
+    car = town.actor(11.0, 0.0, indicator=indicator)
+    off = cameras.render(town.scene(car, time_us=350_000))[FRONT]
+    on = cameras.render(town.scene(car, time_us=0))[FRONT]
+    changed = (on != off).any(axis=2)
+    assert changed[:, half].sum() >= 4
+    assert changed.sum() == changed[:, half].sum()
+
+
+@pytest.mark.parametrize(
+    ("state", "channel"), [(SignalState.RED, 0), (SignalState.GREEN, 1)]
+)
+def test_a_light_shows_its_state(
+    cameras: Cameras, state: SignalState, channel: int
+) -> None:
+    image = cameras.render(town.light(state))[FRONT].astype(int)
+    labels = cameras.classes(town.light(state))[FRONT]
+    lit = image[labels == PixelClass.TRAFFIC_LIGHT]
+    other = lit[:, [c for c in (0, 1) if c != channel]].max(axis=1)
+    assert ((lit[:, channel] > 200) & (other < 150)).sum() >= 6
+
+
+def test_a_waiting_car_sees_the_light_of_its_own_stop_line(cameras: Cameras) -> None:
+    # the post stands 0.5 m behind the line and 0.8 m beside a lane of 4 m
+    scene = town.light(SignalState.RED, x=2.3 + 1.0 + 0.5, y=-2.8)
+    image = cameras.render(scene)[FRONT_RIGHT].astype(int)
+    red = (image[..., 0] > 220) & (image[..., 1] < 90) & (image[..., 2] < 90)
+    assert red.sum() >= 20
+
+
+def test_something_in_the_face_of_a_camera_is_cut_not_dropped(cameras: Cameras) -> None:
+    wall = town.actor(3.2, 0.0, ActorKind.TRUCK, heading=np.pi / 2)
+    labels = cameras.classes(town.scene(wall))[FRONT]
+    assert (labels == PixelClass.VEHICLE).mean() > 0.5
+
+
+def test_what_is_far_away_is_not_drawn(cameras: Cameras) -> None:
+    far = town.scene(town.actor(130.0, 0.0))
+    np.testing.assert_array_equal(cameras.render(far), cameras.render(town.scene()))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(ActorKind),
+            st.floats(-8, 8),
+            st.floats(-8, 8),
+            st.floats(-7, 7),
+        ),
+        max_size=8,
+    )
+)
+def test_actors_may_be_anywhere_even_inside_each_other(
+    crowd: list[tuple[ActorKind, float, float, float]],
+) -> None:
+    actors = [
+        town.actor(x, y, kind, number=i, heading=heading)
+        for i, (kind, x, y, heading) in enumerate(crowd)
+    ]
+    cameras = Cameras(TEXTURE, CameraRig(48, 80))
+    labels = cameras.classes(town.scene(*actors))
+    kinds = {int(ACTOR_CLASSES[kind]) for kind, *_ in crowd}
+    solid = set(np.unique(labels[labels >= PixelClass.VEHICLE]).tolist())
+    assert solid <= kinds
+    assert cameras.render(town.scene(*actors)).shape == (6, 48, 80, 3)
+
+
+def test_every_kind_has_a_size_a_shape_and_a_class() -> None:
+    assert set(TEMPLATES) == set(ACTOR_CLASSES) == set(ActorKind) == set(DIMENSIONS)

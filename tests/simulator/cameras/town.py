@@ -1,0 +1,101 @@
+"""A made-up crossing for the camera tests."""
+
+import math
+
+import numpy as np
+
+from me2e_compress.simulator.cameras import paint_texture
+from me2e_compress.simulator.cameras.texture import GroundTexture
+from me2e_compress.simulator.scene import (
+    DIMENSIONS,
+    Actor,
+    ActorKind,
+    Ego,
+    Lane,
+    LaneMarking,
+    Roadmap,
+    Scene,
+    Signal,
+    SignalKind,
+    SignalState,
+)
+
+STOP_LINE = ((20.0, -2.0), (20.0, 6.0))
+CROSSWALK = ((22.0, -2.0), (22.0, 6.0), (26.0, 6.0), (26.0, -2.0))
+
+
+def lane(y: float, left: LaneMarking, right: LaneMarking) -> Lane:
+    stations = np.arange(-200.0, 201.0, 2.0)
+    centre = np.stack([stations, np.full_like(stations, y)], axis=1)
+    return Lane(f"w>e:{y:g}", centre, 4.0, left, right, 13.9)
+
+
+ROADMAP = Roadmap(
+    (
+        lane(4.0, LaneMarking.SOLID, LaneMarking.NONE),
+        lane(0.0, LaneMarking.DASHED, LaneMarking.SOLID),
+    ),
+    (STOP_LINE,),
+    (CROSSWALK,),
+)
+ROUTE = np.stack([np.arange(0.0, 60.0), np.zeros(60)], axis=1)
+
+
+def paint() -> GroundTexture:
+    return paint_texture(ROADMAP, ROUTE)
+
+
+def ego(x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> Ego:
+    return Ego(x, y, heading, 8.0, 0.0, 0.0, 0.0, 0.0, 4.6, 1.95)
+
+
+def actor(
+    x: float,
+    y: float,
+    kind: ActorKind = ActorKind.CAR,
+    *,
+    number: int = 0,
+    heading: float = 0.0,
+    braking: bool = False,
+    indicator: int = 0,
+) -> Actor:
+    size = DIMENSIONS[kind]
+    return Actor(number, kind, x, y, heading, 5.0, *size, braking, indicator)
+
+
+def scene(*actors: Actor, time_us: int = 0, seen_from: Ego | None = None) -> Scene:
+    return Scene(time_us, seen_from or ego(), actors, ())
+
+
+def light(state: SignalState, x: float = 15.0, y: float = -3.0) -> Scene:
+    signal = Signal(1, SignalKind.TRAFFIC_LIGHT, x, y, 0.0, state, STOP_LINE)
+    return Scene(0, ego(), (), (signal,))
+
+
+def busy() -> Scene:
+    """One of everything, some of it in the way of a camera."""
+    actors = tuple(
+        actor(
+            14 * math.cos(angle),
+            14 * math.sin(angle),
+            kind,
+            number=i,
+            heading=angle + 1.0,
+            braking=i % 2 == 0,
+            indicator=i % 3 - 1,
+        )
+        for i, (kind, angle) in enumerate(
+            zip(ActorKind, np.linspace(0.0, 6.0, len(ActorKind)), strict=True)
+        )
+    )
+    signals = tuple(
+        Signal(i, kind, 9.0, 3.0 * i - 4.0, 0.1, state, STOP_LINE)
+        for i, (kind, state) in enumerate(
+            (
+                (SignalKind.TRAFFIC_LIGHT, SignalState.RED),
+                (SignalKind.STOP_SIGN, None),
+                (SignalKind.GIVE_WAY, None),
+            )
+        )
+    )
+    return Scene(50_000, ego(), (*actors, actor(-2.5, 0.5)), signals)

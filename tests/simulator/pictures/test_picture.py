@@ -1,0 +1,200 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.cameras import CAMERA_NAMES, CameraRig, Cameras
+from me2e_compress.simulator.pictures import (
+    Moment,
+    RoutePicture,
+    write_gif,
+    write_png,
+)
+from me2e_compress.simulator.pictures.top_view import EGO, PLAN, TRAIL
+from me2e_compress.simulator.scene import ActorKind, SignalState
+from me2e_compress.simulator.traffic.events import Event, EventKind
+from tests.simulator.cameras import town
+
+TEXTURE = town.paint()
+PLAN_AHEAD = np.stack([np.arange(1, 7) * 4.0, np.zeros(6)], axis=1)
+Image8 = npt.NDArray[np.uint8]
+
+
+def event(kind: EventKind, time_us: int) -> Event:
+    return Event(time_us, kind, "", 2.0, 0.0, 8.0, 1, ActorKind.CAR)
+
+
+def moment(i: int, *events: Event, images: Image8 | None = None) -> Moment:
+    scene = town.light(SignalState.RED, x=30.0)
+    scene = replace(scene, time_us=i * 50_000, ego=town.ego(float(i), 0.0))
+    return Moment(scene, images, PLAN_AHEAD, events, score=100.0 - i)
+
+
+def picture(*moments: Moment) -> RoutePicture:
+    return RoutePicture("Accident_1", TEXTURE, town.ROUTE, moments, tile_width=160)
+
+
+def count(pixels: Image8, colour: tuple[int, int, int]) -> int:
+    return int((pixels == colour).all(axis=2).sum())
+
+
+def above(pixels: Image8) -> Image8:
+    """The view from above: right of three tiles and their gaps."""
+    return pixels[:-34, 3 * 164 :]
+
+
+def test_a_frame_has_six_tiles_a_view_from_above_and_a_caption() -> None:
+    images = np.stack([np.full((96, 160, 3), 20 * i, np.uint8) for i in range(6)])
+    frame = picture(moment(0, images=images)).frame(0)
+    places = {
+        "FRONT_LEFT": (0, 0),
+        "FRONT": (0, 1),
+        "FRONT_RIGHT": (0, 2),
+        "BACK_LEFT": (1, 0),
+        "BACK": (1, 1),
+        "BACK_RIGHT": (1, 2),
+    }
+    for name, (row, column) in places.items():
+        pixel = frame[row * 100 + 60, column * 164 + 80]
+        assert pixel.tolist() == [20 * CAMERA_NAMES.index(name)] * 3
+    assert above(frame).shape[0] == 196
+    assert (frame[-30:] < 120).any()
+
+
+def test_the_view_from_above_shows_ego_trail_and_plan() -> None:
+    moments = [moment(i) for i in range(9)]
+    first, last = picture(*moments).frame(0), picture(*moments).frame(8)
+    for colour in (EGO, PLAN):
+        assert count(above(first), colour) > 20
+    assert count(above(first), TRAIL) == 0
+    assert count(above(last), TRAIL) > 10
+
+
+def test_the_plan_lies_ahead_of_the_ego() -> None:
+    view = above(picture(moment(0)).frame(0))
+    rows, columns = np.nonzero((view == PLAN).all(axis=2))
+    scale = view.shape[0] / 72.0  # the ego stands 50 m below the upper edge
+    assert rows.min() == pytest.approx((50 - 24) * scale, abs=4)
+    assert columns.mean() == pytest.approx(view.shape[1] / 2, abs=2)
+
+
+def test_no_plan_no_images_no_score_is_no_failure() -> None:
+    bare = replace(moment(0), plan=None, score=None)
+    frame = picture(bare).frame(0)
+    assert count(above(frame), PLAN) == 0
+    assert (frame[40, 20] == frame[140, 200]).all()
+
+
+def test_an_infraction_is_marked_from_its_moment_on() -> None:
+    crash = event(EventKind.COLLISION, 100_000)
+    moments = [moment(0), moment(1), moment(2, crash), moment(3, crash)]
+    red = [count(above(picture(*moments).frame(i)), (208, 16, 32)) for i in range(4)]
+    assert red[0] == red[1] == 0
+    assert min(red[2:]) > 20
+
+
+def test_an_event_handed_in_twice_is_drawn_as_once() -> None:
+    crash = event(EventKind.RED_LIGHT, 50_000)
+    once = picture(moment(0), moment(1, crash), moment(2))
+    twice = picture(moment(0), moment(1, crash), moment(2, crash))
+    np.testing.assert_array_equal(once.frame(2), twice.frame(2))
+
+
+def test_a_trigger_is_no_infraction() -> None:
+    trigger = event(EventKind.TRIGGER, 0)
+    with_it, without = picture(moment(0, trigger)), picture(moment(0))
+    np.testing.assert_array_equal(with_it.frame(0), without.frame(0))
+
+
+def test_frames_keep_every_nth_and_the_last() -> None:
+    film = picture(*(moment(i) for i in range(8)))
+    frames = list(film.frames(3))
+    assert len(frames) == 4
+    np.testing.assert_array_equal(frames[1], film.frame(3))
+    np.testing.assert_array_equal(frames[-1], film.frame(7))
+
+
+def test_a_strip_sets_moments_side_by_side() -> None:
+    film = picture(*(moment(i) for i in range(4)))
+    strip = film.strip([0, 2, 3])
+    assert strip.shape == (30 + 4 + 96 + 4 + 160, 3 * 160 + 2 * 4, 3)
+
+
+def test_real_images_make_the_same_picture_every_time() -> None:
+    cameras = Cameras(TEXTURE, CameraRig(64, 96))
+    images = cameras.render(town.busy())
+    first = picture(Moment(town.busy(), images)).frame(0)
+    np.testing.assert_array_equal(first, picture(Moment(town.busy(), images)).frame(0))
+
+
+def test_without_a_moment_there_is_nothing_to_draw() -> None:
+    with pytest.raises(EvaluationError, match="Accident_1: no moment was recorded"):
+        picture()
+
+
+def test_a_png_is_what_was_drawn(tmp_path: Path) -> None:
+    frame = picture(moment(0)).frame(0)
+    write_png(tmp_path / "moment.png", frame)
+    with Image.open(tmp_path / "moment.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), frame)
+    assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
+
+
+def test_a_gif_has_all_frames_and_their_pace(tmp_path: Path) -> None:
+    film = picture(*(moment(i) for i in range(5)))
+    write_gif(tmp_path / "route.gif", film.frames(), 200_000)
+    with Image.open(tmp_path / "route.gif") as image:
+        assert getattr(image, "n_frames", 1) == 5
+        assert image.info["duration"] == 200
+        assert image.info["loop"] == 0
+        image.seek(4)
+        shown = np.asarray(image.convert("RGB")).astype(int)
+    assert np.abs(shown - film.frame(4)).mean() < 3
+    assert [path.name for path in tmp_path.iterdir()] == ["route.gif"]
+
+
+def test_a_gif_needs_a_frame(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="needs at least one picture"):
+        write_gif(tmp_path / "route.gif", [], 50_000)
+
+
+@pytest.mark.parametrize("write", [write_png, lambda p, f: write_gif(p, [f], 50_000)])
+def test_a_place_that_cannot_be_written_is_named(
+    tmp_path: Path, write: Callable[[Path, Image8], None]
+) -> None:
+    path = tmp_path / "missing" / "moment.png"
+    with pytest.raises(EvaluationError, match=r"moment\.png: the picture cannot be"):
+        write(path, picture(moment(0)).frame(0))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "moment.png"
+    path.write_bytes(b"old")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(EvaluationError, match="No space left on device"):
+        write_png(path, picture(moment(0)).frame(0))
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["moment.png"]
+
+
+def test_two_infractions_at_one_place_are_both_named() -> None:
+    red = event(EventKind.RED_LIGHT, 0)
+    crash = event(EventKind.COLLISION, 0)
+    mark = (208, 16, 32)
+    one = count(above(picture(moment(0, red)).frame(0)), mark)
+    two = count(above(picture(moment(0, red, crash)).frame(0)), mark)
+    again = picture(moment(0, red, replace(red, time_us=50_000)))
+    assert two > one + 20
+    assert count(above(again.frame(0)), mark) == one

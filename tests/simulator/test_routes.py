@@ -1,0 +1,136 @@
+import json
+import stat
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.routes import (
+    SHIPPED,
+    Route,
+    load_routes,
+    pick_routes,
+    save_routes,
+)
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+
+ROUTES = tuple(
+    Route(f"r{k}", "Accident", "Overtaking", k, {"lanes": 2, "bend": "left"})
+    for k in range(6)
+)
+
+
+def test_a_manifest_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    file = tmp_path / "routes.json"
+    save_routes(ROUTES, file)
+
+    assert load_routes(file) == ROUTES
+    assert list(tmp_path.iterdir()) == [file]
+    assert set(json.loads(file.read_text())[0]) == {
+        "id",
+        "scenario",
+        "ability",
+        "seed",
+        "parameters",
+    }
+
+
+def test_220_routes_ship_five_of_each_type() -> None:
+    routes = load_routes()
+
+    assert len(routes) == len({route.seed for route in routes}) == 220
+    assert Counter(route.scenario for route in routes) == dict.fromkeys(
+        SCENARIO_ABILITIES, 5
+    )
+    assert all(route.parameters for route in routes)
+    assert SHIPPED.suffix == ".json"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "Invalid JSON"),
+        ("{}", "the file: Input should be a valid array"),
+        ('[{"id": "a"}]', "0.scenario: Field required"),
+        (
+            '[{"id": "a", "scenario": "Accident", "ability": "Overtaking", '
+            '"seed": "x", "parameters": {}}]',
+            "0.seed: Input should be a valid integer",
+        ),
+    ],
+)
+def test_a_file_that_is_no_manifest_is_named(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    file = tmp_path / "routes.json"
+    file.write_text(text)
+
+    with pytest.raises(EvaluationError) as caught:
+        load_routes(file)
+
+    assert str(file) in str(caught.value)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_id_must_be_unique(tmp_path: Path) -> None:
+    file = tmp_path / "routes.json"
+    save_routes([ROUTES[0], ROUTES[1], ROUTES[0]], file)
+
+    with pytest.raises(EvaluationError, match="routes 0 and 2 share the id r0"):
+        load_routes(file)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="cannot be read: No such file"):
+        load_routes(tmp_path / "none.json")
+
+
+def test_a_folder_that_cannot_be_written_leaves_the_old_file(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="cannot be written"):
+        save_routes(ROUTES, tmp_path / "none" / "routes.json")
+
+
+def test_the_file_may_be_read_by_others(tmp_path: Path) -> None:
+    file = tmp_path / "routes.json"
+    save_routes(ROUTES, file)
+
+    (tmp_path / "plain").touch()
+    plain = (tmp_path / "plain").stat().st_mode
+    assert stat.S_IMODE(file.stat().st_mode) == stat.S_IMODE(plain)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"id": "a/b"}, "only letters, digits"),
+        ({"id": ""}, "only letters, digits"),
+        ({"scenario": "Nothing"}, "no scenario 'Nothing'; there are Accident"),
+        ({"ability": "Merging"}, "Accident tests Overtaking, not 'Merging'"),
+    ],
+)
+def test_an_impossible_route_is_refused(given: dict[str, str], words: str) -> None:
+    fields = {"id": "a", "scenario": "Accident", "ability": "Overtaking", **given}
+
+    with pytest.raises(EvaluationError, match=words):
+        Route(fields["id"], fields["scenario"], fields["ability"], 0)
+
+
+def test_picking_all_some_or_named_routes() -> None:
+    assert pick_routes(ROUTES, "all") == ROUTES
+    assert [route.id for route in pick_routes(ROUTES, "3")] == ["r0", "r2", "r4"]
+    assert [route.id for route in pick_routes(ROUTES, "r5, r1")] == ["r5", "r1"]
+
+
+@pytest.mark.parametrize(
+    ("which", "words"),
+    [
+        ("0", "0 routes were asked for; there are 6"),
+        ("7", "7 routes were asked for; there are 6"),
+        ("r1,zz", "no route 'zz'; there are 6, for example r0"),
+    ],
+)
+def test_picking_what_is_not_there(which: str, words: str) -> None:
+    with pytest.raises(EvaluationError, match=words):
+        pick_routes(ROUTES, which)

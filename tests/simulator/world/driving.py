@@ -1,0 +1,43 @@
+"""Small helpers of the world's tests."""
+
+from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.dry_run import Rehearsal, rehearse
+from me2e_compress.simulator.routes import Parameter, Route
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.scenarios.layouts.streets import two_way
+from me2e_compress.simulator.scene import Control
+from me2e_compress.simulator.traffic.stage import Stage
+from me2e_compress.simulator.world import World
+
+
+def route_of(
+    scenario: str = "Accident", seed: int = 0, **parameters: Parameter
+) -> Route:
+    ability = SCENARIO_ABILITIES[scenario][0]
+    return Route("test", scenario, ability, seed, dict(parameters))
+
+
+def empty_road(stage: Stage) -> None:
+    two_way(stage)
+
+
+def coast(world: World, frames: int, control: Control | None = None) -> None:
+    for _ in range(frames):
+        if world.done:
+            return
+        world.step(control or Control(0.0, 0.0))
+
+
+def sleepwalk(route: Route, speed_mps: float) -> Rehearsal:
+    return rehearse(route, Blind(speed_mps))
+
+
+def trace(route: Route, frames: int = 200, dt_us: int = 50_000) -> list[object]:
+    """Everything that is visible, frame by frame, at full precision."""
+    world, seen = World(route, dt_us=dt_us), list[object]()
+    for _ in range(frames):
+        if world.done:
+            break
+        world.step(Control(0.5, 0.0))
+        seen.append(world.scene())
+    return [*seen, world.events, world.reason]

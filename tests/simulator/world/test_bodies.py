@@ -1,0 +1,201 @@
+import math
+
+import numpy as np
+import pytest
+from highway_env.road.road import Road
+from highway_env.utils import are_polygons_intersecting
+from highway_env.vehicle.behavior import IDMVehicle
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from me2e_compress.simulator.scene import ActorKind, Control
+from me2e_compress.simulator.traffic.bodies import (
+    DRY_GRIP_MPS2,
+    EgoVehicle,
+    Standing,
+    Walker,
+)
+from me2e_compress.simulator.traffic.cars import Car, Manners
+from me2e_compress.simulator.traffic.network import Network, Pose, Section
+from me2e_compress.simulator.traffic.road import TrafficRoad, overlap
+
+
+def driven(control: Control, seconds: float, dt: float, speed: float) -> EgoVehicle:
+    ego = EgoVehicle(Pose(0.0, 0.0, 0.3), speed)
+    ego.wanted = control
+    for _ in range(round(seconds / dt)):
+        ego.step(dt)
+    return ego
+
+
+def test_the_ego_brakes_to_rest_and_never_reverses() -> None:
+    ego = driven(Control(-8.0, 0.0), 4.0, 0.05, 10.0)
+
+    assert ego.speed == 0
+    assert ego.pose.x > 0
+
+
+def test_the_ego_follows_an_order_with_a_lag() -> None:
+    ego = driven(Control(3.0, 0.0), 0.2, 0.05, 5.0)
+
+    assert ego.snapshot().acceleration_mps2 == pytest.approx(3 * (1 - math.exp(-1)))
+
+
+def test_a_positive_wheel_angle_turns_left() -> None:
+    ego = driven(Control(0.0, 0.3), 1.0, 0.05, 5.0).snapshot()
+
+    assert ego.heading > 0.3
+    assert ego.yaw_rate_radps > 0
+    assert ego.lateral_acceleration_mps2 > 0
+
+
+@given(st.floats(-0.5, 0.5), st.floats(-4.0, 3.0), st.floats(2.0, 9.0))
+def test_a_finer_step_hardly_changes_a_held_control(
+    wheel: float, push: float, speed: float
+) -> None:
+    coarse = driven(Control(push, wheel), 2.0, 0.05, speed).pose
+    fine = driven(Control(push, wheel), 2.0, 0.01, speed).pose
+
+    assert math.hypot(coarse.x - fine.x, coarse.y - fine.y) < 0.6
+
+
+@given(st.floats(5.0, 20.0), st.floats(0.2, 0.6))
+def test_tyres_hold_no_more_than_their_grip(speed: float, wheel: float) -> None:
+    ego = driven(Control(0.0, wheel), 1.0, 0.05, speed).snapshot()
+
+    assert abs(ego.lateral_acceleration_mps2) <= DRY_GRIP_MPS2 * 1.001
+
+
+def one_lane(length: float = 300.0) -> tuple[Network, TrafficRoad]:
+    network = Network()
+    network.straight("a", "b", Pose(0.0, 0.0, 0.0), length, Section(limit_mps=20.0))
+    return network, TrafficRoad(network)
+
+
+def put(road: TrafficRoad, *cars: Car | Standing) -> None:
+    for car in cars:
+        car.road = road
+    road.vehicles = [car for car in cars if isinstance(car, Car)]
+    road.objects = [car for car in cars if isinstance(car, Standing)]
+
+
+def run(road: TrafficRoad, seconds: float) -> None:
+    for frame in range(round(seconds * 20)):
+        if frame % 2 == 0:
+            road.act()
+        road.step(0.05)
+        assert all(car.speed >= 0 for car in road.vehicles)
+
+
+@given(st.floats(3.0, 40.0), st.floats(0.0, 15.0), st.floats(0.0, 15.0))
+def test_a_follower_never_reverses_nor_hits_a_leader_with_room(
+    gap: float, speed: float, lead: float
+) -> None:
+    assume(speed - lead < math.sqrt(2 * 4.0 * gap))
+    network, road = one_lane()
+    chain = [("a", "b", 0)]
+    front = Car(1, network, chain, 60.0, lead)
+    rear = Car(2, network, chain, 60.0 - 4.6 - gap, speed, 12.0)
+    put(road, rear, front)
+
+    run(road, 8.0)
+
+    assert road.touching() == []
+    assert rear.station_m < front.station_m
+
+
+def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
+    network = Network()
+    pose = network.straight("a", "b", Pose(0.0, 0.0, 0.0), 40.0, Section())
+    pose = network.arc("b", "c", pose, 15.0, math.pi / 2, Section())
+    network.straight("c", "d", pose, 60.0, Section())
+    road = TrafficRoad(network)
+    car = Car(1, network, [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)], 5.0, 8.0)
+    parked = Standing(2, ActorKind.PARKED, network.pose(("c", "d", 0), 8.0))
+    put(road, car, parked)
+
+    run(road, 20.0)
+
+    assert car.speed < 0.5
+    assert car.leg == 2
+    assert not overlap(car, parked)
+
+
+def test_a_car_keeps_to_its_lane_through_a_bend() -> None:
+    network = Network()
+    pose = network.straight("a", "b", Pose(0.0, 0.0, 1.0), 30.0, Section())
+    pose = network.arc("b", "c", pose, 12.0, -math.pi / 2, Section())
+    network.straight("c", "d", pose, 60.0, Section())
+    road = TrafficRoad(network)
+    car = Car(1, network, [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)], 5.0, 8.0)
+    put(road, car)
+
+    for _ in range(60):
+        run(road, 0.1)
+        lane = network.lane(car.lanes[car.leg])
+        assert abs(lane.local_coordinates(car.position)[1]) < 0.8
+
+
+def test_manners_belong_to_one_car_and_leave_the_class_alone() -> None:
+    network, _ = one_lane()
+    before = {name: getattr(IDMVehicle, name) for name in ("TIME_WANTED", "DELTA")}
+
+    pushy = Car(1, network, [("a", "b", 0)], 5.0, 8.0, manners=Manners(headway_s=0.3))
+    polite = Car(2, network, [("a", "b", 0)], 30.0, 8.0)
+
+    assert pushy.TIME_WANTED == 0.3
+    assert Manners().headway_s == polite.TIME_WANTED
+    assert {name: getattr(IDMVehicle, name) for name in before} == before
+
+
+def test_two_cars_do_not_share_their_chain_of_lanes() -> None:
+    network, _ = one_lane()
+    chain = [("a", "b", 0)]
+    first, second = (Car(i, network, chain, 9.0 * i, 0.0) for i in (1, 2))
+
+    first.change_lane([("a", "b", 0), ("a", "b", 0)], 0)
+
+    assert second.lanes == chain == [("a", "b", 0)]
+
+
+def test_a_walker_waits_then_walks_its_line() -> None:
+    line = np.array([[0.0, 0.0], [0.0, 4.0], [3.0, 4.0]])
+    walker = Walker(1, ActorKind.PEDESTRIAN, line, 1.5)
+    walker.step(0.05)
+    assert walker.speed == 0
+
+    walker.going = True
+    for _ in range(200):
+        walker.step(0.05)
+
+    assert walker.done
+    assert walker.speed == 0
+    assert tuple(walker.position) == pytest.approx((3.0, -4.0))
+
+
+boxes = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0), st.floats(-4.0, 4.0))
+
+
+@given(boxes, boxes)
+def test_overlap_agrees_with_highway_env(
+    one: tuple[float, float, float], other: tuple[float, float, float]
+) -> None:
+    a = Standing(1, ActorKind.PARKED, Pose(*one))
+    b = Standing(2, ActorKind.VAN, Pose(*other))
+    still = np.zeros(2)
+
+    expected, _, _ = are_polygons_intersecting(a.polygon(), b.polygon(), still, still)
+
+    assert overlap(a, b) == expected
+
+
+@given(st.lists(st.floats(5.0, 290.0), min_size=2, max_size=6, unique=True))
+def test_neighbours_are_those_of_highway_env(places: list[float]) -> None:
+    network, road = one_lane()
+    cars = [Car(k + 1, network, [("a", "b", 0)], s, 0.0) for k, s in enumerate(places)]
+    put(road, *cars)
+    stock = Road(network.graph, vehicles=cars, neighbour_vehicles_connected_lanes=True)
+    road.refresh()
+
+    for car in cars:
+        assert road.neighbour_vehicles(car) == stock.neighbour_vehicles(car)

@@ -1,0 +1,188 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph, recipe
+from me2e_compress.errors import StudyError
+from me2e_compress.manager import PassManager
+from me2e_compress.study import Listener, Scheme, Study
+from me2e_compress.study.prepared import Contender, contend
+from me2e_compress.study.workplace import SILENT, Workplace
+from tests.cli.conftest import write_frames
+from tests.stand_in import write_model
+from tests.study.conftest import Make
+
+
+@pytest.fixture
+def study(make: Make, tmp_path: Path) -> Study:
+    """One scheme that takes a module of a small stack away."""
+    write_model(tmp_path / "m.onnx")
+    write_images(tmp_path / "frames", 0)
+    scheme = Scheme("minus-occ", str(tmp_path / "m.onnx"), recipe.load("minus-occ"))
+    return make(schemes=(scheme,), baseline="minus-occ", frames=tmp_path / "frames")
+
+
+def write_images(folder: Path, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    write_frames(
+        folder,
+        img=random.normal(size=(1, 6, 3, 16, 24)).astype(np.float32),
+        lidar2img=random.normal(size=(1, 6, 4, 4)).astype(np.float32),
+        can_bus=random.normal(size=18).astype(np.float32),
+        command=np.array([3]),
+        timestamp=np.array([0.0], np.float32),
+    )
+
+
+def made(study: Study, folder: Path) -> Contender:
+    return contend(study, study.schemes[0], Workplace(folder), SILENT)
+
+
+@pytest.fixture
+def no_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(*_: object) -> None:
+        raise AssertionError("the passes ran again")
+
+    monkeypatch.setattr(PassManager, "run", run)
+
+
+def test_passes_make_a_model_of_their_own(study: Study, tmp_path: Path) -> None:
+    source = Path(study.schemes[0].policy)
+    before = source.read_bytes()
+
+    found = made(study, tmp_path)
+
+    assert found.model is not None
+    assert found.model.parent == tmp_path / "models"
+    assert found.sha256 == graph.sha256_of(found.model)
+    assert found.size_bytes == found.model.stat().st_size
+    assert "ablate-modules" in found.pipeline
+    assert "occupancy" not in [
+        out.name for out in graph.load(found.model).graph.outputs
+    ]
+    assert source.read_bytes() == before
+
+
+def test_the_same_is_made_once(
+    study: Study, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    first = made(study, tmp_path)
+    request.getfixturevalue("no_passes")
+
+    assert made(study, tmp_path) == first
+
+
+def test_a_model_without_its_report_is_made_again(study: Study, tmp_path: Path) -> None:
+    first = made(study, tmp_path)
+    assert first.model is not None
+    report = first.model.with_name(f"{first.model.stem}.report.json")
+    report.unlink()
+
+    assert made(study, tmp_path) == first
+    assert json.loads(report.read_text())["output"]["sha256"] == first.sha256
+
+
+@pytest.mark.parametrize("change", ["frames", "source", "passes", "seed"])
+def test_what_decides_the_model_decides_its_name(
+    study: Study, tmp_path: Path, change: str
+) -> None:
+    first, scheme = made(study, tmp_path), study.schemes[0]
+    if change == "frames":
+        write_images(tmp_path / "others", 1)
+        study = dataclasses.replace(study, frames=tmp_path / "others")
+    elif change == "seed":
+        study = dataclasses.replace(study, seed=1)
+    elif change == "source":
+        write_model(tmp_path / "m.onnx", seed=1)
+    else:
+        other = dataclasses.replace(scheme, passes=recipe.load("minus-map"))
+        study = dataclasses.replace(study, schemes=(other,))
+
+    assert made(study, tmp_path).model != first.model
+
+
+@pytest.mark.parametrize("damage", ["weights", "cut", "report"])
+def test_an_altered_model_is_made_again(
+    study: Study, tmp_path: Path, damage: str
+) -> None:
+    warnings = list[str]()
+    first = made(study, tmp_path)
+    assert first.model is not None
+    if damage == "weights":
+        write_model(first.model, seed=3)
+    elif damage == "cut":
+        first.model.write_bytes(first.model.read_bytes()[:-9])
+    else:
+        first.model.with_name(f"{first.model.stem}.report.json").write_text("{}")
+
+    listener = Listener(on_warning=warnings.append)
+    again = contend(study, study.schemes[0], Workplace(tmp_path), listener)
+
+    assert again == first
+    assert graph.sha256_of(first.model) == first.sha256
+    assert warnings == [f"{first.model}: not what its report is of: made again"]
+
+
+def with_means(study: Study, file: Path) -> Study:
+    passes = recipe.parse(
+        f'ablate-modules{{drop=[map],drop_outputs=true,fill=means,means="{file}"}}'
+    )
+    scheme = dataclasses.replace(study.schemes[0], passes=passes)
+    return dataclasses.replace(study, schemes=(scheme,), baseline=scheme.name)
+
+
+def write_means(study: Study, file: Path, value: float) -> None:
+    """One number everywhere that the map module is read."""
+    loaded = graph.load(Path(study.schemes[0].policy))
+    graph.infer_shapes(loaded)
+    means = {
+        str(output.name): np.full(shape, value, np.float32)
+        for node in loaded.graph
+        for output in node.outputs
+        if (shape := graph.static_shape(output)) is not None
+    }
+    np.savez(file, allow_pickle=False, **means)
+
+
+def test_a_file_that_a_pass_reads_decides_the_model(
+    study: Study, tmp_path: Path
+) -> None:
+    file = tmp_path / "means.npz"
+    asked = with_means(study, file)
+    write_means(asked, file, 1.0)
+    first = made(asked, tmp_path)
+    assert made(asked, tmp_path) == first
+
+    write_means(asked, file, 2.0)
+    second = made(asked, tmp_path)
+
+    assert second.model != first.model
+    assert second.sha256 != first.sha256
+
+
+def test_a_file_that_a_pass_reads_and_that_is_gone(
+    study: Study, tmp_path: Path
+) -> None:
+    asked = with_means(study, tmp_path / "gone.npz")
+
+    with pytest.raises(
+        StudyError, match=r"minus-occ: \S+gone\.npz: cannot be read: No"
+    ):
+        made(asked, tmp_path)
+
+
+def test_what_made_a_file_is_read_from_the_report_beside_it(
+    study: Study, tmp_path: Path
+) -> None:
+    first = made(study, tmp_path)
+    assert first.model is not None
+    plain = dataclasses.replace(study, schemes=(Scheme("minus-occ", str(first.model)),))
+
+    found = made(plain, tmp_path)
+
+    assert (found.source, found.pipeline) == ("m.onnx", first.pipeline)
+    write_model(first.model, seed=3)
+    assert made(plain, tmp_path).pipeline == ""

@@ -1,0 +1,101 @@
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.targets import target_named
+from me2e_compress.targets.lint import lint
+from tests.nets import MODULES, conv_attention, net
+
+LAYER = """
+<ir_version: 9, opset_import: ["" : 17]>
+m (float[1,1,4,4] x, %(kind)s[1,1,4,4] ignored) => (float[1,1,4,4] y)
+<int8[1,1,1,1] w = {3}, float s = {0.5}, int8 n = {0}, %(kind)s z = {%(zero)d}> {
+    q = QuantizeLinear(x, s, z)
+    d = DequantizeLinear(q, s, z)
+    v = DequantizeLinear(w, s, n)
+    c = Conv(d, v)
+    r = Relu(c)
+    %(answer)s
+}
+"""
+ANSWERED = "a = QuantizeLinear(r, s, z) y = DequantizeLinear(a, s, z)"
+PLAIN = "y = Identity(r)"
+
+
+@pytest.mark.parametrize(
+    ("kind", "zero", "answer", "rules"),
+    [
+        ("uint8", 128, ANSWERED, []),
+        ("int8", 0, ANSWERED, ["signed-activation"]),
+        ("uint8", 128, PLAIN, ["float-answer"]),
+        ("int8", 0, PLAIN, ["signed-activation", "float-answer"]),
+    ],
+)
+def test_convolutions_that_run_slowly(
+    kind: str, zero: int, answer: str, rules: list[str]
+) -> None:
+    text = LAYER % {"kind": kind, "zero": zero, "answer": answer}
+
+    found = lint(ir.from_onnx_text(text), "onnxruntime")
+
+    assert [each.rule for each in found] == rules
+    assert {each.severity for each in found} <= {"warning"}
+
+
+def test_operators_without_a_kernel() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>'
+        "m (float[1,2,3,3] x) => (float[1,2,3,3] y) { y = trt.InverseTRT(x) }"
+    )
+    (found,) = lint(model, "onnxruntime")
+
+    assert found.message == "trt::InverseTRT has no kernel and no local function"
+
+
+def test_contrib_operators_are_known() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1]>'
+        "m (float[2] x) => (float[2] y) { y = com.microsoft.Gelu(x) }"
+    )
+    assert lint(model, "onnxruntime") == ()
+
+
+def test_opsets_nobody_has_released() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 99]>'
+        "m (float[2] x) => (float[2] y) { y = Relu(x) }"
+    )
+    assert "opset" in [each.rule for each in lint(model, "onnxruntime")]
+
+
+def test_what_we_place_for_it_has_no_findings() -> None:
+    model = conv_attention()
+    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    target = target_named("onnxruntime")
+    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
+
+    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+
+    assert lint(placed, "onnxruntime") == ()
+
+
+def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    up (float[1,8,4,4] x, float[8,8,1,1] w, float[8,8,2,2] t) => (float[1,8,8,8] y) {
+        c = Conv(x, w)
+        r = Relu(c)
+        y = ConvTranspose<kernel_shape=[2,2], strides=[2,2]>(r, t)
+    }
+    """
+    model = net(text, {"w": np.ones((8, 8, 1, 1)), "t": np.ones((8, 8, 2, 2))})
+    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    target = target_named("onnxruntime")
+    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
+
+    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+
+    assert lint(placed, "onnxruntime") == ()

@@ -1,0 +1,255 @@
+"""Explicit quantization as TensorRT wants it."""
+
+from collections.abc import Callable
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.quantization.plan import make_plan, tensors_of
+from me2e_compress.quantization.rules import rules_named
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.targets import tensorrt
+from me2e_compress.targets.lint import Finding, lint
+from tests.nets import MODULES, conv_attention, net
+
+FULL = QuantScheme.named("full", MODULES)
+
+
+def found(text: str, opset: int = 17) -> list[tuple[str, str, str]]:
+    model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : {opset}]>' + text)
+    return [shown(each) for each in lint(model, "tensorrt")]
+
+
+def shown(finding: Finding) -> tuple[str, str, str]:
+    return finding.severity, finding.rule, finding.message
+
+
+def placed(rules: str) -> ir.Model:
+    model = conv_attention()
+    plan = make_plan(model, FULL, rules_named(rules))
+    tensors = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
+    return tensorrt.place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+
+
+@pytest.mark.parametrize("rules", ["paper", "tensorrt"])
+def test_what_we_place_has_no_findings(rules: str) -> None:
+    assert lint(placed(rules), "tensorrt") == ()
+
+
+def _scale(value: float) -> Callable[[ir.Model], None]:
+    def change(model: ir.Model) -> None:
+        _replace(model, "image_scale", np.array(value, np.float32))
+
+    return change
+
+
+def _zero(model: ir.Model) -> None:
+    _replace(model, "int8_zero", np.array(3, np.int8))
+
+
+def _axis(model: ir.Model) -> None:
+    node = _dequantize(model, "w_int8")
+    node.attributes["axis"] = ir.AttrInt64("axis", 3)
+    _replace(model, "w_scale", np.ones(3, np.float32))
+    _replace(model, "w_zero", np.zeros(3, np.int8))
+
+
+def _other_axis(model: ir.Model) -> None:
+    _dequantize(model, "l_int8").attributes["axis"] = ir.AttrInt64("axis", 0)
+
+
+def _no_axis(model: ir.Model) -> None:
+    _dequantize(model, "l_int8").attributes.pop("axis")
+
+
+def _activation_by_channel(model: ir.Model) -> None:
+    _replace(model, "image_scale", np.ones(3, np.float32))
+    _replace(model, "int8_zero", np.zeros(3, np.int8))
+
+
+def _computed_scale(model: ir.Model) -> None:
+    node = next(n for n in model.graph if n.op_type == "QuantizeLinear")
+    scale = ir.node("Abs", [node.inputs[1]])
+    scale.outputs[0].name = "computed"
+    model.graph.insert_before(node, scale)
+    node.replace_input_with(1, scale.outputs[0])
+
+
+def _float_reader(model: ir.Model) -> None:
+    conv = next(n for n in model.graph if n.op_type == "Conv")
+    conv.replace_input_with(0, model.graph.inputs[0])
+
+
+def _float_weight(model: ir.Model) -> None:
+    conv = next(n for n in model.graph if n.op_type == "Conv")
+    weight = graph.add_constant(model.graph, np.ones((8, 3, 3, 3), np.float32), "v")
+    conv.replace_input_with(1, weight)
+
+
+def _replace(model: ir.Model, name: str, array: np.ndarray) -> None:
+    value = model.graph.initializers[name]
+    value.const_value = ir.tensor(array, name=name)
+    value.shape = ir.Shape(array.shape)
+    value.type = ir.TensorType(value.const_value.dtype)
+
+
+def _dequantize(model: ir.Model, integers: str) -> ir.Node:
+    return next(
+        node
+        for node in model.graph
+        if node.op_type == "DequantizeLinear"
+        and node.inputs[0] is not None
+        and node.inputs[0].name == integers
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "rule", "message"),
+    [
+        (_scale(0.0), "scale", "scale 0, must be finite and above 0"),
+        (_scale(-1.0), "scale", "scale -1, must be finite and above 0"),
+        (_scale(float("inf")), "scale", "scale inf, must be finite and above 0"),
+        (_computed_scale, "scale", "the scale is computed, must be a constant"),
+        (_zero, "zero-point", "zero point 3, must be 0"),
+        (_axis, "weight-axis", "scales along axis 3; output channels of Conv run"),
+        (_other_axis, "weight-axis", "scales along axis 0; output channels of MatMul"),
+        (_no_axis, "weight-axis", "no axis: ONNX takes 1, TensorRT takes 0"),
+        (_activation_by_channel, "channel-scale", "an activation has one scale a ch"),
+        (_float_reader, "half-quantized", "its activation is float: it runs in float"),
+        (_float_weight, "half-quantized", "its weight is float: it runs in float"),
+    ],
+)
+def test_what_is_broken_is_found(
+    change: Callable[[ir.Model], None], rule: str, message: str
+) -> None:
+    model = placed("paper")
+    change(model)
+
+    ours = [each for each in lint(model, "tensorrt") if each.rule == rule]
+
+    assert ours
+    assert message in ours[0].message
+
+
+PAIR = "<float s = {0.5}, float t = {0.25}, int8 z = {0}, uint8 u = {0}, int32 i = {0}>"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "m (float[2] x) => (float[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, u)"
+            " d = DequantizeLinear(q, s, u) y = Relu(d) }",
+            ("error", "quantized-type", "uint8, must be int8"),
+        ),
+        (
+            "m (float[2] x) => (float[2] y) <float s = {0.5}>"
+            " { q = QuantizeLinear(x, s) d = DequantizeLinear(q, s) y = Relu(d) }",
+            ("error", "quantized-type", "uint8, must be int8"),
+        ),
+        (
+            "m (float[2] x) => (float[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"
+            " d = DequantizeLinear(q, t, z) y = Relu(d) }",
+            ("error", "unpaired", "quantized and dequantized on two scales"),
+        ),
+        (
+            "m (float[2] x) => (int8[2] q) " + PAIR + "{ q = QuantizeLinear(x, s, z) }",
+            ("error", "unpaired", "its integers are a graph output"),
+        ),
+        (
+            "m (float[2] x) => (int8[2] y) "
+            + PAIR
+            + "{ q = QuantizeLinear(x, s, z) y = Identity(q) }",
+            ("error", "unpaired", "its integers are read by Identity"),
+        ),
+        (
+            "m (int8[2] x) => (float[2] y) " + PAIR + "{ d = DequantizeLinear(x, s, z)"
+            " y = Relu(d) }",
+            ("error", "unpaired", "reads integers of a graph input"),
+        ),
+        (
+            "m (float x) => (float y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"
+            " d = DequantizeLinear(q, s, z) y = Relu(d) }",
+            ("error", "scalar-pair", "QuantizeLinear of a 0-D tensor"),
+        ),
+        (
+            "m (float[2] x) => (int64[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"
+            " d = DequantizeLinear(q, s, z) y = Cast<to=7>(d) }",
+            ("error", "integer-pair", "a dequantized tensor is cast to an index or"),
+        ),
+        (
+            "m (float[2] x) => (float[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"
+            " y = DequantizeLinear(q, s, z) }",
+            ("warning", "output-pair", "graph output y is rounded"),
+        ),
+        (
+            "m (float[2] x) => (float[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"
+            " d = DequantizeLinear(q, s, z) p = QuantizeLinear(d, t, z)"
+            " e = DequantizeLinear(p, t, z) y = Relu(e) }",
+            ("warning", "repeated-pair", "quantizes what was just dequantized"),
+        ),
+    ],
+)
+def test_pairs_that_are_wrong(text: str, expected: tuple[str, str, str]) -> None:
+    severity, rule, message = expected
+    assert any(
+        (each[0], each[1]) == (severity, rule) and message in each[2]
+        for each in found(text)
+    )
+
+
+def test_a_quantized_bias_is_an_error() -> None:
+    text = """m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y)
+    <int32[1] b = {7}, float s = {0.5}, int32 z = {0}>
+    { d = DequantizeLinear(b, s, z) y = Conv(x, w, d) }"""
+    rules = [each[1] for each in found(text)]
+
+    assert "bias-pair" in rules
+    assert "quantized-type" in rules
+
+
+def test_float_weights_behind_a_pair_are_a_warning() -> None:
+    text = """m (float[2,2] x) => (float[2,2] y)
+    <float[2,2] w = {1.0, 2.0, 3.0, 4.0}, float s = {0.5}, int8 z = {0}>
+    { q = QuantizeLinear(w, s, z) d = DequantizeLinear(q, s, z) y = MatMul(x, d) }"""
+
+    assert ("warning", "float-weight", "the weight is stored as float") in found(text)
+
+
+def test_a_pair_between_a_convolution_and_its_add_is_a_warning() -> None:
+    text = """m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y)
+    <float s = {0.5}, int8 z = {0}>
+    { c = Conv(x, w) q = QuantizeLinear(c, s, z) d = DequantizeLinear(q, s, z)
+      y = Add(d, x) }"""
+
+    assert "residual-branch" in [each[1] for each in found(text)]
+
+
+def test_a_rounded_projection_is_a_residual_branch() -> None:
+    text = """m (float[1,1,4,4] x, float[1,1,1,1] w) => (float[1,1,4,4] y)
+    <float s = {0.5}, int8 z = {0}>
+    { c = Conv(x, w) p = Conv(x, w) q = QuantizeLinear(p, s, z)
+      d = DequantizeLinear(q, s, z) y = Add(c, d) }"""
+
+    assert "residual-branch" not in [each[1] for each in found(text)]
+
+
+def test_graphs_of_other_quantizers_are_judged_the_same() -> None:
+    """A pair on every input and on a weight that stays float, as AddQDQPairToWeight."""
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    m (float[4,16] x, float[16,16] w) => (float[4,16] y)
+    <float s = {0.5}, int8 z = {0}> {
+        a = QuantizeLinear(x, s, z)
+        b = DequantizeLinear(a, s, z)
+        c = QuantizeLinear(w, s, z)
+        d = DequantizeLinear(c, s, z)
+        y = MatMul(b, d)
+    }
+    """
+    model = net(text, {"w": np.ones((16, 16))})
+
+    assert [each.rule for each in lint(model, "tensorrt")] == ["float-weight"]

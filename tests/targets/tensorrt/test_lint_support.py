@@ -1,0 +1,188 @@
+"""Operators, plugins and their calls."""
+
+import onnx
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.targets.lint import Finding, lint
+from me2e_compress.targets.tensorrt.lint.operators import (
+    LATER,
+    SUPPORTED,
+    UNSUPPORTED,
+)
+
+
+def found(text: str, opset: int = 17) -> list[Finding]:
+    head = f'<ir_version: 9, opset_import: ["" : {opset}, "trt" : 1]>'
+    return list(lint(ir.from_onnx_text(head + text), "tensorrt"))
+
+
+def said(text: str, opset: int = 17) -> list[tuple[str, str]]:
+    return [(each.rule, each.message) for each in found(text, opset)]
+
+
+def test_a_plain_graph_has_no_findings() -> None:
+    assert said("m (float[2] x) => (float[2] y) { y = Relu(x) }") == []
+
+
+def test_every_operator_of_onnx_is_in_one_list() -> None:
+    """What onnx releases next must be looked up, not waved through."""
+    names = {each.name for each in onnx.defs.get_all_schemas() if each.domain == ""}
+    listed = {*SUPPORTED, *LATER, *UNSUPPORTED, "QuantizeLinear", "DequantizeLinear"}
+    unknown = {
+        "CausalConvWithState", "LinearAttention", "SwiGLU", "Swish",
+    }  # fmt: skip
+
+    assert names - listed <= unknown
+    assert not set(SUPPORTED) & UNSUPPORTED
+
+
+@pytest.mark.parametrize(
+    ("text", "opset", "rule", "message"),
+    [
+        (
+            "m (float[2] x) => (uint8[2] y, float s, uint8 z)"
+            " { y, s, z = DynamicQuantizeLinear(x) }",
+            17,
+            "operator",
+            "TensorRT's parser does not take DynamicQuantizeLinear",
+        ),
+        (
+            "m (float[2] x) => (float[2] y) { y = Swish(x) }",
+            24,
+            "operator",
+            "Swish is in no support matrix: unknown",
+        ),
+        (
+            "m (double[2] x) => (double[2] y) { y = Relu(x) }",
+            17,
+            "element-type",
+            "Relu of float64 is cast down",
+        ),
+        (
+            "m (int32[1,1,2,2] x) => (int32[1,1,2,2] y)"
+            " { y = MaxPool<kernel_shape=[1,1]>(x) }",
+            17,
+            "element-type",
+            "MaxPool of int32; it is taken with bfloat16, float, float16",
+        ),
+        (
+            "m (float[9000] x, int64[1] k) => (float[4] y, int64[4] i)"
+            " <int64[1] four = {4000}> { y, i = TopK(x, four) }",
+            17,
+            "restriction",
+            "TopK: K = 4000, at most 3840",
+        ),
+        (
+            "m (float[4] x, int64[2,1] i, float[2] u) => (float[4] y)"
+            ' { y = ScatterND<reduction="add">(x, i, u) }',
+            17,
+            "restriction",
+            "ScatterND: reduction add, must be none",
+        ),
+        (
+            "m (float[1,1,2,2] x, float[4] s) => (float[1,1,A,B] y)"
+            ' { y = Resize<mode="cubic">(x, , s) }',
+            17,
+            "restriction",
+            "Resize: mode cubic, must be nearest or linear",
+        ),
+        (
+            "m (float[1,1,2,2,2] x, float[1,2,2,2,3] g) => (float[1,1,2,2,2] y)"
+            " { y = GridSample(x, g) }",
+            20,
+            "restriction",
+            "GridSample: rank 5, must be 4",
+        ),
+        (
+            "m (float[1,1,9] x, float[1,1,3] w) => (float[1,1,7] y) { y = Conv(x, w) }",
+            17,
+            "restriction",
+            "Conv: rank 3, must be 4 or 5",
+        ),
+        (
+            "m (float[1,1,4,4] x) => (float[1,1,2,2] y, int64[1,1,2,2] i)"
+            " { y, i = MaxPool<kernel_shape=[2,2], strides=[2,2]>(x) }",
+            17,
+            "restriction",
+            "MaxPool: only the first output is given",
+        ),
+        (
+            "m (float[2,3] x, int64 a) => (float[2,3] y) { y = CumSum(x, a) }",
+            17,
+            "restriction",
+            "CumSum: axis is computed, must be a constant",
+        ),
+    ],
+)
+def test_what_the_parser_does_not_take(
+    text: str, opset: int, rule: str, message: str
+) -> None:
+    assert (rule, message) in said(text, opset)
+
+
+def test_two_float_types_in_one_operator() -> None:
+    (each,) = (
+        each
+        for each in found(
+            "m (float[2] x, float16[2] h) => (float[2] y) { y = Add(x, h) }"
+        )
+        if each.rule == "mixed-types"
+    )
+    assert each.message == "Add of float and float16: one Cast"
+
+
+@pytest.mark.parametrize(
+    ("opset", "severity"), [(8, "error"), (9, None), (20, None), (21, "warning")]
+)
+def test_opsets(opset: int, severity: str | None) -> None:
+    text = "m (float[2] x) => (float[2] y) { y = Relu(x) }"
+
+    rules = {each.rule: each.severity for each in found(text, opset)}
+
+    assert rules.get("opset") == severity
+
+
+ROTATE = "m (float[2,4,4] x, float[1] a, float[2] c) => (float[2,4,4] y) { y = %s }"
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("trt.RotateTRT<interpolation=1>(x, a, c)", None),
+        ("trt.RotateTRT(x, a, c)", "wants attributes interpolation"),
+        ("trt.RotateTRT<interpolation=1>(x, a)", "takes 3 inputs, not 2"),
+        ("trt.RotateTRT<interpolation=1>(a, a, c)", "takes rank 3, not 1"),
+        ("trt.InverseTRT(x)", "takes rank 4, not 3"),
+        ("trt.Twist(x)", "trt::Twist is no operator, has no local function"),
+    ],
+)
+def test_plugins_are_called_as_they_want(call: str, message: str | None) -> None:
+    errors = found(ROTATE % call)
+
+    assert [message in each.message for each in errors if message] == (
+        [True] if message else []
+    )
+    assert all(each.rule == "plugin" for each in errors)
+
+
+def test_deformable_attention_wants_int32_shapes() -> None:
+    text = (
+        "m (float[1,9,8,4] v, int64[1,2] s, int32[1] l, float[1,5,8,1,4,2] p,"
+        " float[1,5,8,1,4] w) => (float[1,5,8,4] y)"
+        " { y = trt.MultiscaleDeformableAttnPlugin_TRT(v, s, l, p, w) }"
+    )
+    (each,) = found(text)
+
+    assert "input 1 of MultiscaleDeformableAttnPlugin_TRT" in each.message
+    assert "must be int32" in each.message
+
+
+def test_a_local_function_stands_in_for_an_operator() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17, "own" : 1]>
+    m (float[2] x) => (float[2] y) { y = own.Twice(x) }
+    <domain: "own", opset_import: ["" : 17]>
+    Twice (x) => (y) { y = Add(x, x) }
+    """
+    assert lint(ir.from_onnx_text(text), "tensorrt") == ()

@@ -1,0 +1,332 @@
+import numpy as np
+import numpy.typing as npt
+import onnx
+import onnx_ir as ir
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import provenance
+from me2e_compress.quantization.int8_weights import quantize_weight
+from me2e_compress.quantization.plan import make_plan, tensors_of
+from me2e_compress.quantization.rules import tensorrt_rules
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.session import run_once
+from me2e_compress.targets.tensorrt.place import place
+from tests.nets import MODULES, conv_attention, net
+
+FULL = QuantScheme.named("full", MODULES)
+
+LAYERS = """
+<ir_version: 9, opset_import: ["" : %d]>
+layers (float[2,3,5,5] x, float[2,4] t, float[6,3,3,3] conv, float[6] bias,
+        float[6,2,2,2] up, float[4,7] right, float[7,4] turned)
+    => (float[2,6,3,3] a, float[2,4,6,6] b, float[2,7] c, float[2,7] d) {
+    z = Conv<kernel_shape=[3,3]>(x, conv, bias)
+    a = Relu(z)
+    b = ConvTranspose<kernel_shape=[2,2], strides=[2,2], group=2>(a, up)
+    c = MatMul(t, right)
+    d = Gemm<transB=1>(t, turned)
+}
+"""
+SHAPES = {
+    "conv": (6, 3, 3, 3), "bias": (6,), "up": (6, 2, 2, 2), "right": (4, 7),
+    "turned": (7, 4),
+}  # fmt: skip
+PARTS = ("int8", "scale", "zero")
+AXES = {"conv": 0, "up": 1, "right": 1, "turned": 0}
+
+
+def layers(seed: int = 0, opset: int = 17) -> ir.Model:
+    generator = np.random.default_rng(seed)
+    weights = {name: generator.standard_normal(s) for name, s in SHAPES.items()}
+    return net(LAYERS % opset, weights)
+
+
+def placed(model: ir.Model, reach: float = 3.0) -> ir.Model:
+    plan = make_plan(model, FULL)
+    tensors = dict.fromkeys(tensors_of(plan, model), (-reach, reach / 2))
+    return place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+
+
+def test_weights_are_stored_as_int8_along_their_channels() -> None:
+    model = placed(layers())
+    stored = model.graph.initializers
+    producers = {
+        node.inputs[0].name: node
+        for node in model.graph
+        if node.op_type == "DequantizeLinear" and node.inputs[0] is not None
+    }
+
+    for name, axis in AXES.items():
+        assert name not in stored
+        assert stored[f"{name}_int8"].dtype == ir.DataType.INT8
+        assert graph.static_shape(stored[f"{name}_int8"]) == SHAPES[name]
+        assert graph.static_shape(stored[f"{name}_scale"]) == (SHAPES[name][axis],)
+        assert producers[f"{name}_int8"].attributes["axis"].as_int() == axis
+    assert stored["bias"].dtype == ir.DataType.FLOAT
+
+
+def test_readers_of_a_tensor_share_one_pair() -> None:
+    model = placed(layers())
+    quantized = [
+        node.inputs[0].name
+        for node in model.graph
+        if node.op_type == "QuantizeLinear" and node.inputs[0] is not None
+    ]
+
+    assert sorted(str(name) for name in quantized) == ["a", "t", "x"]
+
+
+def test_outputs_and_what_stays_float_read_the_tensor_itself() -> None:
+    model = placed(layers())
+    makers = {value.name: value.producer() for value in model.graph.outputs}
+
+    assert {name: node.op_type for name, node in makers.items() if node} == {
+        "a": "Relu",
+        "b": "ConvTranspose",
+        "c": "MatMul",
+        "d": "Gemm",
+    }
+
+
+def test_zero_points_are_zero_and_scales_positive() -> None:
+    model = placed(layers())
+    for node in model.graph:
+        if node.op_type in ("QuantizeLinear", "DequantizeLinear"):
+            _, scale, zero = (graph.array_of(value) for value in node.inputs)
+            assert scale is not None
+            assert (scale.astype(np.float64) > 0).all()
+            assert zero is not None
+            assert not zero.any()
+            assert zero.dtype == np.int8
+
+
+def test_the_result_is_a_valid_graph_and_the_source_untouched() -> None:
+    model = layers()
+    before = graph.digest(model)
+
+    result = placed(model)
+
+    onnx.checker.check_model(ir.to_proto(result), full_check=True)
+    assert graph.digest(model) == before
+
+
+def test_new_nodes_belong_to_the_module_that_reads_them() -> None:
+    result = placed(conv_attention())
+
+    assert not provenance.missing(result)
+    for node in result.graph:
+        past = provenance.read(node)
+        assert past is not None
+        if node.op_type in ("QuantizeLinear", "DequantizeLinear"):
+            assert past.passes == ("quantize-int8",)
+            reader = next(iter(node.outputs[0].consumers()))
+            assert past.module == provenance.module_of(reader)
+
+
+def test_opset_12_is_refused() -> None:
+    with pytest.raises(PreconditionError, match=r"opset 12: .*needs 13"):
+        placed(layers(opset=12))
+
+
+Floats = npt.NDArray[np.float32]
+
+
+def fake_quantized(x: Floats, scale: Floats) -> npt.NDArray[np.float64]:
+    """Round in float32, as QuantizeLinear is defined; all else is float64."""
+    steps = np.clip(np.rint(x / scale), -128, 127).astype(np.float64)
+    return np.asarray(steps * scale.astype(np.float64))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), reach=st.floats(0.5, 8.0))
+def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) -> None:
+    model = layers(seed)
+    generator = np.random.default_rng(seed)
+    t = generator.standard_normal((2, 4)).astype(np.float32)
+    stored = graph.array_of(model.graph.initializers["right"])
+    assert stored is not None
+    right = stored.astype(np.float32)
+    x = np.zeros((2, 3, 5, 5), np.float32)
+
+    got = run_once(placed(model, reach), {"x": x, "t": t})["c"].astype(np.float64)
+
+    step = np.array(reach / 127, np.float32)
+    channels = np.abs(right).max(axis=0) / np.float32(127)
+    want = fake_quantized(t, step) @ fake_quantized(right, channels)
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), axis=st.integers(0, 2))
+def test_a_weight_is_off_by_half_a_step_at_most(seed: int, axis: int) -> None:
+    weight = np.random.default_rng(seed).standard_normal((3, 4, 5)).astype(np.float32)
+
+    integers, scales = quantize_weight(weight, axis)
+
+    shape = [1, 1, 1]
+    shape[axis] = -1
+    error = np.abs(integers * scales.reshape(shape) - weight)
+    assert (error <= scales.reshape(shape) * 0.5001).all()
+    others = tuple(each for each in range(3) if each != axis)
+    assert (np.abs(integers).max(axis=others) == 127).all()
+
+
+def test_a_channel_of_zeros_stays_zero() -> None:
+    integers, scales = quantize_weight(np.zeros((2, 3), np.float32), 0)
+
+    assert not integers.any()
+    assert scales.tolist() == [1, 1]
+
+
+def test_a_weight_two_layers_share_is_stored_once() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    twice (float[3,4] x, float[4,4] w) => (float[3,4] y) {
+        h = MatMul(x, w)
+        y = MatMul(h, w)
+    }
+    """
+    model = placed(net(text, {"w": np.ones((4, 4))}))
+
+    stored = [name for name in model.graph.initializers if name.endswith("_int8")]
+    assert stored == ["w_int8"]
+
+
+def test_a_weight_that_is_also_read_in_float_stays() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    tied (float[3,4] x, float[4,4] w) => (float[3,4] y, float[4,4] z) {
+        y = MatMul(x, w)
+        z = Relu(w)
+    }
+    """
+    model = placed(net(text, {"w": np.ones((4, 4))}))
+
+    assert {"w", "w_int8"} <= set(model.graph.initializers)
+
+
+BLOCK = """
+<ir_version: 9, opset_import: ["" : 17]>
+block (float[1,4,5,5] x, float[4,4,3,3] w, float[4,4,1,1] v) => (float[1,4,5,5] y) {
+    r = Relu(x)
+    a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(r, w)
+    s = Add(a, %s)
+    y = Relu(s)
+}
+"""
+
+
+def test_only_the_residual_branch_of_an_add_is_quantized() -> None:
+    weights = {"w": np.ones((4, 4, 3, 3)), "v": np.ones((4, 4, 1, 1))}
+    model = placed(net(BLOCK % "x", weights))
+
+    (add,) = (node for node in model.graph if node.op_type == "Add")
+    makers = [value.producer() for value in add.inputs if value is not None]
+    assert [node.op_type for node in makers if node] == ["Conv", "DequantizeLinear"]
+
+
+def test_a_residual_branch_shares_the_pair_of_its_other_readers() -> None:
+    weights = {"w": np.ones((4, 4, 3, 3)), "v": np.ones((4, 4, 1, 1))}
+    model = placed(net(BLOCK % "r", weights))
+
+    assert [n.op_type for n in model.graph].count("QuantizeLinear") == 1
+
+
+def test_what_a_concat_joins_is_on_one_scale() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17]>
+    join (float[9,16] a, float[9,16] b, float[16,16] w, float[32,16] v)
+        => (float[9,16] k, float[9,16] m) {
+        k = MatMul(a, w)
+        ab = Concat<axis=1>(a, b)
+        m = MatMul(ab, v)
+    }
+    """
+    model = net(text, {"w": np.ones((16, 16)), "v": np.ones((32, 16))})
+    plan = make_plan(model, FULL, tensorrt_rules())
+    tensors = {"a": (-1.0, 1.0), "ab": (-1.0, 4.0)}
+
+    result = place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+
+    scales = [
+        graph.array_of(node.inputs[1])
+        for node in result.graph
+        if node.op_type == "QuantizeLinear"
+    ]
+    assert [float(each) for each in scales if each is not None] == [
+        np.float32(4 / 127)
+    ] * 2
+
+
+BATCHED = """
+<ir_version: 9, opset_import: ["" : 17]>
+batched (float[3,4,32] x, float[2,32] t, float[1,32,16] one, float[3,32,16] many,
+         float[1,32,8] lends) => (float[3,4,16] a, float[3,4,16] b, float[1,2,8] c) {
+    a = MatMul(x, one)
+    b = MatMul(x, many)
+    c = MatMul(t, lends)
+}
+"""
+
+
+def batched() -> ir.Model:
+    generator = np.random.default_rng(5)
+    shapes = {"one": (1, 32, 16), "many": (3, 32, 16), "lends": (1, 32, 8)}
+    return net(BATCHED, {n: generator.standard_normal(s) for n, s in shapes.items()})
+
+
+def test_one_matrix_has_scales_by_column_and_a_batch_of_them_one_scale() -> None:
+    stored = placed(batched()).graph.initializers
+
+    shapes = {
+        name: tuple(graph.static_shape(stored[f"{name}_{what}"]) for what in PARTS)
+        for name in ("one", "many", "lends")
+    }
+    assert shapes == {
+        "one": ((32, 16), (16,), (16,)),
+        "many": ((3, 32, 16), (), ()),
+        "lends": ((1, 32, 8), (), ()),
+    }
+
+
+def test_products_by_batches_run_with_all_of_onnxruntimes_fusions() -> None:
+    generator = np.random.default_rng(6)
+    fed = {
+        "x": generator.standard_normal((3, 4, 32)).astype(np.float32),
+        "t": generator.standard_normal((2, 32)).astype(np.float32),
+    }
+
+    got, want = run_once(placed(batched()), fed), run_once(batched(), fed)
+
+    for name, exact in want.items():
+        assert got[name].shape == exact.shape
+        off = got[name].astype(np.float64) - exact.astype(np.float64)
+        assert np.abs(off).max() < 0.6
+
+
+TIED = """
+<ir_version: 9, opset_import: ["" : 17]>
+tied (float[8,8] x, float[8,8] w) => (float[8,8] y) {
+    x_scale = Gemm(x, w)
+    x_DequantizeLinear = Relu(x_scale)
+    int8_zero = Gemm<transB=1>(x_DequantizeLinear, w)
+    y = Relu(int8_zero)
+}
+"""
+
+
+def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
+    weights = {"w": np.random.default_rng(7).standard_normal((8, 8))}
+    x = np.random.default_rng(8).standard_normal((8, 8)).astype(np.float32)
+    model = net(TIED, weights)
+
+    result = placed(model, reach=12)
+
+    onnx.checker.check_model(ir.to_proto(result), full_check=True)
+    got, want = run_once(result, {"x": x})["y"], run_once(model, {"x": x})["y"]
+    assert np.abs(got.astype(np.float64) - want.astype(np.float64)).max() < 2

@@ -1,0 +1,26 @@
+"""The small course in a process of its own: `python -m tests.training.small`."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from me2e_compress.training.course import run
+from me2e_compress.training.curriculum import Course, Round
+from me2e_compress.training.small import LATENCY, SMALL
+
+WORKERS = 2
+
+
+def saving_often(each: Round) -> Round:
+    """The same weights, a checkpoint a step."""
+    stages = tuple(replace(one, save_every=1) for one in each.trainings)
+    return replace(each, trainings=stages)
+
+
+def course_of(rounds: int) -> Course:
+    return replace(SMALL, rounds=tuple(map(saving_often, SMALL.rounds[:rounds])))
+
+
+if __name__ == "__main__":
+    course = course_of(int(sys.argv[2]))
+    run(course, Path(sys.argv[1]), WORKERS, latency=LATENCY)
