@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 
-from me2e_compress.driving.contract import Observation
+from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -57,7 +57,7 @@ class Shadow:
     def needs_images(self) -> bool:
         return self.model.needs_images
 
-    def reset(self, route: Route) -> None:
+    def reset(self, route: RouteInfo) -> None:
         self.model.reset(route)
         self.expert.reset(route)
 

@@ -5,11 +5,11 @@ import io
 from collections.abc import Iterable, Mapping
 
 from me2e_compress.evaluators.highway.results import ResultsFolder
-from me2e_compress.metrics.differences import Difference, difference
+from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.study import Condition, Outcome, Scheme
+from me2e_compress.study import Condition, Scheme, StudyResult
 from me2e_compress.study.cells import Cell, Table, estimate_cell
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.workplace import Workplace
@@ -21,12 +21,12 @@ DIGITS = 4
 """After the point, of means and intervals."""
 
 
-def scores_csv(outcome: Outcome) -> str:
+def scores_csv(outcome: StudyResult) -> str:
     """One row a scheme and condition; what was not measured is empty."""
     return _csv([_scores(outcome, drive) for drive in outcome.drives])
 
 
-def routes_csv(outcome: Outcome) -> str:
+def routes_csv(outcome: StudyResult) -> str:
     """One row a scheme, condition and route."""
     return _csv(
         [
@@ -94,7 +94,7 @@ def among_schemes(
     )
 
 
-def losers(outcome: Outcome) -> str:
+def losers(outcome: StudyResult) -> str:
     """Name the drives that are worse than the baseline's beyond doubt."""
     sure = [
         f"{drive.scheme} ({drive.condition})"
@@ -107,7 +107,7 @@ def losers(outcome: Outcome) -> str:
     return f"Driving score lost, the 95 % interval without zero: {names}.\n"
 
 
-def _cells(found: Difference) -> tuple[Cell, ...]:
+def _cells(found: PairedDifference) -> tuple[Cell, ...]:
     return (
         estimate_cell(found.driving_score, signed=True),
         estimate_cell(found.success_rate, signed=True),
@@ -132,7 +132,7 @@ def _driven(
     return _episodes(workplace, scheme, condition)
 
 
-def _scores(outcome: Outcome, drive: Drive) -> Row:
+def _scores(outcome: StudyResult, drive: Drive) -> Row:
     scheme = outcome.scheme(drive.scheme)
     return {
         "scheme": drive.scheme,
@@ -158,7 +158,7 @@ def _means(found: Scores | None) -> Row:
     }
 
 
-def _losses(found: Difference | None) -> Row:
+def _losses(found: PairedDifference | None) -> Row:
     return {
         **_ends("driving_score_difference", None if not found else found.driving_score),
         **_ends("success_rate_difference", None if not found else found.success_rate),

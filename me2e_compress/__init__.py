@@ -3,6 +3,8 @@
 import importlib
 from typing import TYPE_CHECKING
 
+from me2e_compress.version import __version__
+
 if TYPE_CHECKING:
     from me2e_compress import graph, recipe
     from me2e_compress.calibration.dataset import CalibrationSet
@@ -11,7 +13,6 @@ if TYPE_CHECKING:
     from me2e_compress.modules import ModuleMap
     from me2e_compress.passes import PASSES, Context, Pass, PassResult
 
-__version__ = "0.1.0"
 __all__ = [
     "PASSES",
     "CalibrationSet",
@@ -24,6 +25,7 @@ __all__ = [
     "Report",
     "Step",
     "Verification",
+    "__version__",
     "graph",
     "recipe",
 ]

@@ -12,9 +12,9 @@ from me2e_compress import graph
 from me2e_compress.calibration.observers import observer
 from me2e_compress.calibration.probes import Counts, Extremes, Gauge
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.resume import Checkpoint, Standing
+from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import BINS, Statistics, no_element
-from me2e_compress.calibration.stream import Readings, Recording, gauged, stream
+from me2e_compress.calibration.stream import FrameSource, Readings, gauged, stream
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
 
@@ -46,7 +46,7 @@ class Calibrator:
         self,
         model: ir.Model,
         tensors: Sequence[str],
-        frames: Recording,
+        frames: FrameSource,
         progress: Progress | None = None,
     ) -> Ranges:
         """Collect statistics and read the ranges off them; see :meth:`collect`."""
@@ -58,7 +58,7 @@ class Calibrator:
         self,
         model: ir.Model,
         tensors: Sequence[str],
-        frames: Recording,
+        frames: FrameSource,
         progress: Progress | None = None,
     ) -> Statistics:
         """Run the model over the frames, its own recurrent state fed forward.
@@ -107,7 +107,7 @@ class _Job:
         settings: Calibrator,
         model: ir.Model,
         blank: Statistics,
-        frames: Recording,
+        frames: FrameSource,
         progress: Progress | None,
         passes: int,
     ) -> None:
@@ -124,7 +124,7 @@ class _Job:
             "optimization level": settings.optimize,
             "kind of method": "counts" if passes == 2 else "extremes",
         }
-        self.book = Checkpoint(settings.checkpoint, key, settings.every)
+        self.book = CalibrationCheckpoint(settings.checkpoint, key, settings.every)
         self.begun = self.book.read()
         gauges = self.begun.results.get("gauges", blank.gauges)
         counts = self.begun.results.get("counts")
@@ -176,7 +176,7 @@ class _Job:
             take(numbers, self.seen.frames[at])
             done = before + at + 1
             if self.book.due(done, self.total):
-                self.book.write(Standing(done, self._results(), after))
+                self.book.write(CalibrationState(done, self._results(), after))
             if self.progress:
                 self.progress(done, self.total)
 

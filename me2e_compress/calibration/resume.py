@@ -18,7 +18,7 @@ _STATE = "state/"
 
 
 @dataclasses.dataclass(frozen=True)
-class Standing:
+class CalibrationState:
     """How far one pass over the frames has come.
 
     Attributes:
@@ -33,7 +33,7 @@ class Standing:
 
 
 @dataclasses.dataclass(frozen=True)
-class Checkpoint:
+class CalibrationCheckpoint:
     """One file that holds the standing of a calibration.
 
     Attributes:
@@ -46,14 +46,14 @@ class Checkpoint:
     key: Mapping[str, object]
     every: int = 8
 
-    def read(self) -> Standing:
+    def read(self) -> CalibrationState:
         """Give the standing; nothing done where there is no file.
 
         Raises:
             FramesError: the file is of another calibration, or cannot be read.
         """
         if self.path is None or not self.path.is_file():
-            return Standing()
+            return CalibrationState()
         try:
             found = load_arrays(self.path, "a checkpoint")
             key = json.loads(str(found.pop("key")))
@@ -61,7 +61,7 @@ class Checkpoint:
         except (ValueError, KeyError) as error:
             raise FramesError(f"{self.path}: not a checkpoint ({error})") from error
         self._check(key)
-        return Standing(
+        return CalibrationState(
             done,
             {name: a for name, a in found.items() if not name.startswith(_STATE)},
             {
@@ -71,7 +71,7 @@ class Checkpoint:
             },
         )
 
-    def write(self, standing: Standing) -> None:
+    def write(self, standing: CalibrationState) -> None:
         """Keep a standing, all or nothing."""
         if self.path is None:
             return

@@ -18,7 +18,7 @@ Readings: TypeAlias = npt.NDArray[np.float32]
 """What the gauges said of one frame: float32 [tensors, width of the gauge]."""
 
 
-class Recording(Protocol):
+class FrameSource(Protocol):
     """Frames that can say which they are, and be read from any place on."""
 
     @property
@@ -42,7 +42,7 @@ class Recording(Protocol):
 
 def stream(
     session: Session,
-    frames: Recording,
+    frames: FrameSource,
     width: int,
     begin: int = 0,
     state: Mapping[str, Array] | None = None,

@@ -24,7 +24,7 @@ _EXTRAS = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Finding:
+class Checkup:
     """One thing a machine can or cannot do.
 
     Attributes:
@@ -52,38 +52,38 @@ def doctor(
     console.print(shown)
 
 
-def _machine() -> list[Finding]:
+def _machine() -> list[Checkup]:
     memory = psutil.virtual_memory().total / 2**30
     enough = "" if memory >= 6 else "VAD-tiny wants 6 GiB to calibrate"
     return [
-        Finding("cores", str(os.cpu_count())),
-        Finding("memory", f"{memory:.1f} GiB", enough),
-        Finding("platform", platform.platform()),
-        Finding("onnxruntime on", ", ".join(onnxruntime.get_available_providers())),
+        Checkup("cores", str(os.cpu_count())),
+        Checkup("memory", f"{memory:.1f} GiB", enough),
+        Checkup("platform", platform.platform()),
+        Checkup("onnxruntime on", ", ".join(onnxruntime.get_available_providers())),
     ]
 
 
-def _packages() -> list[Finding]:
-    found = [Finding(name, version) for name, version in versions().items()]
+def _packages() -> list[Checkup]:
+    found = [Checkup(name, version) for name, version in versions().items()]
     for module, extra, purpose in _EXTRAS:
         if importlib.util.find_spec(module) is None:
             advice = f"{purpose}: pip install 'me2e-compress[{extra}]'"
-            found.append(Finding(module, None, advice))
+            found.append(Checkup(module, None, advice))
         else:
             name = module.replace("_", "-")
-            found.append(Finding(module, importlib.metadata.version(name)))
+            found.append(Checkup(module, importlib.metadata.version(name)))
     return found
 
 
-def _gpu() -> Finding:
+def _gpu() -> Checkup:
     try:
         pynvml.nvmlInit()
     except pynvml.NVMLError as error:
-        return Finding("NVIDIA GPU", None, f"energy is not measured here ({error})")
+        return Checkup("NVIDIA GPU", None, f"energy is not measured here ({error})")
     try:
         handle = pynvml.nvmlDeviceGetHandleByIndex(0)
-        return Finding("NVIDIA GPU", str(pynvml.nvmlDeviceGetName(handle)))
+        return Checkup("NVIDIA GPU", str(pynvml.nvmlDeviceGetName(handle)))
     except pynvml.NVMLError as error:
-        return Finding("NVIDIA GPU", None, f"the driver answers: {error}")
+        return Checkup("NVIDIA GPU", None, f"the driver answers: {error}")
     finally:
         pynvml.nvmlShutdown()

@@ -17,7 +17,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
-from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
+from me2e_compress.evaluators.highway.jobs import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.render import render
 from me2e_compress.evaluators.highway.results import MANIFEST
 from me2e_compress.evaluators.highway.runner import Conditions
@@ -74,7 +74,7 @@ def evaluate(
     job = Job(driver, conditions, frame_limit)
     with progress("evaluate") as advance:
 
-        def on_progress(now: Progress) -> None:
+        def on_progress(now: DrivingProgress) -> None:
             running = f"DS {number(now.driving_score, '.1f')}"
             running += f" SR {number(now.success_rate, '.1f')} %"
             advance(now.done, now.total, running)

@@ -12,9 +12,9 @@ from me2e_compress import graph
 from me2e_compress.cli.console import console, print_json, table
 from me2e_compress.cli.models import model_path
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.targets.lint import Finding
+from me2e_compress.targets.lint import LintFinding
 from me2e_compress.targets.lint import lint as find
-from me2e_compress.targets.tensorrt.rtx import Verdict, check
+from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 
 
 def lint(
@@ -52,7 +52,7 @@ def lint(
         raise PreconditionError(f"{model}: {_why(verdict)}")
 
 
-def _said(verdict: Verdict, sm: int) -> str:
+def _said(verdict: BuildResult, sm: int) -> str:
     """Say what TensorRT-RTX made of a graph."""
     int8 = Counter(each.kind for each in verdict.kernels if each.is_int8)
     every = Counter(each.kind for each in verdict.kernels)
@@ -69,11 +69,11 @@ def _said(verdict: Verdict, sm: int) -> str:
     return escape("\n".join(lines))
 
 
-def _built(verdict: Verdict) -> str:
+def _built(verdict: BuildResult) -> str:
     return "built" if verdict.built else "not built"
 
 
-def _why(verdict: Verdict) -> str:
+def _why(verdict: BuildResult) -> str:
     if verdict.missing:
         return (
             f"{len(verdict.missing)} convolutions that the plan makes int8 have no int8"
@@ -83,7 +83,7 @@ def _why(verdict: Verdict) -> str:
     return f"TensorRT-RTX refuses it: {first}"
 
 
-def _show(found: Sequence[Finding], shown: int) -> None:
+def _show(found: Sequence[LintFinding], shown: int) -> None:
     if not found:
         return
     listed = table("Findings", "", "rule", "node", "what", left=4)
@@ -101,7 +101,7 @@ def _show(found: Sequence[Finding], shown: int) -> None:
             console.print(f"{severity} {rule}: {count - shown} more")
 
 
-def _counted(found: Sequence[Finding], name: str, target: str) -> str:
+def _counted(found: Sequence[LintFinding], name: str, target: str) -> str:
     counts = Counter(each.severity for each in found)
     return (
         f"{name} for {target}: {counts['error']} errors, {counts['warning']} warnings"

@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.cli.extras import need_closed_loop
 from me2e_compress.errors import EvaluationError
-from me2e_compress.sensitivity import Choice, Drive
+from me2e_compress.sensitivity import Drive, Int8Choice
 
 
 def drives_of(recipe: Path) -> Path:
@@ -45,7 +45,7 @@ def on_routes(
     picked, set_size = routes_named(routes)
     size = image_size_of(Driver(str(model), adapter).open())
 
-    def drive(choice: Choice, variant: ir.Model) -> float:
+    def drive(choice: Int8Choice, variant: ir.Model) -> float:
         results = folder / name_of(choice, variant)
         with TemporaryDirectory() as scratch:
             path = Path(scratch) / "variant.onnx"
@@ -61,7 +61,7 @@ def on_routes(
     return drive
 
 
-def name_of(choice: Choice, model: ir.Model) -> str:
+def name_of(choice: Int8Choice, model: ir.Model) -> str:
     """Name a variant: its int8 modules, and what tells it from all other graphs."""
     modules = "+".join(choice.modules) or "float"
     return f"{modules}-{graph.digest(model)[:12]}"

@@ -9,7 +9,7 @@ from rich.table import Table
 from me2e_compress.cli.console import console, errors, print_json, progress
 from me2e_compress.cli.output import check_output
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.admission import Verdict, examine
+from me2e_compress.evaluators.highway.admission import Admission, examine
 from me2e_compress.evaluators.highway.generate import VARIANTS, Harvest, generate
 from me2e_compress.simulator.routes import (
     load_routes,
@@ -87,7 +87,7 @@ def _report(harvests: list[Harvest], output: Path, as_json: bool) -> None:
 
 
 def _check(manifest: Path, pick: str, as_json: bool) -> None:
-    verdicts = list[Verdict]()
+    verdicts = list[Admission]()
     picked = pick_routes(load_routes(manifest), pick)
     with progress("examining") as advance:
         for route in picked:

@@ -26,7 +26,7 @@ from me2e_compress.cli.trials import (
 from me2e_compress.errors import RecipeError
 from me2e_compress.runtime.interleaved import race
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity import Budget, Candidate, Choice, Trials
+from me2e_compress.sensitivity import Budget, Candidate, Int8Choice, Trials
 from me2e_compress.sensitivity import search as find
 
 
@@ -72,7 +72,7 @@ def search(
     )
     with progress("modules") as advance:
         tried = find(trials, modules, budget, progress=advance)
-    written = setting.write(output, Choice(tried[-1].modules))
+    written = setting.write(output, Int8Choice(tried[-1].modules))
     if as_json:
         print_json(tried)
     else:

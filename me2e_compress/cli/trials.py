@@ -18,7 +18,7 @@ from me2e_compress.cli.output import Given, check_output
 from me2e_compress.modules import map_of
 from me2e_compress.quantization.rules import rules_named
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.sensitivity import Choice, Drive, Trials, write_recipe
+from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import target_named
 
 Model = Annotated[Path, typer.Argument(help="the float ONNX file", parser=model_path)]
@@ -89,7 +89,7 @@ class Setting:
         )
         return made, scheme.modules
 
-    def write(self, output: Path, choice: Choice) -> str:
+    def write(self, output: Path, choice: Int8Choice) -> str:
         """Write the recipe, and give a line that says where it is."""
         before = tuple(each.name for each in recipe.load("exact"))
         overrides = write_recipe(output, choice, before, self.rules, self.target)

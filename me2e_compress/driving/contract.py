@@ -1,19 +1,13 @@
 """What every evaluator and every driver is."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from me2e_compress.metrics.episode import Episode
-    from me2e_compress.simulator.routes import Route
-    from me2e_compress.simulator.scene import Scene
-    from me2e_compress.simulator.world import World
+from me2e_compress.metrics.episode import Episode
 
 Plan = npt.NDArray[np.floating]
 """Six waypoints [6, 2], one every 0.5 s: metres in the ego frame, x forward, y left."""
@@ -21,6 +15,38 @@ Plan = npt.NDArray[np.floating]
 PLAN_SHAPE = (6, 2)
 PLAN_STEP_US = 500_000
 CAN_BUS_SIZE = 18
+
+
+class RouteInfo(Protocol):
+    """What a policy is told of the route that it starts on."""
+
+    @property
+    def id(self) -> str:
+        """Return its name, unique in its set."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Return what everything random on it is drawn from."""
+        ...
+
+
+class SceneView(Protocol):
+    """Everything there is at one instant, as a simulator lays it out."""
+
+    @property
+    def time_us(self) -> int:
+        """Return the simulated time since the route began, in microseconds."""
+        ...
+
+
+class WorldView(Protocol):
+    """The world behind the scenes; a policy may read it and never steps it."""
+
+    @property
+    def route(self) -> RouteInfo:
+        """Return the route that is driven."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +81,8 @@ class Observation:
     can_bus: npt.NDArray[np.float32]
     command: int
     speed_mps: float
-    scene: Scene | None = None
-    world: World | None = None
+    scene: SceneView | None = None
+    world: WorldView | None = None
 
 
 class Policy(Protocol):
@@ -72,7 +98,7 @@ class Policy(Protocol):
         """Whether it may see the scene and the world."""
         ...
 
-    def reset(self, route: Route) -> None:
+    def reset(self, route: RouteInfo) -> None:
         """Forget the last route: recurrent state returns to its first value."""
         ...
 

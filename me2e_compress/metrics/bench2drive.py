@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.signal import savgol_filter
 
 from me2e_compress.metrics.efficiency import CHECKPOINTS, OUTLIER_PERCENT, PERCENT
-from me2e_compress.metrics.episode import Episode, Frame
+from me2e_compress.metrics.episode import EgoFrame, Episode
 from me2e_compress.metrics.measure import Measure
 
 BLOCK_FRAMES = 20
@@ -47,7 +47,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
     if episode.speed_ratios_percent is not None:
         return episode.speed_ratios_percent
     spacing_m = episode.route_length_m / CHECKPOINTS
-    ratios, passed_m, stretch = list[float](), 0, list[Frame]()
+    ratios, passed_m, stretch = list[float](), 0, list[EgoFrame]()
     for frame in episode.frames:
         stretch.append(frame)
         if int(frame.route_m) - passed_m > spacing_m:
@@ -58,7 +58,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
     return tuple(ratios)
 
 
-def _percent(stretch: list[Frame]) -> float:
+def _percent(stretch: list[EgoFrame]) -> float:
     seen = [
         (frame.speed_mps, frame.traffic_speed_mps)
         for frame in stretch
@@ -124,7 +124,7 @@ def block_is_smooth(
     return all(bool(samples.all()) for samples in within)
 
 
-def _norm(frame: Frame) -> float:
+def _norm(frame: EgoFrame) -> float:
     if frame.acceleration_norm_mps2 is not None:
         return frame.acceleration_norm_mps2
     return float(np.hypot(frame.acceleration_mps2, frame.lateral_acceleration_mps2))

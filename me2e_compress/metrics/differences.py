@@ -16,7 +16,7 @@ POINTS = "points"
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class PairedDifference:
     """Means over routes of "this one minus the reference", each with its interval.
 
     Attributes:
@@ -43,7 +43,7 @@ class Difference:
 
 def difference(
     episodes: Sequence[Episode], reference: Sequence[Episode], seed: int = 0
-) -> Difference:
+) -> PairedDifference:
     """Compare two drives route by route; at least one route is needed.
 
     Args:
@@ -66,7 +66,7 @@ def difference(
         (route_score(one).composed, route_score(other).composed) for one, other in pairs
     ]
     rates = [(100.0 * one.succeeded, 100.0 * other.succeeded) for one, other in pairs]
-    return Difference(
+    return PairedDifference(
         _estimate(scores, seed),
         _estimate(rates, seed),
         sum(one > other for one, other in scores),

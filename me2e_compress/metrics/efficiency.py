@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from statistics import fmean
 
-from me2e_compress.metrics.episode import Ending, Episode, Frame
+from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
 from me2e_compress.metrics.measure import Measure
 
 CHECKPOINTS = 20
@@ -42,10 +42,10 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
     return tuple(ratio for ratio in ratios if ratio is not None)
 
 
-def _stretches(episode: Episode) -> Iterator[list[Frame]]:
+def _stretches(episode: Episode) -> Iterator[list[EgoFrame]]:
     """Yield the frames between one check point and the next."""
     spacing_m = episode.route_length_m / CHECKPOINTS
-    passed, stretch = 0, list[Frame]()
+    passed, stretch = 0, list[EgoFrame]()
     for frame in episode.frames:
         stretch.append(frame)
         reached = int(frame.route_m / spacing_m)
@@ -56,7 +56,7 @@ def _stretches(episode: Episode) -> Iterator[list[Frame]]:
         yield stretch
 
 
-def _ratio_percent(stretch: list[Frame]) -> float | None:
+def _ratio_percent(stretch: list[EgoFrame]) -> float | None:
     seen = [
         (frame.speed_mps, frame.traffic_speed_mps)
         for frame in stretch

@@ -28,7 +28,7 @@ class Ending(StrEnum):
 
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
-class Frame:
+class EgoFrame:
     """The ego at one instant, every 50 ms.
 
     Attributes:
@@ -63,7 +63,7 @@ class Frame:
 
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
-class Decision:
+class InferenceRecord:
     """One inference: when its observation was taken and how long it took."""
 
     time_us: int
@@ -99,8 +99,8 @@ class Episode:
     ending: Ending
     failure: str | None
     infractions: tuple[Infraction, ...]
-    frames: tuple[Frame, ...]
-    decisions: tuple[Decision, ...]
+    frames: tuple[EgoFrame, ...]
+    decisions: tuple[InferenceRecord, ...]
     junction_m: float | None = None
     speed_ratios_percent: tuple[float, ...] | None = None
 
@@ -122,8 +122,8 @@ class Episode:
         record: dict[str, Any] = _EPISODE.dump_python(
             dataclasses.replace(self, frames=(), decisions=()), mode="json"
         )
-        record["frames"] = _columns(Frame, self.frames)
-        record["decisions"] = _columns(Decision, self.decisions)
+        record["frames"] = _columns(EgoFrame, self.frames)
+        record["decisions"] = _columns(InferenceRecord, self.decisions)
         return record
 
     @classmethod

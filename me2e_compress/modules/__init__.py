@@ -2,7 +2,7 @@
 
 from me2e_compress.modules.assign import Assignment, Placement, assign
 from me2e_compress.modules.detect import detect, map_of
-from me2e_compress.modules.inventory import Inventory, Weight, inventory
+from me2e_compress.modules.inventory import Inventory, WeightEntry, inventory
 from me2e_compress.modules.itemise import Item, itemise
 from me2e_compress.modules.module_map import (
     Module,
@@ -24,7 +24,7 @@ __all__ = [
     "Placement",
     "Role",
     "Substitute",
-    "Weight",
+    "WeightEntry",
     "assign",
     "detect",
     "exits",

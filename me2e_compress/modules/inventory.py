@@ -12,7 +12,7 @@ _INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
 
 
 @dataclasses.dataclass(frozen=True)
-class Weight:
+class WeightEntry:
     """One tensor of the state dict or of the file.
 
     Attributes:
@@ -40,9 +40,9 @@ class Inventory:
         extra: in the file only: renamed, folded together or made by the exporter.
     """
 
-    present: tuple[Weight, ...]
-    missing: tuple[Weight, ...]
-    extra: tuple[Weight, ...]
+    present: tuple[WeightEntry, ...]
+    missing: tuple[WeightEntry, ...]
+    extra: tuple[WeightEntry, ...]
 
 
 def inventory(
@@ -67,14 +67,16 @@ def inventory(
     }
     sizes = {name: _elements(value) for name, value in stored.items()}
     ours = [
-        Weight(name, modules.match(name), elements, _kind_in_state_dict(name))
+        WeightEntry(name, modules.match(name), elements, _kind_in_state_dict(name))
         for name, elements in state_dict.items()
     ]
     return Inventory(
         present=tuple(w for w in ours if sizes.get(w.name) == w.elements),
         missing=tuple(w for w in ours if sizes.get(w.name) != w.elements),
         extra=tuple(
-            Weight(name, owner_of(value, modules, module_of), sizes[name], _kind(value))
+            WeightEntry(
+                name, owner_of(value, modules, module_of), sizes[name], _kind(value)
+            )
             for name, value in stored.items()
             if state_dict.get(name) != sizes[name]
         ),

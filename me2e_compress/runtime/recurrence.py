@@ -15,7 +15,7 @@ SUFFIX = "_out"
 
 
 @dataclasses.dataclass(frozen=True)
-class Port:
+class SessionPort:
     """An input or output as onnxruntime sees it.
 
     Attributes:
@@ -29,8 +29,8 @@ class Port:
 
 def recurrence(
     metadata: Mapping[str, str],
-    inputs: Mapping[str, Port],
-    outputs: Mapping[str, Port],
+    inputs: Mapping[str, SessionPort],
+    outputs: Mapping[str, SessionPort],
 ) -> dict[str, str]:
     """Pair recurrent inputs with the outputs that answer them.
 
@@ -71,9 +71,9 @@ def recurrent_inputs(model: ir.Model) -> dict[str, str]:
     )
 
 
-def _ports(values: Sequence[ir.Value]) -> dict[str, Port]:
+def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
     return {
-        str(value.name): Port(
+        str(value.name): SessionPort(
             str(value.type), tuple(d if isinstance(d, int) else str(d) for d in shape)
         )
         for value in values
@@ -93,5 +93,5 @@ def _parse(text: str) -> dict[str, str]:
     return dict(pairs)
 
 
-def _fits(source: Port, answer: Port) -> bool:
+def _fits(source: SessionPort, answer: SessionPort) -> bool:
     return source.type == answer.type and len(source.shape) == len(answer.shape)

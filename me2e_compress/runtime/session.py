@@ -12,10 +12,10 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.native import REFUSALS, InvalidArgument
 from me2e_compress.runtime.opening import Weights, open_file, open_graph
-from me2e_compress.runtime.recurrence import Port, recurrence
+from me2e_compress.runtime.recurrence import SessionPort, recurrence
 from me2e_compress.runtime.supported import can_run
 
-__all__ = ["Port", "Session", "can_run", "replay", "run_once"]
+__all__ = ["Session", "SessionPort", "can_run", "replay", "run_once"]
 
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
     "tensor(float)": np.dtype(np.float32),
@@ -186,11 +186,11 @@ def run_once(model: ir.Model, feeds: Mapping[str, Array]) -> dict[str, Array]:
     return Session(model, threads=1, optimize=False).run(feeds)
 
 
-def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, Port]:
-    return {each.name: Port(each.type, tuple(each.shape)) for each in arguments}
+def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, SessionPort]:
+    return {each.name: SessionPort(each.type, tuple(each.shape)) for each in arguments}
 
 
-def _zeros(name: str, port: Port) -> Array:
+def _zeros(name: str, port: SessionPort) -> Array:
     shape = [size for size in port.shape if isinstance(size, int)]
     if len(shape) < len(port.shape) or port.type not in DTYPES:
         raise GraphError(

@@ -1,16 +1,16 @@
 """Which modules and nodes int8 hurts, and which assignment fits a budget."""
 
-from me2e_compress.sensitivity.analysis import Finding, Sensitivity, analyse
+from me2e_compress.sensitivity.analysis import ModuleSensitivity, Sensitivity, analyse
 from me2e_compress.sensitivity.recipes import advise, write_recipe
 from me2e_compress.sensitivity.search import Budget, Candidate, search
-from me2e_compress.sensitivity.trials import Choice, Drive, Score, Trials
+from me2e_compress.sensitivity.trials import Drive, Int8Choice, Score, Trials
 
 __all__ = [
     "Budget",
     "Candidate",
-    "Choice",
     "Drive",
-    "Finding",
+    "Int8Choice",
+    "ModuleSensitivity",
     "Score",
     "Sensitivity",
     "Trials",

@@ -4,14 +4,14 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from me2e_compress.quantization.plan import RESIDUAL
-from me2e_compress.sensitivity.trials import Choice, Score, Trials
+from me2e_compress.sensitivity.trials import Int8Choice, Score, Trials
 
 BLAME = 0.5
 """Nodes are to blame if they alone cost this part of what their module costs."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Finding:
+class ModuleSensitivity:
     """What one module costs when it alone is int8.
 
     Attributes:
@@ -44,7 +44,7 @@ class Sensitivity:
         driving: of all modules together; None: nothing is driven.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[ModuleSensitivity, ...]
     together: Score
     trials: int
     float_driving: float | None = None
@@ -76,20 +76,20 @@ def analyse(
         if progress:
             progress(done, len(active), module)
         names = names_of(trials, module)
-        score = trials.score(Choice((module,)))
+        score = trials.score(Int8Choice((module,)))
         blamed: tuple[tuple[tuple[str, ...], float], ...] = ()
         if node_trials and score.loss > 0:
             blamed = _Bisection(trials, module, names, node_trials).run(score.loss)
-        driving = trials.driving(Choice((module,)))
-        findings.append(Finding(module, len(names), score, driving, blamed))
+        driving = trials.driving(Int8Choice((module,)))
+        findings.append(ModuleSensitivity(module, len(names), score, driving, blamed))
     findings.sort(key=lambda each: -each.score.loss)
-    every = Choice(tuple(active))
+    every = Int8Choice(tuple(active))
     together = trials.score(every)
     return Sensitivity(
         tuple(findings),
         together,
         trials.done,
-        float_driving=trials.driving(Choice(())),
+        float_driving=trials.driving(Int8Choice(())),
         driving=trials.driving(every),
     )
 
@@ -99,7 +99,7 @@ def names_of(trials: Trials, module: str) -> tuple[str, ...]:
 
     Residual Adds are left out: they follow their convolution.
     """
-    chosen = trials.plan(Choice((module,))).chosen
+    chosen = trials.plan(Int8Choice((module,))).chosen
     return tuple(dict.fromkeys(each.node for each in chosen if each.rule != RESIDUAL))
 
 
@@ -136,4 +136,4 @@ class _Bisection:
     def _loss(self, only: tuple[str, ...]) -> float:
         self._left -= 1
         floats = tuple(name for name in self._names if name not in only)
-        return self._trials.score(Choice((self._module,), floats)).loss
+        return self._trials.score(Int8Choice((self._module,), floats)).loss

@@ -7,7 +7,7 @@ from pathlib import Path
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.sensitivity.analysis import Sensitivity
-from me2e_compress.sensitivity.trials import Choice, Trials
+from me2e_compress.sensitivity.trials import Int8Choice, Trials
 
 
 def advise(
@@ -15,7 +15,7 @@ def advise(
     found: Sensitivity,
     limit: float,
     driving_limit: float | None = None,
-) -> Choice:
+) -> Int8Choice:
     """Give a choice that keeps the loss within a limit, and floats little for it.
 
     Starts with all modules in int8. Until the measured losses are within the limits,
@@ -75,7 +75,9 @@ def _sacrifices(found: Sensitivity) -> list[_Sacrifice]:
     return order
 
 
-def _without(trials: Trials, found: Sensitivity, given: Sequence[_Sacrifice]) -> Choice:
+def _without(
+    trials: Trials, found: Sensitivity, given: Sequence[_Sacrifice]
+) -> Int8Choice:
     """Give the choice of all modules but what was given up."""
     gone = {each.module for each in given if each.nodes is None}
     names = dict[str, list[str]]()
@@ -91,18 +93,18 @@ def _without(trials: Trials, found: Sensitivity, given: Sequence[_Sacrifice]) ->
     left = {each.module for each in found.findings} - gone
     floats = [name for module in names if module in left for name in names[module]]
     modules = (name for name in trials.modules.names() if name in left)
-    return Choice(tuple(modules), tuple(floats))
+    return Int8Choice(tuple(modules), tuple(floats))
 
 
-def _driving_loss(trials: Trials, choice: Choice) -> float:
-    whole, got = trials.driving(Choice(())), trials.driving(choice)
+def _driving_loss(trials: Trials, choice: Int8Choice) -> float:
+    whole, got = trials.driving(Int8Choice(())), trials.driving(choice)
     if whole is None or got is None:
         raise EvaluationError("a limit of driving needs trials that are driven")
     return whole - got
 
 
 def write_recipe(
-    path: Path, choice: Choice, passes: tuple[str, ...], rules: str, target: str
+    path: Path, choice: Int8Choice, passes: tuple[str, ...], rules: str, target: str
 ) -> Path | None:
     """Write a recipe and, where nodes stay float, the overrides beside it.
 

@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.sensitivity.analysis import names_of
-from me2e_compress.sensitivity.trials import Choice, Score, Trials
+from me2e_compress.sensitivity.trials import Int8Choice, Score, Trials
 
 MOST_MODULES = 16
 """All 2^16 assignments are weighed; a map of more modules must be coarser."""
@@ -81,8 +81,8 @@ def search(
     for done, name in enumerate(active):
         if progress:
             progress(done, len(active), name)
-        losses[name] = trials.score(Choice((name,))).loss
-        savings[name] = float_cost - budget.cost(trials.variant(Choice((name,))))
+        losses[name] = trials.score(Int8Choice((name,))).loss
+        savings[name] = float_cost - budget.cost(trials.variant(Int8Choice((name,))))
     ranked = _predict(active, losses, savings, float_cost)
     fitting = [each for each in ranked if each.cost <= budget.limit]
     tried: list[Candidate] = []
@@ -91,7 +91,7 @@ def search(
     if fitting and cheapest not in chosen:
         chosen.append(cheapest)
     for candidate in chosen:
-        choice = Choice(candidate.modules)
+        choice = Int8Choice(candidate.modules)
         cost = budget.cost(trials.variant(choice))
         tried.append(
             dataclasses.replace(

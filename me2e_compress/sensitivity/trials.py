@@ -23,7 +23,7 @@ _GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
 
 
 @dataclasses.dataclass(frozen=True)
-class Choice:
+class Int8Choice:
     """What is int8.
 
     Attributes:
@@ -44,7 +44,7 @@ class Choice:
         )
 
 
-Drive: TypeAlias = Callable[[Choice, ir.Model], float]
+Drive: TypeAlias = Callable[[Int8Choice, ir.Model], float]
 """Gives the closed-loop score of a choice, whose graph it gets; larger is better."""
 
 
@@ -117,24 +117,24 @@ class Trials:
         self.ranges = ranges
         self._drive = drive
         self._threads = threads
-        self._known: dict[Choice, Score] = {}
-        self._driven: dict[Choice, float] = {}
+        self._known: dict[Int8Choice, Score] = {}
+        self._driven: dict[Int8Choice, float] = {}
         self.reference = Reference.of(
             Session(model, threads=threads, release=True), frames
         )
 
-    def plan(self, choice: Choice) -> QuantPlan:
+    def plan(self, choice: Int8Choice) -> QuantPlan:
         """Decide for every node, as ``quantize-int8`` will for the recipe."""
         scheme = QuantScheme.of(choice.modules, self.modules)
         return make_plan(self.model, scheme, self._rules, choice.overrides())
 
-    def variant(self, choice: Choice) -> ir.Model:
+    def variant(self, choice: Int8Choice) -> ir.Model:
         """Give the graph of a choice."""
         if not choice.modules:
             return self.model
         return self._target.place(self.model, self.plan(choice), self.ranges)
 
-    def score(self, choice: Choice) -> Score:
+    def score(self, choice: Int8Choice) -> Score:
         """Judge a choice.
 
         Raises:
@@ -151,7 +151,7 @@ class Trials:
             self.done += 1
         return self._known[choice]
 
-    def driving(self, choice: Choice) -> float | None:
+    def driving(self, choice: Int8Choice) -> float | None:
         """Ask the hook for the closed-loop score of a choice; None without a hook."""
         if self._drive is None:
             return None

@@ -2,16 +2,16 @@
 
 from me2e_compress.study.definition import Condition, Scheme, Study, Timing
 from me2e_compress.study.file import load_study
-from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
 from me2e_compress.study.workplace import Listener
 
 __all__ = [
     "Condition",
     "Listener",
-    "Outcome",
     "Scheme",
     "Study",
+    "StudyResult",
     "Timing",
     "load_study",
     "run_study",

@@ -6,14 +6,14 @@ from typing import Any
 
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine
-from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
+from me2e_compress.evaluators.highway.jobs import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.metrics.differences import Difference, difference
+from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.study.definition import Condition, Study
-from me2e_compress.study.prepared import Contender
+from me2e_compress.study.prepared import PreparedScheme
 from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
 from me2e_compress.study.workplace import Listener, Workplace
@@ -36,7 +36,7 @@ class Drive:
     scheme: str
     condition: str
     scores: Scores | None
-    difference: Difference | None = None
+    difference: PairedDifference | None = None
     routes: tuple[RouteOutcome, ...] = ()
     reason: str = ""
 
@@ -71,7 +71,7 @@ class Road:
     listener: Listener
 
     def under(
-        self, condition: Condition, contenders: Sequence[Contender]
+        self, condition: Condition, contenders: Sequence[PreparedScheme]
     ) -> tuple[Drive, ...]:
         """Drive all schemes under one condition, the baseline first.
 
@@ -91,7 +91,7 @@ class Road:
             for each in contenders
         )
 
-    def job(self, contender: Contender, condition: Condition) -> Job | None:
+    def job(self, contender: PreparedScheme, condition: Condition) -> Job | None:
         """Return who drives under what; None if its latency is not known."""
         latency = self.clock.source(contender.scheme, condition, self.study.seed)
         if latency is None:
@@ -100,7 +100,7 @@ class Road:
         return Job(contender.driver, Conditions(latency, image_size=size))
 
     def _episodes(
-        self, contender: Contender, condition: Condition
+        self, contender: PreparedScheme, condition: Condition
     ) -> tuple[Episode, ...] | None:
         job = self.job(contender, condition)
         if job is None:
@@ -118,7 +118,7 @@ class Road:
 
     def _drive(
         self,
-        contender: Contender,
+        contender: PreparedScheme,
         condition: Condition,
         episodes: tuple[Episode, ...] | None,
         reference: tuple[Episode, ...] | None,
@@ -137,8 +137,8 @@ class Road:
             outcomes(episodes, reference),
         )
 
-    def _teller(self, stage: str) -> Callable[[Progress], None]:
-        def tell(now: Progress) -> None:
+    def _teller(self, stage: str) -> Callable[[DrivingProgress], None]:
+        def tell(now: DrivingProgress) -> None:
             words = ""
             if now.driving_score is not None:
                 words = f"DS {now.driving_score:.1f}  SR {now.success_rate:.1f} %"

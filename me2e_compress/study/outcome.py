@@ -10,7 +10,7 @@ from me2e_compress.runtime.profile import processor
 from me2e_compress.study.definition import Condition, Study
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.plan_fidelity import Faithfulness, measure_json
-from me2e_compress.study.prepared import Contender
+from me2e_compress.study.prepared import PreparedScheme
 from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.timing import Clock
 
@@ -28,7 +28,7 @@ class SchemeOutcome:
         fidelity: Its plan against the baseline's.
     """
 
-    contender: Contender
+    contender: PreparedScheme
     size_mb: Measure
     latency_ms: Mapping[int, Measure]
     fidelity: Faithfulness
@@ -40,7 +40,7 @@ class SchemeOutcome:
 
     @classmethod
     def of(
-        cls, contender: Contender, clock: Clock, fidelity: Faithfulness
+        cls, contender: PreparedScheme, clock: Clock, fidelity: Faithfulness
     ) -> "SchemeOutcome":
         """Put together what was found."""
         size = contender.size_bytes
@@ -74,7 +74,7 @@ class SchemeOutcome:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StudyResult:
     """Everything that a study found, and what it was made with.
 
     Attributes:

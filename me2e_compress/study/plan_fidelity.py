@@ -13,7 +13,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.study.definition import Study
-from me2e_compress.study.prepared import Contender
+from me2e_compress.study.prepared import PreparedScheme
 from me2e_compress.study.workplace import Listener
 
 EXACT = "no noise: equal to the bit"
@@ -56,7 +56,10 @@ class Faithfulness:
 
 
 def judge(
-    study: Study, baseline: Contender, contender: Contender, listener: Listener
+    study: Study,
+    baseline: PreparedScheme,
+    contender: PreparedScheme,
+    listener: Listener,
 ) -> Faithfulness:
     """Run both models over the held-out frames.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 from pydantic import BaseModel, ValidationError
 
-from me2e_compress import __version__, graph
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import Driver
@@ -19,10 +19,11 @@ from me2e_compress.passes.spec import to_text
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.study.definition import Scheme, Study
 from me2e_compress.study.workplace import Listener, Workplace
+from me2e_compress.version import __version__
 
 
 @dataclass(frozen=True)
-class Contender:
+class PreparedScheme:
     """A scheme whose driver is ready.
 
     Attributes:
@@ -44,9 +45,9 @@ class Contender:
     size_bytes: int | None = None
 
 
-def contend(
+def prepare_scheme(
     study: Study, scheme: Scheme, workplace: Workplace, listener: Listener
-) -> Contender:
+) -> PreparedScheme:
     """Find or make a scheme's driver, and open it once.
 
     Raises:
@@ -57,7 +58,7 @@ def contend(
     if not scheme.is_model:
         driver = Driver(scheme.policy)
         driver.open()
-        return Contender(scheme, driver)
+        return PreparedScheme(scheme, driver)
     model = source = Path(scheme.policy)
     if not source.is_file():
         raise StudyError(f"scheme {scheme.name}: {source}: no such model")
@@ -69,7 +70,9 @@ def contend(
     origin = source.name, to_text(scheme.passes)
     if not scheme.passes:
         origin = _told_beside(model, sha256) or origin
-    return Contender(scheme, driver, model, *origin, sha256, graph.file_bytes(model))
+    return PreparedScheme(
+        scheme, driver, model, *origin, sha256, graph.file_bytes(model)
+    )
 
 
 def _told_beside(model: Path, sha256: str) -> tuple[str, str] | None:

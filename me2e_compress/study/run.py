@@ -7,9 +7,9 @@ from me2e_compress.manager.report import versions
 from me2e_compress.study.check_frames import check_recordings
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import Road
-from me2e_compress.study.outcome import Outcome, SchemeOutcome, this_machine
+from me2e_compress.study.outcome import SchemeOutcome, StudyResult, this_machine
 from me2e_compress.study.plan_fidelity import judge
-from me2e_compress.study.prepared import Contender, contend
+from me2e_compress.study.prepared import PreparedScheme, prepare_scheme
 from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workplace import SILENT, Listener, Workplace
@@ -21,7 +21,7 @@ def run_study(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     pictures: int = 3,
-) -> Outcome:
+) -> StudyResult:
     """Make the models, time them, hold them against the baseline, drive them.
 
     Run again with the same folder it goes on: models, traces and routes that are there
@@ -41,7 +41,7 @@ def run_study(
     check_recordings(study)
     workplace = Workplace(folder)
     contenders = [
-        contend(study, scheme, workplace, listener) for scheme in study.schemes
+        prepare_scheme(study, scheme, workplace, listener) for scheme in study.schemes
     ]
     clock = time_all(study, contenders, workplace, listener)
     schemes = _schemes(study, contenders, clock, listener)
@@ -52,7 +52,7 @@ def run_study(
         for drive in road.under(condition, contenders)
     ]
     contrasts = take_pictures(road, contenders, drives, pictures)
-    return Outcome(
+    return StudyResult(
         study,
         schemes,
         tuple(drives),
@@ -64,7 +64,7 @@ def run_study(
 
 
 def _schemes(
-    study: Study, contenders: list[Contender], clock: Clock, listener: Listener
+    study: Study, contenders: list[PreparedScheme], clock: Clock, listener: Listener
 ) -> tuple[SchemeOutcome, ...]:
     names = [each.scheme.name for each in contenders]
     baseline = contenders[names.index(study.baseline)]

@@ -12,7 +12,7 @@ from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.world import World
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.drives import Drive, Road
-from me2e_compress.study.prepared import Contender
+from me2e_compress.study.prepared import PreparedScheme
 from me2e_compress.study.route_outcomes import RouteOutcome
 
 SCORED, MOVED_M = 1.0, 0.5
@@ -82,7 +82,10 @@ class _Pair:
 
 
 def take_pictures(
-    road: Road, contenders: Sequence[Contender], drives: Sequence[Drive], limit: int
+    road: Road,
+    contenders: Sequence[PreparedScheme],
+    drives: Sequence[Drive],
+    limit: int,
 ) -> tuple[Contrast, ...]:
     """Drive again, up to the moment, the routes on which schemes part the most.
 
@@ -165,7 +168,11 @@ class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
 
 
 def _picture(
-    road: Road, contender: Contender, condition: Condition, route: Route, time_us: int
+    road: Road,
+    contender: PreparedScheme,
+    condition: Condition,
+    route: Route,
+    time_us: int,
 ) -> Path:
     name = contender.scheme.name
     path = road.workplace.picture(contender.scheme, condition, route.id, time_us)

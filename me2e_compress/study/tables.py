@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from me2e_compress.metrics.abilities import ABILITIES
-from me2e_compress.metrics.differences import Difference
+from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import (
     MISSING,
@@ -14,13 +14,13 @@ from me2e_compress.study.cells import (
 )
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.outcome import Outcome, SchemeOutcome
+from me2e_compress.study.outcome import SchemeOutcome, StudyResult
 
 SCORES = ("DS", "SR %", "DE %", "DC")
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
-def scoreboards(outcome: Outcome) -> tuple[Table, ...]:
+def scoreboards(outcome: StudyResult) -> tuple[Table, ...]:
     """Show how every scheme drives, and what it weighs and takes.
 
     One table a condition; one scheme alone has one table of all its conditions.
@@ -37,7 +37,7 @@ def scoreboards(outcome: Outcome) -> tuple[Table, ...]:
     )
 
 
-def _scoreboard(outcome: Outcome, condition: Condition) -> Table:
+def _scoreboard(outcome: StudyResult, condition: Condition) -> Table:
     return Table(
         f"Scoreboard, {_condition(outcome, condition)}",
         ("scheme", *SCORES, *COSTS),
@@ -50,7 +50,7 @@ def _scoreboard(outcome: Outcome, condition: Condition) -> Table:
     )
 
 
-def differences(outcome: Outcome) -> Table:
+def differences(outcome: StudyResult) -> Table:
     """Show every scheme minus the baseline, paired by route."""
     baseline, rows = outcome.study.baseline, []
     several = len(outcome.study.conditions) > 1
@@ -60,7 +60,7 @@ def differences(outcome: Outcome) -> Table:
         name = f"{drive.scheme}, {drive.condition}" if several else drive.scheme
         rows.append((Cell(name), *_difference(drive.difference)))
     return Table(
-        f"Difference to {baseline} on the same routes",
+        f"PairedDifference to {baseline} on the same routes",
         ("scheme", "DS, points", "SR, points", "routes better", "routes worse"),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap: an interval that "
@@ -68,7 +68,7 @@ def differences(outcome: Outcome) -> Table:
     )
 
 
-def abilities(outcome: Outcome) -> tuple[Table, ...]:
+def abilities(outcome: StudyResult) -> tuple[Table, ...]:
     """Show the success rate by ability: tables as those of the scoreboard."""
     if len(outcome.schemes) > 1:
         return tuple(
@@ -107,7 +107,7 @@ def _abilities(
     )
 
 
-def all_tables(outcome: Outcome) -> tuple[Table, ...]:
+def all_tables(outcome: StudyResult) -> tuple[Table, ...]:
     """Every table of a study, in the order of reading."""
     compared = [differences(outcome)] if len(outcome.schemes) > 1 else []
     return (*scoreboards(outcome), *compared, *abilities(outcome))
@@ -131,7 +131,7 @@ def _costs(scheme: SchemeOutcome) -> tuple[Cell, ...]:
     )
 
 
-def _difference(found: Difference) -> tuple[Cell, ...]:
+def _difference(found: PairedDifference) -> tuple[Cell, ...]:
     return (
         estimate_cell(found.driving_score, signed=True),
         estimate_cell(found.success_rate, signed=True),
@@ -140,7 +140,7 @@ def _difference(found: Difference) -> tuple[Cell, ...]:
     )
 
 
-def _condition(outcome: Outcome, condition: Condition) -> str:
+def _condition(outcome: StudyResult, condition: Condition) -> str:
     if condition.latency == "none":
         return f"{condition.name}: decisions cost no time"
     if not condition.traced:
@@ -151,7 +151,7 @@ def _condition(outcome: Outcome, condition: Condition) -> str:
     return f"{condition.name}: each model's own latency, {device}"
 
 
-def _routes_note(outcome: Outcome) -> str:
+def _routes_note(outcome: StudyResult) -> str:
     driven, whole = len(outcome.study.routes), outcome.study.set_size
     share = f"{driven} routes" if driven == whole else f"{driven} of {whole} routes"
     return (
@@ -160,7 +160,7 @@ def _routes_note(outcome: Outcome) -> str:
     )
 
 
-def _costs_note(outcome: Outcome) -> str:
+def _costs_note(outcome: StudyResult) -> str:
     notes = []
     if outcome.timed:
         kind = "on this machine"

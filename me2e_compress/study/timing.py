@@ -13,7 +13,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.interleaved import machine_in_turn, traces_in_turn
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.study.definition import Condition, Scheme, Study
-from me2e_compress.study.prepared import Contender
+from me2e_compress.study.prepared import PreparedScheme
 from me2e_compress.study.workplace import Listener, Workplace
 
 
@@ -52,7 +52,7 @@ class Clock:
 
 def time_all(
     study: Study,
-    contenders: Sequence[Contender],
+    contenders: Sequence[PreparedScheme],
     workplace: Workplace,
     listener: Listener,
 ) -> Clock:
@@ -90,12 +90,12 @@ def time_all(
 
 
 def _missing(
-    contenders: Sequence[Contender],
+    contenders: Sequence[PreparedScheme],
     traces: Mapping[str, LatencyTrace],
     yardstick: LatencyTrace | None,
     workplace: Workplace,
     listener: Listener,
-) -> list[Contender]:
+) -> list[PreparedScheme]:
     """List what is to be measured: all, where new traces cannot stand beside old."""
     ours = [each for each in contenders if each.model and not each.scheme.trace]
     missing = [each for each in ours if each.scheme.name not in traces]
@@ -113,8 +113,8 @@ def _missing(
 def _measured(
     study: Study,
     frames: CalibrationSet,
-    missing: Sequence[Contender],
-    baseline: Contender,
+    missing: Sequence[PreparedScheme],
+    baseline: PreparedScheme,
     kept: LatencyTrace | None,
     listener: Listener,
 ) -> dict[str, LatencyTrace]:
@@ -149,7 +149,7 @@ def _paced(trace: LatencyTrace, pace: float) -> LatencyTrace:
 
 def _kept(
     study: Study,
-    each: Contender,
+    each: PreparedScheme,
     frames: str | None,
     workplace: Workplace,
     listener: Listener,
@@ -169,7 +169,7 @@ def _kept(
 
 
 def _other(
-    trace: LatencyTrace, each: Contender, frames: str | None, study: Study
+    trace: LatencyTrace, each: PreparedScheme, frames: str | None, study: Study
 ) -> str | None:
     """Say what a trace is of that this study does not measure; None: the same."""
     wanted, machine = study.timing.samples, machine_in_turn(study.timing.threads)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_json
-from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report import html
 from me2e_compress.study.tables import all_tables
 
@@ -28,7 +28,7 @@ class Written:
     report: Path
 
 
-def write(outcome: Outcome, folder: Path, command: Sequence[str] = ()) -> Written:
+def write(outcome: StudyResult, folder: Path, command: Sequence[str] = ()) -> Written:
     """Write JSON, Markdown and HTML, each whole or not at all.
 
     Args:

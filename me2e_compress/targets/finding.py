@@ -10,7 +10,7 @@ Severity = Literal["error", "warning"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Finding:
+class LintFinding:
     """One thing that is wrong with a graph for its target.
 
     Attributes:
@@ -27,18 +27,18 @@ class Finding:
     message: str
 
 
-Rule: TypeAlias = Callable[[ir.Model], Iterator[Finding]]
+LintRule: TypeAlias = Callable[[ir.Model], Iterator[LintFinding]]
 """Looks at a graph, with its shapes inferred, and yields what it finds."""
 
 
-def error(rule: str, node: ir.Node | None, message: str) -> Finding:
+def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
     """Make a finding that the target refuses."""
-    return Finding("error", rule, _name(node), message)
+    return LintFinding("error", rule, _name(node), message)
 
 
-def warning(rule: str, node: ir.Node | None, message: str) -> Finding:
+def warning(rule: str, node: ir.Node | None, message: str) -> LintFinding:
     """Make a finding that the target runs badly."""
-    return Finding("warning", rule, _name(node), message)
+    return LintFinding("warning", rule, _name(node), message)
 
 
 def is_standard(node: ir.Node) -> bool:

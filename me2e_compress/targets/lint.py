@@ -4,19 +4,19 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import RecipeError
-from me2e_compress.targets.finding import Finding, Rule, Severity
+from me2e_compress.targets.finding import LintFinding, LintRule, Severity
 from me2e_compress.targets.onnxruntime.lint import RULES as ONNXRUNTIME_RULES
 from me2e_compress.targets.tensorrt.lint import RULES as TENSORRT_RULES
 
-__all__ = ["LINTS", "Finding", "Rule", "Severity", "lint"]
+__all__ = ["LINTS", "LintFinding", "LintRule", "Severity", "lint"]
 
-LINTS: dict[str, tuple[Rule, ...]] = {
+LINTS: dict[str, tuple[LintRule, ...]] = {
     "tensorrt": TENSORRT_RULES,
     "onnxruntime": ONNXRUNTIME_RULES,
 }
 
 
-def lint(model: ir.Model, target: str) -> tuple[Finding, ...]:
+def lint(model: ir.Model, target: str) -> tuple[LintFinding, ...]:
     """List everything that is wrong with a graph for a target, errors first.
 
     Args:

@@ -6,10 +6,10 @@ import onnx
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress.targets.finding import Finding, error, is_standard
+from me2e_compress.targets.finding import LintFinding, error, is_standard
 
 
-def valid(model: ir.Model) -> Iterator[Finding]:
+def valid(model: ir.Model) -> Iterator[LintFinding]:
     """Ask ONNX's checker."""
     try:
         common.CheckerPass()(model)
@@ -18,7 +18,7 @@ def valid(model: ir.Model) -> Iterator[Finding]:
         yield error("onnx", None, f"not valid ONNX: {reason}")
 
 
-def of_opset(model: ir.Model) -> Iterator[Finding]:
+def of_opset(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators that are younger than the graph says it is.
 
     TensorRT's parser does not look at the opset; onnxruntime does.
@@ -30,7 +30,7 @@ def of_opset(model: ir.Model) -> Iterator[Finding]:
         yield from _too_young(function.all_nodes(), own)
 
 
-def _too_young(nodes: Iterable[ir.Node], opset: int) -> Iterator[Finding]:
+def _too_young(nodes: Iterable[ir.Node], opset: int) -> Iterator[LintFinding]:
     for node in nodes:
         if not is_standard(node) or not onnx.defs.has(node.op_type, domain=""):
             continue

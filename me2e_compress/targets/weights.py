@@ -15,7 +15,7 @@ from me2e_compress.runtime.frames import Array
 
 
 @dataclasses.dataclass(frozen=True)
-class Weight:
+class QuantizedWeight:
     """A weight on the symmetric int8 grid: ``integers * scales`` along an axis.
 
     Attributes:
@@ -32,7 +32,9 @@ class Weight:
     axis: int | None
 
 
-def weights_of(model: ir.Model, chosen: Iterable[Decision]) -> dict[str, Weight]:
+def weights_of(
+    model: ir.Model, chosen: Iterable[Decision]
+) -> dict[str, QuantizedWeight]:
     """Quantize the weights of int8 layers; layers that share one share the result.
 
     Args:
@@ -73,7 +75,7 @@ def _planned(
 
 def _quantize(
     value: ir.Value, axis: int | None, computed: Mapping[str, Array]
-) -> Weight:
+) -> QuantizedWeight:
     name = str(value.name)
     if name in computed:
         array = computed[name]
@@ -84,4 +86,4 @@ def _quantize(
     if axis == -1:
         array, axis = array.reshape(array.shape[-2:]), 1
     integers, scales = quantize_weight(array.astype(np.float32), axis)
-    return Weight(name, integers, scales, axis)
+    return QuantizedWeight(name, integers, scales, axis)

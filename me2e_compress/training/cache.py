@@ -9,7 +9,7 @@ from torch import Tensor
 
 from me2e_compress.training.data import Episodes, Indices
 from me2e_compress.training.step import NONE, pixels_of, remember
-from me2e_compress.zoo.highway.interfaces import World
+from me2e_compress.zoo.highway.interfaces import PlannerInput
 from me2e_compress.zoo.highway.stack import Highway
 
 GRIDS = ("raster", "occupancy")
@@ -20,10 +20,10 @@ FRAMES = 24
 
 @dataclass
 class Cache:
-    """One `World` a sample: float16, grids as uint8.
+    """One `PlannerInput` a sample: float16, grids as uint8.
 
     Attributes:
-        rows: by field of `World`, [N, ...].
+        rows: by field of `PlannerInput`, [N, ...].
     """
 
     rows: dict[str, Tensor]
@@ -47,14 +47,14 @@ class Cache:
                 rows[name][torch.from_numpy(picked)] = part
         return cls(rows)
 
-    def world(self, picked: Indices) -> World:
+    def world(self, picked: Indices) -> PlannerInput:
         """The worlds of [B] samples."""
         index = torch.from_numpy(picked)
         found = {}
         for name, rows in self.rows.items():
             part = rows[index].float()
             found[name] = part / 255 if name in GRIDS else part
-        return World(**found)
+        return PlannerInput(**found)
 
 
 @torch.no_grad()
@@ -76,7 +76,7 @@ def _episode(
             looks.append(model.bev_encoder.look(fine, calibration).float())
             middles.append(middle)
         joined = remember(model, torch.cat(looks), batch)
-        worlds = list[World]()
+        worlds = list[PlannerInput]()
         for number, middle in enumerate(middles):
             where = slice(number * FRAMES, (number + 1) * FRAMES)
             bev = model.bev_encoder.fuse(joined[where])
@@ -86,7 +86,7 @@ def _episode(
         field.name: _packed(
             field.name, torch.cat([getattr(world, field.name) for world in worlds])
         )
-        for field in fields(World)
+        for field in fields(PlannerInput)
     }
 
 

@@ -17,7 +17,7 @@ Weights = Mapping[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What a stage begins with: of a `Checkpoint`, or of a file that holds no more.
+    """What a stage begins with: a `TrainingCheckpoint`, or a file that holds no more.
 
     Attributes:
         mean: weights and buffers that drive.
@@ -38,7 +38,7 @@ class Start:
 
 
 @dataclass(frozen=True, eq=False)
-class Checkpoint:
+class TrainingCheckpoint:
     """Everything that going on needs.
 
     Attributes:

@@ -10,9 +10,14 @@ from torch.multiprocessing.spawn import ProcessException, spawn
 
 from me2e_compress.errors import TrainingError
 from me2e_compress.runtime.parent import end_with_parent
-from me2e_compress.training.checkpoint import Checkpoint
+from me2e_compress.training.checkpoint import TrainingCheckpoint
 from me2e_compress.training.options import difference
-from me2e_compress.training.process import CHECKPOINT, Stage, Task, Training
+from me2e_compress.training.process import (
+    CHECKPOINT,
+    StageTask,
+    Training,
+    TrainingProcess,
+)
 from me2e_compress.training.together import Together
 from me2e_compress.zoo.highway.config import HighwayConfig
 
@@ -64,7 +69,7 @@ def train(
     last = folder / CHECKPOINT
     if last.exists() and _steps(last, what) >= what.steps:
         return last
-    task = Task(what, config, tuple(files), tuple(held_out), start, folder)
+    task = StageTask(what, config, tuple(files), tuple(held_out), start, folder)
     together = Together.of(what.workers, config)
     try:
         running = spawn(_process, (task, together), what.workers, join=False)
@@ -76,10 +81,10 @@ def train(
     return last
 
 
-def _process(rank: int, task: Task, together: Together) -> None:
+def _process(rank: int, task: StageTask, together: Together) -> None:
     end_with_parent()
     torch.set_num_threads(1)
-    Stage(rank, together, task).run()
+    TrainingProcess(rank, together, task).run()
 
 
 def _told(error: ProcessException) -> str:
@@ -95,7 +100,7 @@ def _steps(checkpoint: Path, what: Training) -> int:
     Raises:
         TrainingError: it is none, or of another stage.
     """
-    found = Checkpoint.load(checkpoint)
+    found = TrainingCheckpoint.load(checkpoint)
     words = difference(json.loads(found.what), asdict(what), MAY_CHANGE)
     if words is not None:
         raise TrainingError(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.training.checkpoint import Checkpoint, Start, fit
+from me2e_compress.training.checkpoint import Start, TrainingCheckpoint, fit
 from me2e_compress.training.data import Episodes, Sequences
 from me2e_compress.training.descent import Descent, Mean
 from me2e_compress.training.frenet import anchors_of
@@ -68,7 +68,7 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Task:
+class StageTask:
     """A stage and its files.
 
     Attributes:
@@ -89,10 +89,10 @@ class Task:
     folder: Path
 
 
-class Stage:
+class TrainingProcess:
     """What one process holds while it trains."""
 
-    def __init__(self, rank: int, together: Together, task: Task) -> None:
+    def __init__(self, rank: int, together: Together, task: StageTask) -> None:
         """Read the episodes and begin, or go on where the checkpoint is.
 
         Args:
@@ -148,7 +148,7 @@ class Stage:
     def _resume(self) -> None:
         path = self.task.folder / CHECKPOINT
         if path.exists():
-            found = Checkpoint.load(path)
+            found = TrainingCheckpoint.load(path)
             fit(self.model, found.mean, path)
             fit(self.model, found.model, path)
             fit(self.lamps, found.lamps, path)
@@ -208,7 +208,7 @@ class Stage:
 
     def _save(self) -> None:
         if self.rank == 0:
-            Checkpoint(
+            TrainingCheckpoint(
                 self.model.state_dict(),
                 self.mean.weights,
                 self.lamps.state_dict(),

@@ -19,7 +19,7 @@ from me2e_compress.training.losses import (
 from me2e_compress.training.losses.tracking_loss import match
 from me2e_compress.training.stored_episode import Array
 from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of
-from me2e_compress.zoo.highway.interfaces import Candidates, EgoState, World
+from me2e_compress.zoo.highway.interfaces import Candidates, EgoState, PlannerInput
 from me2e_compress.zoo.highway.stack import STOOD_S, Highway, Seen
 
 MEAN, STD = 110.0, 60.0
@@ -72,7 +72,7 @@ NONE = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass
-class Outcome:
+class StepOutcome:
     """What came of a batch.
 
     Attributes:
@@ -85,14 +85,14 @@ class Outcome:
 
     losses: dict[str, Tensor]
     seen: Seen
-    world: World
+    world: PlannerInput
     candidates: Candidates
     wanted: Targets
 
 
 def run_planner(
     model: Highway,
-    world: World,
+    world: PlannerInput,
     batch: dict[str, Array],
     rng: np.random.Generator,
     how: Augmentation,
@@ -127,7 +127,7 @@ def run(
     lidar2img: Tensor,
     rng: np.random.Generator,
     how: Augmentation,
-) -> Outcome:
+) -> StepOutcome:
     """Run sequences through the model.
 
     Args:
@@ -163,10 +163,10 @@ def run(
         **occ_losses(seen.occupancy, wanted),
         **plan_losses(candidates, wanted, model.config.area),
     }
-    return Outcome(losses, seen, world, candidates, wanted)
+    return StepOutcome(losses, seen, world, candidates, wanted)
 
 
-def _settled(world: World) -> World:
+def _settled(world: PlannerInput) -> PlannerInput:
     """The planner bends its own plans, not the map under them."""
     return replace(
         world,
@@ -224,7 +224,9 @@ def _ego(flat: dict[str, Array], rng: np.random.Generator, how: Augmentation) ->
     return EgoState(bus, stood).features()
 
 
-def _without_occ(world: World, rng: np.random.Generator, how: Augmentation) -> World:
+def _without_occ(
+    world: PlannerInput, rng: np.random.Generator, how: Augmentation
+) -> PlannerInput:
     gone = torch.from_numpy(rng.random(len(world.occupancy)) < how.no_occ)
     mean = world.occupancy.mean(0, keepdim=True)
     kept = torch.where(gone[:, None, None, None], mean, world.occupancy)

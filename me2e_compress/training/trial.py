@@ -9,7 +9,7 @@ from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.generate import generate
-from me2e_compress.evaluators.highway.jobs import HighwayEvaluator, Progress
+from me2e_compress.evaluators.highway.jobs import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.measure import Estimate
@@ -85,7 +85,7 @@ def drive(
             killed.
     """
 
-    def tell(progress: Progress) -> None:
+    def tell(progress: DrivingProgress) -> None:
         on_done(progress.done, progress.total)
 
     who = Driver(str(driver))

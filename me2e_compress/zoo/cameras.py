@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from me2e_compress.zoo.synthetic_world import Box, Pose, World
+from me2e_compress.zoo.synthetic_world import Cuboid, EgoPose, SyntheticWorld
 
 Array = NDArray[np.floating[Any]]
 
@@ -42,7 +42,7 @@ SKY_HIGH = np.array([96.0, 148.0, 214.0], np.float32)
 
 
 @dataclass(frozen=True)
-class Camera:
+class Pinhole:
     """A pinhole.
 
     Attributes:
@@ -75,7 +75,7 @@ class Camera:
 
 
 @cache
-def rig() -> tuple[Camera, ...]:
+def rig() -> tuple[Pinhole, ...]:
     """The six cameras, in the order of the image input."""
     cameras = []
     for _, yaw_deg, position, (focal, cx, cy) in MOUNTS:
@@ -83,7 +83,7 @@ def rig() -> tuple[Camera, ...]:
         ahead = (-math.sin(yaw), math.cos(yaw), 0.0)
         right = (math.cos(yaw), math.sin(yaw), 0.0)
         cameras.append(
-            Camera(
+            Pinhole(
                 np.array(position, np.float32),
                 np.array([right, (0.0, 0.0, -1.0), ahead], np.float32),
                 np.array(
@@ -104,7 +104,9 @@ def _rays() -> tuple[Array, ...]:
     return tuple(camera.rays() for camera in rig())
 
 
-def render(world: World, ego: Pose, boxes: Sequence[Box]) -> NDArray[np.uint8]:
+def render(
+    world: SyntheticWorld, ego: EgoPose, boxes: Sequence[Cuboid]
+) -> NDArray[np.uint8]:
     """Draw what the six cameras see: [6, 360, 640, 3] RGB.
 
     Args:
@@ -124,7 +126,7 @@ def render(world: World, ego: Pose, boxes: Sequence[Box]) -> NDArray[np.uint8]:
 
 
 def _background(
-    world: World, ego: Pose, camera: Camera, rays: Array
+    world: SyntheticWorld, ego: EgoPose, camera: Pinhole, rays: Array
 ) -> tuple[Array, Array]:
     """Sky and ground: colour [360, 640, 3] and depth [360, 640]."""
     rise = np.clip(rays[..., 2:] / 0.5, 0, 1)
@@ -143,7 +145,7 @@ def _background(
 
 
 def _draw(
-    box: Box, ego: Pose, camera: Camera, rays: Array, colour: Array, depth: Array
+    box: Cuboid, ego: EgoPose, camera: Pinhole, rays: Array, colour: Array, depth: Array
 ) -> None:
     """Cast the rays that may hit the box and paint where it is nearest."""
     window = _window(box, ego, camera)
@@ -173,7 +175,7 @@ def _draw(
     behind[hit] = near[hit]
 
 
-def _window(box: Box, ego: Pose, camera: Camera) -> tuple[slice, slice] | None:
+def _window(box: Cuboid, ego: EgoPose, camera: Pinhole) -> tuple[slice, slice] | None:
     """Rows and columns that the box may touch, or None."""
     x, y, z = box.corners()
     right, ahead = ego.to_lidar(x, y)

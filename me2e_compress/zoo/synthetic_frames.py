@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from me2e_compress.errors import FramesError
 from me2e_compress.zoo.cameras import render, rig
 from me2e_compress.zoo.stacks import Stack
-from me2e_compress.zoo.synthetic_world import FRAME_S, World
+from me2e_compress.zoo.synthetic_world import FRAME_S, SyntheticWorld
 from me2e_compress.zoo.traffic import draw_world
 
 Frame = dict[str, NDArray[np.float32]]
@@ -54,7 +54,7 @@ def _normalise(
     return out
 
 
-def _can_bus(world: World, step: int) -> NDArray[np.float32]:
+def _can_bus(world: SyntheticWorld, step: int) -> NDArray[np.float32]:
     """What the vehicle says of its motion, [18] float32.
 
     0-2 metres moved since the last frame (world axes), 3-6 quaternion, 7 speed, 10-12

@@ -27,7 +27,7 @@ GLASS = np.array([36.0, 44.0, 54.0], np.float32)
 
 
 @dataclass(frozen=True)
-class Pose:
+class EgoPose:
     """Metres and radians in the world; yaw 0 looks along x, left is positive."""
 
     x: float
@@ -50,7 +50,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Box:
+class Cuboid:
     """A cuboid on the ground; metres, radians, metres a second, RGB.
 
     Attributes:
@@ -67,7 +67,7 @@ class Box:
     speed_mps: float = 0.0
     window_m: float | None = None
 
-    def moved(self, seconds: float) -> "Box":
+    def moved(self, seconds: float) -> "Cuboid":
         """The same box later, straight on."""
         way = self.speed_mps * seconds
         return replace(
@@ -115,7 +115,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class World:
+class SyntheticWorld:
     """The ground, and what was on it when the scene began.
 
     Attributes:
@@ -132,21 +132,21 @@ class World:
     bend: float
     crossing_m: float
     tile: Array
-    boxes: tuple[Box, ...]
+    boxes: tuple[Cuboid, ...]
     speed_mps: float
     accel_mps2: float
     lane_m: float
 
-    def ego(self, seconds: float) -> Pose:
+    def ego(self, seconds: float) -> EgoPose:
         """Where the ego vehicle is: it keeps its lane."""
         way = self.speed_mps * seconds + self.accel_mps2 * seconds**2 / 2
-        return Pose(
+        return EgoPose(
             way,
             self.bend * way**2 / 2 + self.lane_m,
             math.atan(self.bend * way),
         )
 
-    def boxes_at(self, seconds: float) -> tuple[Box, ...]:
+    def boxes_at(self, seconds: float) -> tuple[Cuboid, ...]:
         """Everything that stands or moves, at a time."""
         return tuple(box.moved(seconds) for box in self.boxes)
 

@@ -4,7 +4,13 @@ import math
 
 import numpy as np
 
-from me2e_compress.zoo.synthetic_world import LANE_M, LANES, TILE, Box, World
+from me2e_compress.zoo.synthetic_world import (
+    LANE_M,
+    LANES,
+    TILE,
+    Cuboid,
+    SyntheticWorld,
+)
 
 Range = tuple[float, float]
 
@@ -12,7 +18,7 @@ TINT = 22.0
 """Standard deviation of a colour around its grey, in 1 / 255."""
 
 
-def draw_world(rng: np.random.Generator) -> World:
+def draw_world(rng: np.random.Generator) -> SyntheticWorld:
     """A road with 8 to 12 vehicles, parked ones, buildings, people and cones."""
     bend = float(rng.uniform(-0.008, 0.008))
     speed_mps = float(rng.uniform(3, 10))
@@ -24,7 +30,7 @@ def draw_world(rng: np.random.Generator) -> World:
     ]
     coarse = rng.normal(0, 7, (TILE // 8, TILE // 8)).repeat(8, 0).repeat(8, 1)
     tile = (coarse + rng.normal(0, 6, (TILE, TILE))).astype(np.float32)
-    return World(
+    return SyntheticWorld(
         bend=bend,
         crossing_m=float(rng.uniform(8, 40)),
         tile=tile,
@@ -46,7 +52,7 @@ def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, floa
     return float(red), float(green), float(blue)
 
 
-def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Box:
+def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Cuboid:
     """One that drives; in the lane of the ego vehicle about as fast as that."""
     lane = int(rng.integers(0, LANES)) - LANES // 2
     ahead = lane != 0 or rng.random() < 0.7
@@ -55,7 +61,7 @@ def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Box:
         along = float(rng.uniform(-45, 60))
     x, y, yaw = _place(bend, along, lane * LANE_M)
     truck = rng.random() < 0.2
-    return Box(
+    return Cuboid(
         x=x,
         y=y,
         yaw=yaw + (math.pi if lane == 1 else 0.0),
@@ -68,26 +74,28 @@ def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Box:
     )
 
 
-def _parked(rng: np.random.Generator, bend: float) -> Box:
+def _parked(rng: np.random.Generator, bend: float) -> Cuboid:
     side = 1 if rng.random() < 0.5 else -1
     x, y, yaw = _place(bend, float(rng.uniform(-35, 55)), side * 6.4)
-    return Box(x, y, yaw, 4.4, 1.8, 1.5, _colour(rng, (30, 235)), window_m=1.5)
+    return Cuboid(x, y, yaw, 4.4, 1.8, 1.5, _colour(rng, (30, 235)), window_m=1.5)
 
 
-def _building(rng: np.random.Generator, bend: float) -> Box:
+def _building(rng: np.random.Generator, bend: float) -> Cuboid:
     side = 1 if rng.random() < 0.5 else -1
     depth = float(rng.uniform(7, 14))
     offset = side * (float(rng.uniform(11, 20)) + depth / 2)
     x, y, yaw = _place(bend, float(rng.uniform(-55, 80)), offset)
     length, height = float(rng.uniform(9, 24)), float(rng.uniform(5, 17))
-    return Box(x, y, yaw, length, depth, height, _colour(rng, (90, 210)), window_m=2.8)
+    return Cuboid(
+        x, y, yaw, length, depth, height, _colour(rng, (90, 210)), window_m=2.8
+    )
 
 
-def _small(rng: np.random.Generator, bend: float) -> Box:
+def _small(rng: np.random.Generator, bend: float) -> Cuboid:
     """A pedestrian who walks along the pavement, or a cone."""
     side = 1 if rng.random() < 0.5 else -1
     x, y, yaw = _place(bend, float(rng.uniform(-20, 40)), side * rng.uniform(6, 8.5))
     if rng.random() < 0.4:
-        return Box(x, y, yaw, 0.4, 0.4, 0.8, (236.0, 108.0, 32.0))
+        return Cuboid(x, y, yaw, 0.4, 0.4, 0.8, (236.0, 108.0, 32.0))
     pace = float(rng.uniform(0.6, 1.6))
-    return Box(x, y, yaw, 0.5, 0.5, 1.75, _colour(rng, (30, 220)), speed_mps=pace)
+    return Cuboid(x, y, yaw, 0.5, 0.5, 1.75, _colour(rng, (30, 220)), speed_mps=pace)

@@ -4,15 +4,21 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode, Frame
+from me2e_compress.metrics.episode import (
+    FRAME_US,
+    EgoFrame,
+    Ending,
+    Episode,
+    InferenceRecord,
+)
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
 
-STILL = Frame(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, None)
+STILL = EgoFrame(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, None)
 
 
 def frames(
     count: int, at: Callable[[int], dict[str, float | None]] = lambda _: {}
-) -> tuple[Frame, ...]:
+) -> tuple[EgoFrame, ...]:
     """Frames every 50 ms; `at` says what differs from standing still."""
     return tuple(
         dataclasses.replace(STILL, time_us=k * FRAME_US, **at(k))  # type: ignore[arg-type]
@@ -22,7 +28,7 @@ def frames(
 
 def cruise(
     length_m: float = 100.0, speed: float = 10.0, traffic: float | None = None
-) -> tuple[Frame, ...]:
+) -> tuple[EgoFrame, ...]:
     """Constant speed from the start to the end of a route."""
     count = math.ceil(length_m / speed / 0.05) + 1
     return frames(
@@ -43,7 +49,7 @@ def drive(
     *infractions: Infraction,
     completion: float = 100.0,
     abilities: tuple[str, ...] = ("Merging",),
-    driven: tuple[Frame, ...] = (),
+    driven: tuple[EgoFrame, ...] = (),
     ending: Ending = Ending.COMPLETED,
     length_m: float = 100.0,
     junction_m: float | None = None,
@@ -60,7 +66,7 @@ def drive(
         None,
         infractions,
         driven,
-        (Decision(0, 100_000),),
+        (InferenceRecord(0, 100_000),),
         junction_m,
         ratios,
     )

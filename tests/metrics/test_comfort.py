@@ -4,7 +4,7 @@ import pytest
 
 from me2e_compress.metrics import bench2drive
 from me2e_compress.metrics.comfort import comfort, smooth_frames
-from me2e_compress.metrics.episode import Episode, Frame
+from me2e_compress.metrics.episode import EgoFrame, Episode
 from tests.metrics.drives import drive, frames
 
 Floats = npt.NDArray[np.float64]
@@ -14,7 +14,7 @@ def held(count: int, **values: float) -> Episode:
     return drive(driven=frames(count, lambda _: dict(values)))
 
 
-def random_frames(seed: int, count: int) -> tuple[Frame, ...]:
+def random_frames(seed: int, count: int) -> tuple[EgoFrame, ...]:
     rng = np.random.default_rng(seed)
     along, left = rng.normal(0, 1.5, (2, count)).cumsum(axis=1) * 0.3
     yaw = rng.normal(0, 0.1, count).cumsum() * 0.3
@@ -43,7 +43,7 @@ def local_fit(values: Floats, dt: float) -> tuple[Floats, Floats]:
     return fitted, slopes
 
 
-def columns(driven: tuple[Frame, ...]) -> tuple[Floats, Floats, Floats, Floats]:
+def columns(driven: tuple[EgoFrame, ...]) -> tuple[Floats, Floats, Floats, Floats]:
     table = np.array(
         [
             (
@@ -146,7 +146,7 @@ def test_bench2drive_halves_the_jerk() -> None:
     assert comfort(ramp(4.7)).value == 0.0
 
 
-def original(driven: tuple[Frame, ...]) -> list[bool]:
+def original(driven: tuple[EgoFrame, ...]) -> list[bool]:
     """Bench2Drive's blocks, filters spelled out as local fits (delta 0.1 s)."""
     along, left, yaw, _ = columns(driven)
     omega, norm = np.degrees(yaw), np.hypot(along, left)
@@ -171,7 +171,7 @@ def test_bench2drive_smoothness_against_local_fits(seed: int) -> None:
     calm = random_frames(seed, 215)
     scale = float(rng.uniform(0.01, 0.2))
     driven = tuple(
-        Frame(
+        EgoFrame(
             *(f.time_us, f.x, f.y, f.heading, f.speed_mps),
             acceleration_mps2=f.acceleration_mps2,
             lateral_acceleration_mps2=f.lateral_acceleration_mps2,

@@ -5,7 +5,7 @@ import pytest
 
 from me2e_compress.metrics import bench2drive
 from me2e_compress.metrics.efficiency import efficiency, speed_ratios
-from me2e_compress.metrics.episode import Ending, Episode, Frame
+from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
 from tests.metrics.drives import cruise, drive, frames
 
 
@@ -14,7 +14,7 @@ def random_drive(seed: int, completed: bool = True) -> Episode:
     rng = np.random.default_rng(seed)
     length = float(rng.uniform(80.0, 160.0))
     end = length if completed else 0.6 * length
-    driven, route = list[Frame](), 0.0
+    driven, route = list[EgoFrame](), 0.0
     while route < end:
         speed = float(rng.uniform(0.2, 12.0))
         traffic = float(rng.uniform(0.0, 9.0)) if rng.random() < 0.6 else None
@@ -32,7 +32,7 @@ def random_drive(seed: int, completed: bool = True) -> Episode:
 def by_hand(episode: Episode) -> list[float]:
     """Assign every frame to its check point first, then divide."""
     spacing = episode.route_length_m / 20
-    groups = dict[int, list[Frame]]()
+    groups = dict[int, list[EgoFrame]]()
     before = 0
     for frame in episode.frames:
         groups.setdefault(before, []).append(frame)

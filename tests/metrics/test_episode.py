@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.metrics.episode import (
-    Decision,
+    EgoFrame,
     Ending,
     Episode,
-    Frame,
+    InferenceRecord,
 )
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
 from tests.metrics.drives import cruise, drive, infraction
@@ -18,7 +18,7 @@ from tests.metrics.drives import cruise, drive, infraction
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 times = st.integers(0, 10**10)
 frame_rows = st.builds(
-    Frame,
+    EgoFrame,
     times,
     *[numbers] * 9,
     traffic_speed_mps=st.none() | numbers,
@@ -44,7 +44,7 @@ episodes = st.builds(
     st.none() | st.text(max_size=8),
     st.lists(infractions, max_size=2).map(tuple),
     st.lists(frame_rows, max_size=4).map(tuple),
-    st.lists(st.builds(Decision, times, times), max_size=3).map(tuple),
+    st.lists(st.builds(InferenceRecord, times, times), max_size=3).map(tuple),
     st.none() | numbers,
     st.none() | st.lists(numbers, max_size=3).map(tuple),
 )

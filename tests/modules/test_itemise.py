@@ -3,7 +3,7 @@ import onnx_ir as ir
 from me2e_compress.modules import (
     Item,
     ModuleMap,
-    Weight,
+    WeightEntry,
     assign,
     inventory,
     itemise,
@@ -80,15 +80,15 @@ def test_inventory_tells_what_is_there_more_and_less() -> None:
             "neck.bn.num_batches_tracked": 1,
         },
     )
-    assert found.present == (Weight("neck.w", "neck", 2, "parameter"),)
+    assert found.present == (WeightEntry("neck.w", "neck", 2, "parameter"),)
     assert found.missing == (
-        Weight("det.w", "det", 4, "parameter"),
-        Weight("idle", None, 3, "parameter"),
-        Weight("neck.bn.running_mean", "neck", 2, "batch-norm statistics"),
-        Weight("neck.bn.num_batches_tracked", "neck", 1, "batch-norm counter"),
+        WeightEntry("det.w", "det", 4, "parameter"),
+        WeightEntry("idle", None, 3, "parameter"),
+        WeightEntry("neck.bn.running_mean", "neck", 2, "batch-norm statistics"),
+        WeightEntry("neck.bn.num_batches_tracked", "neck", 1, "batch-norm counter"),
     )
     assert found.extra == (
-        Weight("size", "det", 1, "integer constant"),
-        Weight("idle", None, 2, "constant"),
-        Weight("onnx::Add_12", "det", 2, "renamed weight"),
+        WeightEntry("size", "det", 1, "integer constant"),
+        WeightEntry("idle", None, 2, "constant"),
+        WeightEntry("onnx::Add_12", "det", 2, "renamed weight"),
     )

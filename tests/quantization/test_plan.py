@@ -7,9 +7,9 @@ import pytest
 from me2e_compress.errors import ModuleMapError, RecipeError
 from me2e_compress.quantization.plan import Decision, make_plan, tensors_of
 from me2e_compress.quantization.rules import (
-    Operator,
     RuleSet,
-    Weight,
+    WeightedOperator,
+    WeightOperand,
     paper_rules,
     tensorrt_rules,
 )
@@ -219,7 +219,7 @@ def test_unknown_schemes_and_modules_are_errors() -> None:
 def test_a_rule_can_be_switched_off() -> None:
     model = net(LINEAR % ("1,64", "64,32", "1,32"), {"w": np.ones((64, 32))})
 
-    plan = make_plan(model, HEAD, RuleSet("own", (Operator(), Weight())))
+    plan = make_plan(model, HEAD, RuleSet("own", (WeightedOperator(), WeightOperand())))
 
     assert plan.counts() == {"layer": 1}
 

@@ -16,8 +16,8 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import rules_named
 from me2e_compress.sensitivity import (
     Budget,
-    Choice,
     Drive,
+    Int8Choice,
     Score,
     Trials,
     advise,
@@ -127,16 +127,16 @@ def test_the_advice_floats_the_culprit_and_nothing_else(tmp_path: Path) -> None:
 
     choice = advise(judge, found, limit)
 
-    assert choice == Choice(("backbone", "head"), ("/head/MatMul_3",))
+    assert choice == Int8Choice(("backbone", "head"), ("/head/MatMul_3",))
     assert judge.score(choice).loss <= limit
-    assert advise(judge, found, 1e9) == Choice(("backbone", "head"))
-    assert advise(judge, found, 0.0) == Choice(())
+    assert advise(judge, found, 1e9) == Int8Choice(("backbone", "head"))
+    assert advise(judge, found, 0.0) == Int8Choice(())
 
 
 def invented(judge: Trials, cost: dict[str, float], *, joint: bool = False) -> Trials:
     """Losses by table: those of what is int8 added up; ``joint``: the largest."""
 
-    def score(choice: Choice) -> Score:
+    def score(choice: Int8Choice) -> Score:
         costs = [
             cost[name]
             for module in choice.modules
@@ -161,7 +161,7 @@ def test_one_culprit_after_the_other_is_given_up(tmp_path: Path) -> None:
     found = analyse(judge, ("backbone", "head"))
     both = ("backbone", "head")
 
-    assert advise(judge, found, 7.0) == Choice(both, ("/head/MatMul_2",))
+    assert advise(judge, found, 7.0) == Int8Choice(both, ("/head/MatMul_2",))
 
 
 def test_what_fits_in_spite_of_its_blame_is_taken_back(tmp_path: Path) -> None:
@@ -175,12 +175,12 @@ def test_what_fits_in_spite_of_its_blame_is_taken_back(tmp_path: Path) -> None:
     # 4 was in vain, 2 alone is too much
     choice = advise(judge, dataclasses.replace(found, findings=found.findings[::-1]), 3)
 
-    assert choice == Choice(("backbone", "head"), ("/head/MatMul_2",))
+    assert choice == Int8Choice(("backbone", "head"), ("/head/MatMul_2",))
 
 
 def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
     judge = trials(tmp_path, 3)
-    choice = Choice(("backbone", "head"), ("/head/MatMul_3",))
+    choice = Int8Choice(("backbone", "head"), ("/head/MatMul_3",))
     path = tmp_path / "elsewhere" / "advised.toml"
     path.parent.mkdir()
     overrides = write_recipe(path, choice, ("fold-constants",), "paper", "tensorrt")
@@ -202,7 +202,7 @@ def test_the_recipe_makes_the_graph_that_was_judged(tmp_path: Path) -> None:
 def test_a_recipe_without_int8_has_no_int8(tmp_path: Path) -> None:
     path = tmp_path / "r.toml"
 
-    assert write_recipe(path, Choice(()), ("fold-constants",), "paper", "x") is None
+    assert write_recipe(path, Int8Choice(()), ("fold-constants",), "paper", "x") is None
     assert [each.name for each in recipe.load(path)] == ["fold-constants"]
 
 
@@ -214,9 +214,9 @@ def driven(judge: Trials, drive: Drive) -> Trials:
 
 
 def test_modules_are_driven_once_and_halves_of_them_are_not(tmp_path: Path) -> None:
-    seen: list[Choice] = []
+    seen: list[Int8Choice] = []
 
-    def drive(choice: Choice, made: ir.Model) -> float:
+    def drive(choice: Int8Choice, made: ir.Model) -> float:
         seen.append(choice)
         int8 = [n.op_type for n in made.graph].count("QuantizeLinear")
         return 100.0 - int8
@@ -225,7 +225,7 @@ def test_modules_are_driven_once_and_halves_of_them_are_not(tmp_path: Path) -> N
     found = analyse(driven(judge, drive), ("backbone", "head"))
 
     modules = [("backbone",), ("head",), (), ("backbone", "head")]
-    assert seen == [Choice(names) for names in modules]
+    assert seen == [Int8Choice(names) for names in modules]
     assert found.float_driving == 100.0
     assert {each.module: each.driving for each in found.findings} == {
         "backbone": 98.0,
@@ -236,15 +236,15 @@ def test_modules_are_driven_once_and_halves_of_them_are_not(tmp_path: Path) -> N
 
 
 def test_the_advice_keeps_a_limit_of_driving(tmp_path: Path) -> None:
-    def drive(choice: Choice, made: ir.Model) -> float:
+    def drive(choice: Int8Choice, made: ir.Model) -> float:
         return 80.0 if "head" in choice.modules else 99.0
 
     judge = trials(tmp_path, 3)
     on_road = driven(judge, drive)
     found = analyse(on_road, ("backbone", "head"), node_trials=0)
 
-    assert advise(on_road, found, 1e9, 19.0) == Choice(("backbone", "head"))
-    assert advise(on_road, found, 1e9, 18.9) == Choice(("backbone",))
+    assert advise(on_road, found, 1e9, 19.0) == Int8Choice(("backbone", "head"))
+    assert advise(on_road, found, 1e9, 18.9) == Int8Choice(("backbone",))
     with pytest.raises(EvaluationError, match="needs trials that are driven"):
         advise(judge, found, 1e9, 1.0)
 
@@ -256,8 +256,8 @@ def weight_bytes(made: ir.Model) -> float:
 def test_the_search_keeps_the_budget_and_loses_least(tmp_path: Path) -> None:
     judge = trials(tmp_path, 3)
     whole = weight_bytes(judge.model)
-    only_backbone = weight_bytes(judge.variant(Choice(("backbone",))))
-    only_head = weight_bytes(judge.variant(Choice(("head",))))
+    only_backbone = weight_bytes(judge.variant(Int8Choice(("backbone",))))
+    only_head = weight_bytes(judge.variant(Int8Choice(("head",))))
 
     loose = search(judge, ("backbone", "head"), Budget(whole, "bytes", weight_bytes))
     tight = search(
@@ -279,7 +279,7 @@ def test_the_search_keeps_the_budget_and_loses_least(tmp_path: Path) -> None:
 def test_the_last_that_is_tried_is_the_cheapest(tmp_path: Path) -> None:
     judge, both = trials(tmp_path, 3), ("backbone", "head")
     whole = weight_bytes(judge.model)
-    least = weight_bytes(judge.variant(Choice(both)))
+    least = weight_bytes(judge.variant(Int8Choice(both)))
     weighed: list[float] = []
 
     def cost(made: ir.Model) -> float:  # once all are predicted, only both stay cheap
@@ -299,7 +299,7 @@ def test_a_budget_that_nothing_fits_is_an_error(tmp_path: Path) -> None:
 
 def test_a_model_without_a_plan_is_judged_by_its_worst_output(tmp_path: Path) -> None:
     judge = trials(tmp_path, 3)
-    score = judge.score(Choice(("head",)))
+    score = judge.score(Int8Choice(("head",)))
     bare = dataclasses.replace(
         score, fidelity=dataclasses.replace(score.fidelity, plan=None)
     )

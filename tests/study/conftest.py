@@ -11,7 +11,7 @@ import pytest
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.simulator.routes import Route
-from me2e_compress.study import Condition, Outcome, Scheme, Study, Timing, run_study
+from me2e_compress.study import Condition, Scheme, Study, StudyResult, Timing, run_study
 from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 
@@ -56,7 +56,7 @@ def make(models: Path) -> Make:
 
 
 @pytest.fixture(scope="session")
-def found(models: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+def found(models: Path, tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
     """What the study finds; its folder is beside its first picture's."""
     return run_study(
         asked(models), tmp_path_factory.mktemp("found"), Here(), pictures=1

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study import Condition, Outcome
+from me2e_compress.study import Condition, StudyResult
 from me2e_compress.study.report import html
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
@@ -45,7 +45,7 @@ def test_a_front_is_what_no_other_beats(points: list[Point]) -> None:
 
 
 @pytest.fixture(scope="module")
-def page(found: Outcome) -> str:
+def page(found: StudyResult) -> str:
     return html(found, ("me2e-compress", "study", "<s>.toml"))
 
 
@@ -79,11 +79,11 @@ def test_every_section_is_there(page: str) -> None:
     ]
 
 
-def test_the_same_study_gives_the_same_page(found: Outcome, page: str) -> None:
+def test_the_same_study_gives_the_same_page(found: StudyResult, page: str) -> None:
     assert html(found, ("me2e-compress", "study", "<s>.toml")) == page
 
 
-def test_figures_name_every_scheme(found: Outcome) -> None:
+def test_figures_name_every_scheme(found: StudyResult) -> None:
     costs, gaps = pareto(found, IDEAL), forest(found)
 
     assert costs is not None
@@ -93,7 +93,7 @@ def test_figures_name_every_scheme(found: Outcome) -> None:
     assert ">fast, slow</text>" in gaps
 
 
-def test_a_curve_needs_three_conditions(found: Outcome) -> None:
+def test_a_curve_needs_three_conditions(found: StudyResult) -> None:
     middle = Condition("middle", "fps:5")
     drives = [
         dataclasses.replace(each, condition="middle") for each in found.drives[:4]
@@ -110,7 +110,7 @@ def test_a_curve_needs_three_conditions(found: Outcome) -> None:
     assert all(drawn.count(f">{name}</text>") == 2 for name in ("middle", "fast"))
 
 
-def test_findings_give_costs_and_what_is_sure(found: Outcome) -> None:
+def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
     told = {each.scheme: each.text for each in findings(found)}
 
     assert list(told) == ["blind", "again", "fast"]
@@ -129,7 +129,9 @@ def test_what_is_shown_as_zero_is_no_difference(
     assert sure(Estimate(Measure(low, "points"), low, high, 9)) == sign
 
 
-def test_files_are_written_beside_each_other(found: Outcome, tmp_path: Path) -> None:
+def test_files_are_written_beside_each_other(
+    found: StudyResult, tmp_path: Path
+) -> None:
     written = write(found, tmp_path / "new" / "study")
 
     assert json.loads(written.record.read_text()) == found.to_json()
@@ -138,7 +140,7 @@ def test_files_are_written_beside_each_other(found: Outcome, tmp_path: Path) -> 
     assert len(list((tmp_path / "new" / "study").iterdir())) == 3
 
 
-def test_a_folder_that_cannot_be_written(found: Outcome, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written(found: StudyResult, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
 
     with pytest.raises(StudyError, match="file/study: cannot be written"):

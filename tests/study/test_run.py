@@ -15,8 +15,8 @@ from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.metrics.scores import score
 from me2e_compress.study import (
     Listener,
-    Outcome,
     Scheme,
+    StudyResult,
     Timing,
     load_study,
     run_study,
@@ -62,7 +62,7 @@ def without_latency(record: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def test_every_scheme_under_every_condition(found: Outcome) -> None:
+def test_every_scheme_under_every_condition(found: StudyResult) -> None:
     assert [(each.scheme, each.condition) for each in found.drives] == [
         (scheme, condition)
         for condition in ("ideal", "slow")
@@ -71,7 +71,7 @@ def test_every_scheme_under_every_condition(found: Outcome) -> None:
     assert all(len(each.routes) == 2 for each in found.drives)
 
 
-def test_the_scores_are_those_of_the_results(found: Outcome) -> None:
+def test_the_scores_are_those_of_the_results(found: StudyResult) -> None:
     folder = found.contrasts[0].before.parents[1] / "results" / "fast.slow"
     episodes = tuple(ResultsFolder.open(folder).episodes().values())
 
@@ -83,7 +83,7 @@ def test_the_scores_are_those_of_the_results(found: Outcome) -> None:
 
 
 def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
-    found: Outcome,
+    found: StudyResult,
 ) -> None:
     blind, slow, again, fast = (each.difference for each in found.under(IDEAL))
 
@@ -95,7 +95,7 @@ def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
     assert fast.better + fast.worse > 0
 
 
-def test_a_model_has_size_and_latency_and_a_driver_has_none(found: Outcome) -> None:
+def test_a_model_has_size_and_latency_and_a_driver_has_none(found: StudyResult) -> None:
     blind, slow, again, fast = found.schemes
 
     assert blind.size_mb.value is None
@@ -107,7 +107,7 @@ def test_a_model_has_size_and_latency_and_a_driver_has_none(found: Outcome) -> N
     assert fast.latency_ms[99].value is not None
 
 
-def test_fidelity_is_measured_against_the_baseline(found: Outcome) -> None:
+def test_fidelity_is_measured_against_the_baseline(found: StudyResult) -> None:
     blind, slow, again, fast = (each.fidelity for each in found.schemes)
 
     assert blind.mean_m.reason == "blind is no model"
@@ -119,7 +119,7 @@ def test_fidelity_is_measured_against_the_baseline(found: Outcome) -> None:
     assert fast.frames == 2
 
 
-def test_a_picture_shows_where_two_drives_part(found: Outcome) -> None:
+def test_a_picture_shows_where_two_drives_part(found: StudyResult) -> None:
     [contrast] = found.contrasts
 
     gaps = [
@@ -140,7 +140,7 @@ def test_a_picture_shows_where_two_drives_part(found: Outcome) -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes(
-    found: Outcome, make: Make, tmp_path: Path
+    found: StudyResult, make: Make, tmp_path: Path
 ) -> None:
     again = run_study(make(), tmp_path, Here(), pictures=0)
 

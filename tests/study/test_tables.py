@@ -3,7 +3,7 @@ import dataclasses
 import pytest
 
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study import Outcome
+from me2e_compress.study import StudyResult
 from me2e_compress.study.cells import (
     INFINITE,
     MINUS,
@@ -20,7 +20,7 @@ from tests.study.conftest import IDEAL
 pytestmark = pytest.mark.xdist_group("study")
 
 
-def test_a_scoreboard_a_condition_and_a_row_a_scheme(found: Outcome) -> None:
+def test_a_scoreboard_a_condition_and_a_row_a_scheme(found: StudyResult) -> None:
     ideal, slow = scoreboards(found)
 
     assert ideal.title == "Scoreboard, ideal: decisions cost no time"
@@ -31,7 +31,7 @@ def test_a_scoreboard_a_condition_and_a_row_a_scheme(found: Outcome) -> None:
     assert "2 of 220 routes" in ideal.note
 
 
-def test_the_numbers_are_those_of_the_drives(found: Outcome) -> None:
+def test_the_numbers_are_those_of_the_drives(found: StudyResult) -> None:
     scores = found.under(IDEAL)[3].scores
     assert scores is not None
 
@@ -42,18 +42,18 @@ def test_the_numbers_are_those_of_the_drives(found: Outcome) -> None:
     assert row[8].text == "7.000"
 
 
-def test_a_driver_without_a_model_has_reasons_not_numbers(found: Outcome) -> None:
+def test_a_driver_without_a_model_has_reasons_not_numbers(found: StudyResult) -> None:
     row = scoreboards(found)[0].rows[0]
 
     assert [cell.text for cell in row[5:]] == [MISSING] * 5
     assert all(cell.reason for cell in row[5:])
 
 
-def test_no_noise_is_not_a_gap(found: Outcome) -> None:
+def test_no_noise_is_not_a_gap(found: StudyResult) -> None:
     assert scoreboards(found)[0].rows[2][9].text == INFINITE
 
 
-def test_the_baseline_is_not_compared_with_itself(found: Outcome) -> None:
+def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
     table = differences(found)
 
     assert [row[0].text for row in table.rows] == [
@@ -64,7 +64,7 @@ def test_the_baseline_is_not_compared_with_itself(found: Outcome) -> None:
     assert table.rows[1][1] == Cell("+0.0", "+0.0 to +0.0")
 
 
-def test_abilities_have_their_mean_last(found: Outcome) -> None:
+def test_abilities_have_their_mean_last(found: StudyResult) -> None:
     table = abilities(found)[0]
 
     assert table.columns[1:] == (
@@ -74,7 +74,7 @@ def test_abilities_have_their_mean_last(found: Outcome) -> None:
     assert table.rows[0][-1].reason.startswith("no route for Merging")
 
 
-def test_one_scheme_has_one_scoreboard_of_its_conditions(found: Outcome) -> None:
+def test_one_scheme_has_one_scoreboard_of_its_conditions(found: StudyResult) -> None:
     study = dataclasses.replace(
         found.study, schemes=found.study.schemes[1:2], baseline="slow"
     )

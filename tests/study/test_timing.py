@@ -13,7 +13,7 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.interleaved import machine_in_turn
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.study import Condition, Listener, Scheme, Study, Timing, timing
-from me2e_compress.study.prepared import contend
+from me2e_compress.study.prepared import prepare_scheme
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workplace import SILENT, Workplace
 from tests.study.conftest import BLIND, IDEAL, Make
@@ -25,7 +25,9 @@ HERE = machine_in_turn(1)
 
 def clock_of(study: Study, folder: Path, listener: Listener = SILENT) -> Clock:
     place = Workplace(folder)
-    contenders = [contend(study, each, place, listener) for each in study.schemes]
+    contenders = [
+        prepare_scheme(study, each, place, listener) for each in study.schemes
+    ]
     return time_all(study, contenders, place, listener)
 
 

@@ -16,7 +16,7 @@ import pytest
 from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.simulator.routes import load_routes
-from me2e_compress.training.checkpoint import Checkpoint
+from me2e_compress.training.checkpoint import TrainingCheckpoint
 from me2e_compress.training.course import News, claim, frames_in, run
 from me2e_compress.training.curriculum import (
     FULL,
@@ -158,7 +158,7 @@ def kill_while_driving(folder: Path, rounds: int, which: int) -> None:
 def kill_while_training(folder: Path, rounds: int, which: int) -> None:
     last = folder / f"round-{which}" / "training-0" / "last.pt"
     kill_when(folder, rounds, last.exists)
-    assert Checkpoint.load(last).step < SMALL.rounds[which].trainings[0].steps
+    assert TrainingCheckpoint.load(last).step < SMALL.rounds[which].trainings[0].steps
 
 
 def finish(folder: Path, rounds: int) -> None:

@@ -21,7 +21,7 @@ from me2e_compress.simulator.routes import Route, load_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.training.episodes import (
     Collection,
-    Progress,
+    CollectionProgress,
     collect,
     decode,
     driving,
@@ -33,7 +33,7 @@ SHORT = ("HighwayExit", "ControlLoss")
 WHAT = Collection(seed=3, variants=1, every=40, image_size=(16, 24))
 
 
-def nobody(progress: Progress) -> None:
+def nobody(progress: CollectionProgress) -> None:
     """Do not listen."""
 
 
@@ -93,13 +93,13 @@ def test_workers_do_not_matter(folder: Path, tmp_path: Path) -> None:
 
 
 def test_only_what_is_missing_is_driven(folder: Path) -> None:
-    whole, heard = bytes_of(folder), list[Progress]()
+    whole, heard = bytes_of(folder), list[CollectionProgress]()
     (folder / "HighwayExit_3_000.npz").unlink()
     kept = (folder / "ControlLoss_3_000.npz").stat().st_ino
 
     collect(folder, WHAT, None, 1, heard.append)
 
-    assert heard == [Progress(1, 2), Progress(2, 2)]
+    assert heard == [CollectionProgress(1, 2), CollectionProgress(2, 2)]
     assert (folder / "ControlLoss_3_000.npz").stat().st_ino == kept
     assert bytes_of(folder) == whole
 
@@ -151,11 +151,11 @@ def test_what_is_too_short_is_not_driven_again(
 ) -> None:
     monkeypatch.setattr(driving, "SHORTEST_US", 10**12)
     collect(tmp_path, WHAT, None, 1, nobody)
-    heard = list[Progress]()
+    heard = list[CollectionProgress]()
 
     collect(tmp_path, WHAT, None, 1, heard.append)
 
-    assert heard == [Progress(2, 2)]
+    assert heard == [CollectionProgress(2, 2)]
     assert "HighwayExit_3_000.skipped" in bytes_of(tmp_path)
 
 

@@ -26,7 +26,7 @@ from me2e_compress.training.episodes.collection import Task, tasks_of
 from me2e_compress.training.episodes.driving import episode_of
 from me2e_compress.training.episodes.episode_arrays import Arrays
 from me2e_compress.training.episodes.perturb import Perturbation
-from me2e_compress.training.episodes.recording_policy import Recording
+from me2e_compress.training.episodes.recording_policy import RecordingPolicy
 from tests.evaluators.highway.drivers import straight_on
 
 SIZE = (24, 40)
@@ -70,12 +70,12 @@ def witness() -> Witness:
 @pytest.fixture(scope="module")
 def world(witness: Witness) -> World:
     found = witness.seen[0].world
-    assert found is not None
+    assert isinstance(found, World)
     return found
 
 
 def scenes(witness: Witness) -> list[Scene]:
-    return [seen.scene for seen in witness.seen if seen.scene is not None]
+    return [seen.scene for seen in witness.seen if isinstance(seen.scene, Scene)]
 
 
 def test_without_noise_the_expert_drives_as_ever(
@@ -222,7 +222,7 @@ def test_noise_leaves_the_route() -> None:
 
 
 @dataclass
-class Overheard(Recording):
+class Overheard(RecordingPolicy):
     """A recording, and what it answered."""
 
     answers: list[Plan] = field(default_factory=list)

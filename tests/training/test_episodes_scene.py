@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.evaluators.highway.expert import Decision, Memory
+from me2e_compress.evaluators.highway.expert import ExpertDecision, Memory
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
@@ -22,7 +22,7 @@ from me2e_compress.simulator.world import Phase
 from me2e_compress.training.episodes import GRID
 from me2e_compress.training.episodes.agents import agents
 from me2e_compress.training.episodes.episode_arrays import Arrays
-from me2e_compress.training.episodes.recording_policy import Frame
+from me2e_compress.training.episodes.recording_policy import LabelledFrame
 from me2e_compress.training.episodes.signs import signals
 
 NORTH = Ego(100.0, 50.0, math.pi / 2, 8.0, 0.0, 0.0, 0.0, 0.0, 5.0, 2.0)
@@ -144,10 +144,12 @@ def test_the_centre_of_an_actor_is_occupied(
     assert occupied(arrays)[5, int(row), int(column)]
 
 
-def frame(*lights: Signal, phases: tuple[Phase, ...], served: int = -1) -> Frame:
+def frame(
+    *lights: Signal, phases: tuple[Phase, ...], served: int = -1
+) -> LabelledFrame:
     memory = Memory(served=frozenset({served}))
-    decision = Decision(np.zeros((6, 2)), 0.0, 0.0, 0.0, memory)
-    return Frame(scene(signals=lights), phases, 3, Memory(), decision)
+    decision = ExpertDecision(np.zeros((6, 2)), 0.0, 0.0, 0.0, memory)
+    return LabelledFrame(scene(signals=lights), phases, 3, Memory(), decision)
 
 
 def signal(

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from me2e_compress.errors import TrainingError
-from me2e_compress.training.checkpoint import Checkpoint
+from me2e_compress.training.checkpoint import TrainingCheckpoint
 from me2e_compress.training.data import Sequences
 from me2e_compress.training.lessons import Lessons
 from me2e_compress.training.log import Log
 from me2e_compress.training.loop import train
 from me2e_compress.training.losses import LampHead
-from me2e_compress.training.process import Stage, Task, Training, rate_at
+from me2e_compress.training.process import StageTask, Training, TrainingProcess, rate_at
 from me2e_compress.training.together import Together
 from me2e_compress.zoo.highway.stack import Highway
 from tests.training.made import LITTLE, arrays_of, write
@@ -47,18 +47,18 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
     return tuple(write(folder / f"{i}.npz", arrays_of(5, i)) for i in range(3))
 
 
-def stage(task: Task) -> Stage:
+def stage(task: StageTask) -> TrainingProcess:
     """All of a stage in this process."""
-    return Stage(0, Together.of(1, task.config), task)
+    return TrainingProcess(0, Together.of(1, task.config), task)
 
 
 @pytest.fixture
-def task(files: tuple[Path, ...], tmp_path: Path) -> Task:
-    return Task(WHAT, LITTLE, files[1:], files[:1], None, tmp_path)
+def task(files: tuple[Path, ...], tmp_path: Path) -> StageTask:
+    return StageTask(WHAT, LITTLE, files[1:], files[:1], None, tmp_path)
 
 
 def weights(folder: Path) -> dict[str, bytes]:
-    found = Checkpoint.load(folder / "last.pt")
+    found = TrainingCheckpoint.load(folder / "last.pt")
     return {
         f"{kind}.{name}": value.contiguous().numpy().tobytes()
         for kind, state in (("model", found.model), ("mean", found.mean))
@@ -82,7 +82,7 @@ class Killed:
 
 
 def test_an_interrupted_stage_comes_to_the_same_weights(
-    task: Task, tmp_path: Path
+    task: StageTask, tmp_path: Path
 ) -> None:
     whole = replace(task, folder=tmp_path / "whole")
     broken = replace(task, folder=tmp_path / "broken")
@@ -94,13 +94,13 @@ def test_an_interrupted_stage_comes_to_the_same_weights(
     first.lessons = Killed(first.lessons)  # type: ignore[assignment]
     with pytest.raises(KeyboardInterrupt):
         first.run()
-    assert Checkpoint.load(broken.folder / "last.pt").step == 2
+    assert TrainingCheckpoint.load(broken.folder / "last.pt").step == 2
     stage(broken).run()
 
     assert weights(broken.folder) == weights(whole.folder)
 
 
-def test_the_log_tells_losses_of_samples_nobody_learned_from(task: Task) -> None:
+def test_the_log_tells_losses_of_samples_nobody_learned_from(task: StageTask) -> None:
     stage(task).run()
     rows = Log(task.folder / "log.jsonl").rows()
     assert [(row["what"], row["step"]) for row in rows] == [
@@ -111,14 +111,16 @@ def test_the_log_tells_losses_of_samples_nobody_learned_from(task: Task) -> None
     assert rows[1]["seconds"] >= rows[0]["seconds"] > 0
 
 
-def test_a_stage_that_goes_on_tells_its_steps_once(task: Task) -> None:
+def test_a_stage_that_goes_on_tells_its_steps_once(task: StageTask) -> None:
     stage(replace(task, what=replace(WHAT, steps=2))).run()
     stage(task).run()
     steps = [row["step"] for row in Log(task.folder / "log.jsonl").rows()]
     assert steps == [2, 4]
 
 
-def test_the_planner_alone_changes_nothing_else(task: Task, tmp_path: Path) -> None:
+def test_the_planner_alone_changes_nothing_else(
+    task: StageTask, tmp_path: Path
+) -> None:
     stage(task).run()
     inner = tmp_path / "planner"
     inner.mkdir()
@@ -127,7 +129,7 @@ def test_the_planner_alone_changes_nothing_else(task: Task, tmp_path: Path) -> N
     stage(replace(task, what=alone, start=start, folder=inner)).run()
     before = {
         name: value.contiguous().numpy().tobytes()
-        for name, value in Checkpoint.load(start).mean.items()
+        for name, value in TrainingCheckpoint.load(start).mean.items()
     }
     after = weights(inner)
     learned = {
@@ -137,16 +139,16 @@ def test_the_planner_alone_changes_nothing_else(task: Task, tmp_path: Path) -> N
 
 
 def test_a_stage_begins_with_the_mean_of_the_one_before(
-    task: Task, tmp_path: Path
+    task: StageTask, tmp_path: Path
 ) -> None:
     stage(task).run()
     begun = stage(replace(task, start=task.folder / "last.pt", folder=tmp_path / "b"))
-    mean = Checkpoint.load(task.folder / "last.pt").mean
+    mean = TrainingCheckpoint.load(task.folder / "last.pt").mean
     found = begun.model.state_dict()
     assert all(torch.equal(found[name], mean[name]) for name in mean)
 
 
-def test_anchors_are_drawn_from_the_episodes(task: Task) -> None:
+def test_anchors_are_drawn_from_the_episodes(task: StageTask) -> None:
     anchors = stage(task).model.planner.anchors
     assert anchors.abs().max() < 1e-4  # the expert of these goes on as now
 
@@ -158,7 +160,7 @@ def test_the_rate_warms_up_and_falls() -> None:
 
 
 def test_a_stage_of_something_else_is_not_gone_on_with(
-    task: Task, files: tuple[Path, ...]
+    task: StageTask, files: tuple[Path, ...]
 ) -> None:
     stage(replace(task, what=replace(WHAT, steps=2))).run()
     other = replace(WHAT, rate=3e-3)
@@ -168,7 +170,7 @@ def test_a_stage_of_something_else_is_not_gone_on_with(
 
 
 def test_a_finished_stage_is_not_begun_again(
-    task: Task, files: tuple[Path, ...], monkeypatch: pytest.MonkeyPatch
+    task: StageTask, files: tuple[Path, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage(task).run()
     monkeypatch.setattr(Together, "of", None)  # nobody is started
@@ -176,11 +178,13 @@ def test_a_finished_stage_is_not_begun_again(
     assert found == task.folder / "last.pt"
 
 
-def test_a_start_of_another_model_is_refused(task: Task, tmp_path: Path) -> None:
+def test_a_start_of_another_model_is_refused(task: StageTask, tmp_path: Path) -> None:
     wider = Highway(replace(LITTLE, stages=(8, 8, 8, 16)))
     state = LampHead(64).state_dict()
     start = tmp_path / "wider.pt"
-    Checkpoint(wider.state_dict(), wider.state_dict(), state, {}, 1, "{}").save(start)
+    TrainingCheckpoint(wider.state_dict(), wider.state_dict(), state, {}, 1, "{}").save(
+        start
+    )
     with pytest.raises(TrainingError, match=r"wider\.pt: a checkpoint of another mod"):
         stage(replace(task, start=start))
 
@@ -205,7 +209,7 @@ def test_what_a_process_dies_of_is_told_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_a_checkpoint_says_what_trained_it(task: Task) -> None:
+def test_a_checkpoint_says_what_trained_it(task: StageTask) -> None:
     stage(replace(task, what=replace(WHAT, steps=2))).run()
-    told = json.loads(Checkpoint.load(task.folder / "last.pt").what)
+    told = json.loads(TrainingCheckpoint.load(task.folder / "last.pt").what)
     assert (told["steps"], told["augmentation"]["hints"]) == (2, 0.7)

@@ -9,11 +9,11 @@ import torch
 from onnx import numpy_helper
 
 from me2e_compress.errors import TrainingError
-from me2e_compress.training.checkpoint import Checkpoint, Start
+from me2e_compress.training.checkpoint import Start, TrainingCheckpoint
 from me2e_compress.training.course import load
 from me2e_compress.training.data import Sequences
 from me2e_compress.training.losses import LampHead
-from me2e_compress.training.process import Stage, Task, Training
+from me2e_compress.training.process import StageTask, Training, TrainingProcess
 from me2e_compress.training.together import Together
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.stack import Highway
@@ -40,17 +40,17 @@ def test_its_weights_are_those_of_the_onnx_file() -> None:
 def test_a_step_goes_on_from_it(tmp_path: Path) -> None:
     files = [write(tmp_path / f"{i}.npz", arrays_of(5, i)) for i in range(2)]
     config, start = HighwayConfig(), checkpoint("highway")
-    task = Task(
+    task = StageTask(
         ONE_STEP, config, (files[0],), (files[1],), start, tmp_path / "training"
     )
     task.folder.mkdir()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        Stage(0, Together.of(1, config), task).run()
+        TrainingProcess(0, Together.of(1, config), task).run()
     finally:
         torch.set_num_threads(threads)
-    before, after = Start.load(start), Checkpoint.load(task.folder / "last.pt")
+    before, after = Start.load(start), TrainingCheckpoint.load(task.folder / "last.pt")
     gaps = [
         (after.model[name] - value).abs().max()
         for name, value in before.mean.items()
@@ -62,7 +62,7 @@ def test_a_step_goes_on_from_it(tmp_path: Path) -> None:
 
 def test_a_whole_checkpoint_is_a_start(tmp_path: Path) -> None:
     model, mean, lamps = Highway(LITTLE), Highway(LITTLE), LampHead(64)
-    whole = Checkpoint(
+    whole = TrainingCheckpoint(
         model.state_dict(), mean.state_dict(), lamps.state_dict(), {}, 1, "{}"
     )
     whole.save(tmp_path / "last.pt")
@@ -83,4 +83,4 @@ def test_half_a_start_is_none(tmp_path: Path, lacking: str) -> None:
 
 def test_the_shipped_one_is_not_resumed() -> None:
     with pytest.raises(TrainingError, match="it lacks 'model'"):
-        Checkpoint.load(checkpoint("highway"))
+        TrainingCheckpoint.load(checkpoint("highway"))

@@ -17,7 +17,7 @@ from me2e_compress.training.step import (
     STD,
     WEIGHTS,
     Augmentation,
-    Outcome,
+    StepOutcome,
     pixels_of,
     remember,
     run,
@@ -56,7 +56,7 @@ def lamps() -> LampHead:
 
 def outcome(
     model: Highway, lamps: LampHead, episodes: Episodes, how: Augmentation, seed: int
-) -> Outcome:
+) -> StepOutcome:
     rng = np.random.default_rng(seed)
     picked = episodes.draw(rng, 2, Sequences(2))
     images = episodes.images(picked.ravel()).reshape(2, 2, 6, *SIZE, 3)
@@ -71,7 +71,7 @@ def gradients(module: nn.Module) -> float:
 
 
 @pytest.fixture(scope="module")
-def stepped(model: Highway, lamps: LampHead, episodes: Episodes) -> Outcome:
+def stepped(model: Highway, lamps: LampHead, episodes: Episodes) -> StepOutcome:
     found = outcome(model, lamps, episodes, Augmentation(), 0)
     model.zero_grad()
     lamps.zero_grad()
@@ -79,18 +79,20 @@ def stepped(model: Highway, lamps: LampHead, episodes: Episodes) -> Outcome:
     return found
 
 
-def test_all_losses_are_there_and_finite(stepped: Outcome) -> None:
+def test_all_losses_are_there_and_finite(stepped: StepOutcome) -> None:
     assert set(stepped.losses) == set(WEIGHTS)
     assert all(torch.isfinite(loss) for loss in stepped.losses.values())
 
 
-def test_every_module_learns(stepped: Outcome, model: Highway, lamps: LampHead) -> None:
+def test_every_module_learns(
+    stepped: StepOutcome, model: Highway, lamps: LampHead
+) -> None:
     parts = {**dict(model.named_children()), "lamps": lamps}
     modules = {name: part for name, part in parts.items() if list(part.parameters())}
     assert min(gradients(each) for each in modules.values()) > 0, modules.keys()
 
 
-def test_only_what_cannot_learn_is_idle(stepped: Outcome, model: Highway) -> None:
+def test_only_what_cannot_learn_is_idle(stepped: StepOutcome, model: Highway) -> None:
     idle = {name for name, p in model.named_parameters() if p.grad is None}
     # layers without self-attention have the LayerNorm before it all the same
     unused = ("road_layer.norms.0", "grid_layer.norms.0")

@@ -5,7 +5,7 @@ from me2e_compress.errors import FramesError
 from me2e_compress.zoo.cameras import HEIGHT, WIDTH, rig
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame, frames
-from me2e_compress.zoo.synthetic_world import FRAME_S, Pose
+from me2e_compress.zoo.synthetic_world import FRAME_S, EgoPose
 
 
 def test_frames_are_the_inputs_without_the_state(scenes: list[Frame]) -> None:
@@ -79,7 +79,7 @@ def test_front_camera_looks_ahead_and_left_is_left() -> None:
 
 
 def test_pose_round_trip() -> None:
-    pose = Pose(3.0, -2.0, 0.7)
+    pose = EgoPose(3.0, -2.0, 0.7)
     right, ahead = np.array([1.5], np.float32), np.array([8], np.float32)
     back = pose.to_lidar(*pose.to_world(right, ahead))
     assert back[0] == pytest.approx(right, abs=1e-5)

@@ -8,13 +8,13 @@ one speed on the route's centre, commits an infraction on it at every one of
 from dataclasses import dataclass
 
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
-from me2e_compress.evaluators.highway.dry_run import Rehearsal, rehearse
+from me2e_compress.evaluators.highway.dry_run import DryRun, dry_run
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.simulator.routes import Route
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Admission:
     """What the gate says of one route.
 
     Attributes:
@@ -24,8 +24,8 @@ class Verdict:
     """
 
     route: Route
-    expert: Rehearsal | None
-    blind: tuple[Rehearsal, ...]
+    expert: DryRun | None
+    blind: tuple[DryRun, ...]
 
     @property
     def refusal(self) -> str | None:
@@ -54,11 +54,11 @@ class Verdict:
         return self.refusal is None
 
 
-def examine(route: Route) -> Verdict:
+def examine(route: Route) -> Admission:
     """Put one route through the gate; the cheap blind drives come first."""
-    drives = list[Rehearsal]()
+    drives = list[DryRun]()
     for speed in SPEEDS_MPS:
-        drives.append(rehearse(route, Blind(speed)))
+        drives.append(dry_run(route, Blind(speed)))
         if not drives[-1].infractions:
-            return Verdict(route, None, tuple(drives))
-    return Verdict(route, rehearse(route, Expert()), tuple(drives))
+            return Admission(route, None, tuple(drives))
+    return Admission(route, dry_run(route, Expert()), tuple(drives))

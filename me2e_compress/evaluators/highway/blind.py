@@ -7,15 +7,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from me2e_compress.driving.contract import PLAN_SHAPE, PLAN_STEP_US, Observation, Plan
-from me2e_compress.errors import EvaluationError
+from me2e_compress.driving.contract import (
+    PLAN_SHAPE,
+    PLAN_STEP_US,
+    Observation,
+    Plan,
+    RouteInfo,
+)
+from me2e_compress.evaluators.highway.observe import scene_and_world
 from me2e_compress.evaluators.highway.reference import (
     beyond,
     in_ego_frame,
     reentry,
     slope_of,
 )
-from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Ego, RoutePath
 
 SPEEDS_MPS = (4.0, 8.0, 12.0)
@@ -40,17 +45,14 @@ class Blind:
     privileged: bool = field(default=True, init=False)
     _at_m: float | None = field(default=None, init=False, repr=False)
 
-    def reset(self, route: Route) -> None:
+    def reset(self, route: RouteInfo) -> None:
         """Forget where it was."""
         self._at_m = None
 
     def plan(self, observation: Observation) -> Plan:
         """Return waypoints [6, 2] of the route ahead; see `centre_plan`."""
-        if observation.scene is None or observation.world is None:
-            raise EvaluationError(
-                "driver blind: the observation has no world, and the route is there"
-            )
-        ego, path = observation.scene.ego, observation.world.path
+        scene, world = scene_and_world(observation, "driver blind")
+        ego, path = scene.ego, world.path
         self._at_m, _ = path.project(ego.x, ego.y, self._at_m)
         return centre_plan(ego, path, self._at_m, self.speed_mps)
 

@@ -18,7 +18,7 @@ ENDS_ONLY = (
 
 
 @dataclass(frozen=True, slots=True)
-class Rehearsal:
+class DryRun:
     """How one drive of one route went.
 
     Attributes:
@@ -43,13 +43,13 @@ class Rehearsal:
         return self.ending is Ending.COMPLETED and not self.infractions
 
 
-def rehearse(route: Route, policy: Policy) -> Rehearsal:
+def dry_run(route: Route, policy: Policy) -> DryRun:
     """Drive a route with a privileged policy that decides at every frame."""
     seen = _Witness()
     episode = drive(route, policy, Conditions(), Listeners(asking=seen.watch))
     kinds = [event.kind for event in seen.events]
     faults = [found.kind for found in episode.infractions]
-    return Rehearsal(
+    return DryRun(
         tuple(dict.fromkeys(kind for kind in faults if kind not in ENDS_ONLY)),
         episode.ending,
         EventKind.TRIGGER in kinds,

@@ -16,7 +16,7 @@ from me2e_compress.simulator.routes import Route
 
 
 @dataclass(frozen=True)
-class Progress:
+class DrivingProgress:
     """How far an evaluation is.
 
     Attributes:
@@ -56,7 +56,7 @@ class HighwayEvaluator:
     folder: Path
     set_size: int
     engine: Engine = field(default_factory=LocalEngine)
-    on_progress: Callable[[Progress], None] = lambda progress: None
+    on_progress: Callable[[DrivingProgress], None] = lambda progress: None
     on_warning: Callable[[str], None] = lambda line: None
 
     def episodes(self) -> Iterator[Episode]:
@@ -94,11 +94,11 @@ class HighwayEvaluator:
         return LocalEngine(1)
 
 
-def progress_of(episodes: Sequence[Episode], total: int) -> Progress:
+def progress_of(episodes: Sequence[Episode], total: int) -> DrivingProgress:
     """Sum up the episodes that there are."""
     if not episodes:
-        return Progress(0, total, None, None)
-    return Progress(
+        return DrivingProgress(0, total, None, None)
+    return DrivingProgress(
         len(episodes),
         total,
         sum(route_score(one).composed for one in episodes) / len(episodes),

@@ -7,13 +7,14 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation, Policy
+from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CameraRig, Cameras
 from me2e_compress.simulator.scene import Ego, Scene
 from me2e_compress.simulator.world import World
 
 
 @dataclass
-class Observer:
+class ObservationBuilder:
     """Makes the observations of one route.
 
     Args:
@@ -47,6 +48,24 @@ class Observer:
             scene if self.policy.privileged else None,
             self.world if self.policy.privileged else None,
         )
+
+
+def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
+    """Return what a privileged policy is shown of this simulator.
+
+    Args:
+        observation: What it decides on.
+        who: Its name, for the message.
+
+    Raises:
+        EvaluationError: It is shown none, or those of another simulator.
+    """
+    scene, world = observation.scene, observation.world
+    if isinstance(scene, Scene) and isinstance(world, World):
+        return scene, world
+    raise EvaluationError(
+        f"{who}: the observation has no highway-env world, and it is privileged"
+    )
 
 
 def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:

@@ -6,7 +6,13 @@ from typing import Self
 
 import numpy as np
 
-from me2e_compress.driving.contract import CAN_BUS_SIZE, PLAN_SHAPE, Observation, Plan
+from me2e_compress.driving.contract import (
+    CAN_BUS_SIZE,
+    PLAN_SHAPE,
+    Observation,
+    Plan,
+    RouteInfo,
+)
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.adapter import Adapter, ImageNormalization
 from me2e_compress.evaluators.highway.ports import (
@@ -22,7 +28,6 @@ from me2e_compress.evaluators.highway.ports import (
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
-from me2e_compress.simulator.routes import Route
 
 MICROSECONDS = 1_000_000
 """In a second."""
@@ -96,7 +101,7 @@ class OnnxPolicy:
         """Whether the model has an image input."""
         return self.normalization is not None
 
-    def reset(self, route: Route | None) -> None:
+    def reset(self, route: RouteInfo | None) -> None:
         """Begin a route: recurrent inputs are zeros again."""
         self._state = {
             name: zeros(name, self.session.inputs[name]) for name in self.recurrent

@@ -7,7 +7,7 @@ import numpy as np
 from me2e_compress.driving.contract import CAN_BUS_SIZE
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.session import DTYPES, Port
+from me2e_compress.runtime.session import DTYPES, SessionPort
 
 Shape = tuple[int | str | None, ...]
 
@@ -26,8 +26,8 @@ DEFAULT_IMAGE_SIZE = (96, 160)
 
 
 def check_inputs(
-    inputs: Mapping[str, Port],
-    outputs: Mapping[str, Port],
+    inputs: Mapping[str, SessionPort],
+    outputs: Mapping[str, SessionPort],
     names: Mapping[str, str],
     recurrent: Mapping[str, str],
 ) -> None:
@@ -63,14 +63,14 @@ def check_inputs(
         _check_shape(name, port.shape, CONTRACT[contract[name]])
 
 
-def image_size(port: Port) -> tuple[int, int]:
+def image_size(port: SessionPort) -> tuple[int, int]:
     """Return rows and columns of an image input that was checked."""
     found = port.shape[-2:]
     rows, columns = (side if isinstance(side, int) else None for side in found)
     return rows or DEFAULT_IMAGE_SIZE[0], columns or DEFAULT_IMAGE_SIZE[1]
 
 
-def zeros(name: str, port: Port) -> Array:
+def zeros(name: str, port: SessionPort) -> Array:
     """Return the first value of a recurrent input.
 
     Raises:
@@ -85,7 +85,7 @@ def zeros(name: str, port: Port) -> Array:
     return np.zeros(shape, DTYPES[port.type])
 
 
-def fed(array: Array, port: Port) -> Array:
+def fed(array: Array, port: SessionPort) -> Array:
     """Give an array the number of dimensions and the type that a port takes."""
     missing = len(port.shape) - array.ndim
     sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]
@@ -100,7 +100,7 @@ def fits(found: Shape, wanted: Shape) -> bool:
     )
 
 
-def _exists(name: str, ports: Mapping[str, Port], kind: str) -> None:
+def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
     if name not in ports:
         raise EvaluationError(
             f"the adapter names {kind} {name}; there are {', '.join(ports)}"

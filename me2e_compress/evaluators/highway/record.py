@@ -4,7 +4,13 @@ import math
 from dataclasses import dataclass, field
 from statistics import fmean
 
-from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode, Frame
+from me2e_compress.metrics.episode import (
+    FRAME_US,
+    EgoFrame,
+    Ending,
+    Episode,
+    InferenceRecord,
+)
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import (
@@ -46,8 +52,8 @@ class Recorder:
     """Writes down one route: a frame every 50 ms, whatever the world's own step."""
 
     world: World
-    frames: list[Frame] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)
+    frames: list[EgoFrame] = field(default_factory=list)
+    decisions: list[InferenceRecord] = field(default_factory=list)
 
     def see(self, scene: Scene) -> None:
         """Write down an instant if its time has come."""
@@ -112,7 +118,7 @@ def junction_m(path: RoutePath) -> float | None:
     return None
 
 
-def _frame(scene: Scene, route_m: float) -> Frame:
+def _frame(scene: Scene, route_m: float) -> EgoFrame:
     ego = scene.ego
     near = [
         actor.speed_mps
@@ -120,7 +126,7 @@ def _frame(scene: Scene, route_m: float) -> Frame:
         if actor.kind in VEHICLES
         and math.hypot(actor.x - ego.x, actor.y - ego.y) <= NEAR_M
     ]
-    return Frame(
+    return EgoFrame(
         time_us=scene.time_us,
         x=ego.x,
         y=ego.y,

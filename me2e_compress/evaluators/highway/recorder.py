@@ -12,7 +12,7 @@ from me2e_compress.evaluators.highway.durations import EXPERT_S
 from me2e_compress.evaluators.highway.endings import Rules
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.generate import propose, seed_of
-from me2e_compress.evaluators.highway.observe import Observer
+from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
@@ -92,8 +92,8 @@ def _look(
     rig = CameraRig(*policy.image_size)
     texture = paint_texture(world.roadmap, world.path.points)
     cameras = Cameras(texture, rig) if policy.needs_images else None
-    driver = Observer(world, expert, rig, None)
-    passenger = Observer(world, policy, rig, cameras)
+    driver = ObservationBuilder(world, expert, rig, None)
+    passenger = ObservationBuilder(world, policy, rig, cameras)
     scene = world.scene()
     while count and rules.ending(world, scene.ego.speed_mps) is None:
         since_us = scene.time_us - begin_us

@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-from me2e_compress import __version__
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import Route
+from me2e_compress.version import __version__
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"

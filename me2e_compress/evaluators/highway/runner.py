@@ -14,9 +14,9 @@ from me2e_compress.driving.realtime import DT_US, HeldControl
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.endings import Rules
-from me2e_compress.evaluators.highway.observe import Observer
+from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.record import Recorder
-from me2e_compress.metrics.episode import FRAME_US, Decision, Ending, Episode
+from me2e_compress.metrics.episode import FRAME_US, Ending, Episode, InferenceRecord
 from me2e_compress.simulator.cameras import (
     CLEAR,
     CameraRig,
@@ -125,7 +125,7 @@ class _Drive:
             texture = paint_texture(world.roadmap, world.path.points)
             self.cameras = Cameras(texture, rig, conditions.weather)
         needed = self.cameras if policy.needs_images else None
-        self.observer = Observer(world, policy, rig, needed)
+        self.observer = ObservationBuilder(world, policy, rig, needed)
         self.plan: tuple[Ego, Plan] | None = None
 
     def run(self) -> Episode:
@@ -160,7 +160,7 @@ class _Drive:
         plan = _checked(answer)
         self.plan = scene.ego, plan
         latency_us = self.charge(took_us)
-        self.recorder.decisions.append(Decision(scene.time_us, latency_us))
+        self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
         control = self.controller.control(anchored, scene.ego, scene.time_us)
         self.held.decide(control, latency_us)

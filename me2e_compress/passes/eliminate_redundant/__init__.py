@@ -13,7 +13,7 @@ from me2e_compress.passes.edits import bypass, graphs_of, is_read, remove_dead
 from me2e_compress.passes.eliminate_redundant import sharing
 from me2e_compress.passes.eliminate_redundant.branches import inline_branch
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
-from me2e_compress.passes.eliminate_redundant.merges import Site, merge
+from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
 
 __all__ = ["EliminateRedundant"]
 
@@ -59,7 +59,7 @@ class EliminateRedundant:
     def _round(
         self, body: ir.Graph, opsets: dict[str, int], tally: Counter[str]
     ) -> None:
-        site = Site(body, opsets, self.name)
+        site = MergeSite(body, opsets, self.name)
         tally["initializers"] += sharing.share_initializers(body)
         work = dict.fromkeys(reversed(list(body)))
         while work:
@@ -70,7 +70,9 @@ class EliminateRedundant:
             body, self.name, across_modules=self.across_modules
         )
 
-    def _visit(self, node: ir.Node, site: Site, tally: Counter[str]) -> list[ir.Node]:
+    def _visit(
+        self, node: ir.Node, site: MergeSite, tally: Counter[str]
+    ) -> list[ir.Node]:
         """Try the rules on one node; give the nodes to look at again."""
         if not any(is_read(value) for value in node.outputs):
             makers = list(node.predecessors())

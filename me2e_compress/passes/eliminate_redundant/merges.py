@@ -56,7 +56,7 @@ WIDENS: dict[ir.DataType, str] = {
 
 
 @dataclasses.dataclass
-class Site:
+class MergeSite:
     """Where rules work: a graph, and constants made for it so far."""
 
     graph: ir.Graph
@@ -83,10 +83,10 @@ class Site:
         return value
 
 
-Rule = Callable[[ir.Node, Site], ir.Node | None]
+Rule = Callable[[ir.Node, MergeSite], ir.Node | None]
 
 
-def merge(node: ir.Node, site: Site) -> ir.Node | None:
+def merge(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """Merge a node with the one before it, if one node can do both."""
     if not is_standard(node):
         return None
@@ -115,7 +115,7 @@ def _is_view(node: ir.Node) -> bool:
     return node.op_type in VIEWS
 
 
-def _views(node: ir.Node, site: Site) -> ir.Node | None:
+def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """Reshape, Flatten, Squeeze and Unsqueeze in a row are one Reshape, or nothing."""
     inner, sizes = _before(node), static_shape(node.outputs[0])
     if inner is None or sizes is None or 0 in sizes or site.opset < 5:
@@ -133,7 +133,7 @@ def _views(node: ir.Node, site: Site) -> ir.Node | None:
     return put(node, "Reshape", [source, shape], by=site.by, sources=[inner])
 
 
-def _transposes(node: ir.Node, site: Site) -> ir.Node | None:
+def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
     inner = _before(node)
     if inner is None or inner.op_type != "Transpose":
         return None
@@ -166,7 +166,7 @@ def _perm(node: ir.Node) -> list[int] | None:
     return None if shape is None else list(range(len(shape)))[::-1]
 
 
-def _casts(node: ir.Node, site: Site) -> ir.Node | None:
+def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
     inner = _before(node)
     if inner is None or inner.op_type != "Cast" or inner.inputs[0] is None:
         return None
@@ -188,7 +188,7 @@ def _casts(node: ir.Node, site: Site) -> ir.Node | None:
     )
 
 
-def _slices(node: ir.Node, site: Site) -> ir.Node | None:
+def _slices(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """Slices of different axes are one Slice."""
     inner = _before(node)
     if inner is None or inner.op_type != "Slice" or site.opset < 10:
@@ -227,7 +227,7 @@ def _window(node: ir.Node) -> list[list[int]] | None:
     return [starts, ends, [axis % rank for axis in axes], steps]
 
 
-def _concats(node: ir.Node, site: Site) -> ir.Node | None:
+def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
     axis = node.attributes.get_int("axis", 0)
     inputs: list[ir.Value | None] = []
     inner_nodes: list[ir.Node] = []
@@ -255,7 +255,7 @@ def _concats(node: ir.Node, site: Site) -> ir.Node | None:
     )
 
 
-def _drop_expand(node: ir.Node, site: Site) -> ir.Node | None:
+def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """An Expand (or a Tile that only repeats) before what broadcasts anyway."""
     target = static_shape(node.outputs[0])
     if target is None or site.opset < 8:

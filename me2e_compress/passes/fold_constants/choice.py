@@ -21,7 +21,7 @@ ENTRY_BYTES = 64
 
 
 @dataclasses.dataclass
-class Choice:
+class FoldChoice:
     """What to fold.
 
     Attributes:
@@ -37,7 +37,7 @@ class Choice:
     growth_bytes: int
 
 
-def choose(known: Knowledge, bytes_per_node: int) -> Choice:
+def choose(known: Knowledge, bytes_per_node: int) -> FoldChoice:
     """Decide for every constant value whether it is stored or computed."""
     market = _Market(known, bytes_per_node)
     choice, losing = market.clear(strict=set(), frozen=set())
@@ -59,7 +59,7 @@ class _Market:
         self.readers = self._readers()
         self.lot = self._lots()
 
-    def clear(self, strict: set[int], frozen: set[int]) -> tuple[Choice, set[int]]:
+    def clear(self, strict: set[int], frozen: set[int]) -> tuple[FoldChoice, set[int]]:
         """Choose; name the lots that grow the file beyond what their nodes are worth.
 
         Args:
@@ -89,7 +89,7 @@ class _Market:
         count = sum(len(one.nodes) for one in self.known.expressions)
         removed = sum(len(one.nodes) for one in gone)
         growth = sum(grown for grown, _ in accounts.values())
-        return Choice(values, gone, count - removed, int(growth)), losing - frozen
+        return FoldChoice(values, gone, count - removed, int(growth)), losing - frozen
 
     def _bytes(self, value: ir.Value) -> float:
         if isinstance(value.type, ir.SequenceType | ir.OptionalType):

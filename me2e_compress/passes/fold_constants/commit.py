@@ -7,11 +7,11 @@ import onnx_ir as ir
 
 from me2e_compress.graph import add_constant, provenance, replace_value, value_names
 from me2e_compress.passes.edits import Array, put
-from me2e_compress.passes.fold_constants.choice import Choice
+from me2e_compress.passes.fold_constants.choice import FoldChoice
 
 
 def commit(
-    graph: ir.Graph, choice: Choice, arrays: dict[ir.Value, Array], name: str
+    graph: ir.Graph, choice: FoldChoice, arrays: dict[ir.Value, Array], name: str
 ) -> list[ir.Value]:
     """Put initializers in the place of the chosen values and drop their makers.
 

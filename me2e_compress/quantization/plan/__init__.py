@@ -17,7 +17,7 @@ from me2e_compress.quantization.plan.groups import (
 from me2e_compress.quantization.plan.make import channel_axis, make_plan, tensors_of
 from me2e_compress.quantization.plan.overrides import Overrides
 from me2e_compress.quantization.plan.plan_files import (
-    Difference,
+    PlanDifference,
     differences,
     load_plan,
     plan_of,
@@ -30,9 +30,9 @@ __all__ = [
     "INT8",
     "RESIDUAL",
     "Decision",
-    "Difference",
     "KeptFloat",
     "Overrides",
+    "PlanDifference",
     "QuantPlan",
     "ScaleGroup",
     "SharingCost",

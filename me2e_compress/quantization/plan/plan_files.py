@@ -53,7 +53,7 @@ def plan_of(model: ir.Model) -> QuantPlan | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class PlanDifference:
     """One node that two plans decide differently.
 
     Attributes:
@@ -71,14 +71,14 @@ class Difference:
         return f"{name}: {_short(self.old)} -> {_short(self.new)}"
 
 
-def differences(old: QuantPlan, new: QuantPlan) -> Iterator[Difference]:
+def differences(old: QuantPlan, new: QuantPlan) -> Iterator[PlanDifference]:
     """Compare two plans node by node: dtype and rule, in the order of the second."""
     before = {each.output: each for each in old.decisions}
     after = {each.output: each for each in new.decisions}
     for output in (*after, *(name for name in before if name not in after)):
         left, right = before.get(output), after.get(output)
         if left is None or right is None or _key(left) != _key(right):
-            yield Difference(left, right)
+            yield PlanDifference(left, right)
 
 
 def _key(decision: Decision) -> tuple[str, str]:

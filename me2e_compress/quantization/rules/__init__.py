@@ -19,7 +19,11 @@ from me2e_compress.quantization.rules.kernel_limits import (
     SmallProduct,
 )
 from me2e_compress.quantization.rules.positions import Coordinates
-from me2e_compress.quantization.rules.scope import ModuleScope, Operator, Weight
+from me2e_compress.quantization.rules.scope import (
+    ModuleScope,
+    WeightedOperator,
+    WeightOperand,
+)
 from me2e_compress.quantization.rules.stages import AttentionLength, MatrixVector
 
 __all__ = [
@@ -32,11 +36,11 @@ __all__ = [
     "MatrixVector",
     "ModuleScope",
     "NarrowConvolution",
-    "Operator",
     "Rule",
     "RuleSet",
     "SmallProduct",
-    "Weight",
+    "WeightOperand",
+    "WeightedOperator",
     "paper_rules",
     "rules_named",
     "tensorrt_rules",
@@ -103,9 +107,9 @@ def rules_named(name: str, attention_limit: int = 512) -> RuleSet:
 
 def _paper(attention_limit: int) -> tuple[Rule, ...]:
     return (
-        Operator(),
+        WeightedOperator(),
         ModuleScope(),
-        Weight(),
+        WeightOperand(),
         AttentionLength(attention_limit),
         MatrixVector(),
     )

@@ -11,7 +11,7 @@ from me2e_compress.quantization.rules.base import WEIGHTED, Facts
 
 
 @dataclasses.dataclass(frozen=True)
-class Operator:
+class WeightedOperator:
     """Only convolutions and matrix products are int8."""
 
     id: ClassVar[str] = "operator"
@@ -48,7 +48,7 @@ class ModuleScope:
 
 
 @dataclasses.dataclass(frozen=True)
-class Weight:
+class WeightOperand:
     """The right operand is a float32 weight, or the product is an attention's."""
 
     id: ClassVar[str] = "weight"

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import ACCENT, BASELINE, MUTED, styled, svg
 
@@ -17,7 +17,7 @@ ENOUGH = 3
 Score = Callable[[Scores], Estimate]
 
 
-def curves(outcome: Outcome) -> str | None:
+def curves(outcome: StudyResult) -> str | None:
     """Draw driving score and success rate over the conditions, in their order.
 
     Returns:
@@ -43,7 +43,7 @@ def curves(outcome: Outcome) -> str | None:
         return svg(figure)
 
 
-def _found(outcome: Outcome, scheme: str, pick: Score) -> Sequence[Estimate | None]:
+def _found(outcome: StudyResult, scheme: str, pick: Score) -> Sequence[Estimate | None]:
     """Give one estimate a condition; None where the scheme was not driven."""
     return [
         None if drive.scores is None else pick(drive.scores)
@@ -53,7 +53,7 @@ def _found(outcome: Outcome, scheme: str, pick: Score) -> Sequence[Estimate | No
 
 
 def _curve(
-    axes: Axes, name: str, found: Sequence[Estimate | None], outcome: Outcome
+    axes: Axes, name: str, found: Sequence[Estimate | None], outcome: StudyResult
 ) -> None:
     colour = BASELINE if name == outcome.study.baseline else ACCENT
     driven = [

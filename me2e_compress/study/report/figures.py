@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.study.definition import Condition
-from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.findings import sure
 from me2e_compress.study.report.labels import place
 from me2e_compress.study.report.style import (
@@ -59,7 +59,7 @@ def front(points: Sequence[Point]) -> list[Point]:
     return kept
 
 
-def pareto(outcome: Outcome, condition: Condition) -> str | None:
+def pareto(outcome: StudyResult, condition: Condition) -> str | None:
     """Draw driving score against latency and against size; None below two points."""
     latency = _points(outcome, condition, "latency")
     size = _points(outcome, condition, "size")
@@ -86,7 +86,7 @@ def pareto(outcome: Outcome, condition: Condition) -> str | None:
         return svg(figure)
 
 
-def forest(outcome: Outcome) -> str | None:
+def forest(outcome: StudyResult) -> str | None:
     """Draw every difference to the baseline with its interval; None without one."""
     rows = [each for each in outcome.drives if each.difference is not None]
     if not rows:
@@ -108,7 +108,7 @@ def forest(outcome: Outcome) -> str | None:
         return svg(figure)
 
 
-def _points(outcome: Outcome, condition: Condition, kind: str) -> list[Point]:
+def _points(outcome: StudyResult, condition: Condition, kind: str) -> list[Point]:
     found = list[Point]()
     for drive in outcome.under(condition):
         scheme = outcome.scheme(drive.scheme)

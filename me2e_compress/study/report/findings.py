@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study.cells import number
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.outcome import Outcome, SchemeOutcome
+from me2e_compress.study.outcome import SchemeOutcome, StudyResult
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 
 
 @dataclass(frozen=True)
-class Finding:
+class Takeaway:
     """What a reader should take away about a scheme.
 
     Attributes:
@@ -23,17 +23,19 @@ class Finding:
     text: str
 
 
-def findings(outcome: Outcome) -> tuple[Finding, ...]:
+def findings(outcome: StudyResult) -> tuple[Takeaway, ...]:
     """Say of every scheme what it costs and how it drives, against the baseline."""
     baseline = outcome.scheme(outcome.study.baseline)
     return tuple(
-        Finding(scheme.name, _sentence(outcome, baseline, scheme))
+        Takeaway(scheme.name, _sentence(outcome, baseline, scheme))
         for scheme in outcome.schemes
         if scheme is not baseline
     )
 
 
-def _sentence(outcome: Outcome, baseline: SchemeOutcome, scheme: SchemeOutcome) -> str:
+def _sentence(
+    outcome: StudyResult, baseline: SchemeOutcome, scheme: SchemeOutcome
+) -> str:
     costs = [
         _times(scheme.size_mb, baseline.size_mb, "the size"),
         _times(scheme.latency_ms[50], baseline.latency_ms[50], "the median latency"),

@@ -9,7 +9,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.study.outcome import Outcome
+from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import forest, pareto
 from me2e_compress.study.report.findings import findings
@@ -50,7 +50,7 @@ class Shown:
     after: tuple[str, str]
 
 
-def html(outcome: Outcome, command: Sequence[str] = ()) -> str:
+def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
     """Give the whole page; it refers to nothing outside itself.
 
     Args:
@@ -86,7 +86,7 @@ def html(outcome: Outcome, command: Sequence[str] = ()) -> str:
     )
 
 
-def _lede(outcome: Outcome) -> str:
+def _lede(outcome: StudyResult) -> str:
     study = outcome.study
     driven = len(study.routes)
     share = f"{driven}" if driven == study.set_size else f"{driven} of {study.set_size}"
@@ -119,7 +119,7 @@ def _fate(route: RouteOutcome) -> str:
     return f"driving score {route.driving_score:.1f}, {words}"
 
 
-def _recipe(name: str, outcome: Outcome) -> tuple[str, str, str]:
+def _recipe(name: str, outcome: StudyResult) -> tuple[str, str, str]:
     """Give name, what it was made of, and the first digits of its digest."""
     contender = outcome.scheme(name).contender
     made_of = contender.source or contender.scheme.policy
@@ -128,7 +128,7 @@ def _recipe(name: str, outcome: Outcome) -> tuple[str, str, str]:
     return name, made_of, (contender.sha256 or "")[:12]
 
 
-def _made(outcome: Outcome, command: Sequence[str]) -> list[tuple[str, str]]:
+def _made(outcome: StudyResult, command: Sequence[str]) -> list[tuple[str, str]]:
     study, timing = outcome.study, outcome.study.timing
     versions = ", ".join(f"{name} {text}" for name, text in outcome.versions.items())
     rows = [("Command", " ".join(command)), ("Machine", outcome.machine)]

@@ -7,7 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import Decision, QuantPlan
-from me2e_compress.targets.weights import Weight, weights_of
+from me2e_compress.targets.weights import QuantizedWeight, weights_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Draft:
     """
 
     model: ir.Model
-    weights: Mapping[str, Weight]
+    weights: Mapping[str, QuantizedWeight]
     reach: Mapping[str, float]
 
 

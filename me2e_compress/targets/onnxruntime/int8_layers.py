@@ -8,7 +8,7 @@ from me2e_compress import graph
 from me2e_compress.targets.onnxruntime.gemm import write_gemm
 from me2e_compress.targets.onnxruntime.kernels import bias_of, biased_end
 from me2e_compress.targets.onnxruntime.writer import Writer
-from me2e_compress.targets.weights import Weight
+from me2e_compress.targets.weights import QuantizedWeight
 
 BIAS_MAX = 2**30
 """Largest int32 bias: half the accumulator stays for the products, which need at most
@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float32]
 
 
 def write_layer(
-    writer: Writer, node: ir.Node, weight: Weight, step: np.float32
+    writer: Writer, node: ir.Node, weight: QuantizedWeight, step: np.float32
 ) -> None:
     """Let a layer read its int8 weight, and an int32 bias.
 
@@ -51,8 +51,8 @@ def write_layer(
 
 
 def with_bias(
-    weight: Weight, bias: Floats, step: np.float32
-) -> tuple[Weight, npt.NDArray[np.int32]]:
+    weight: QuantizedWeight, bias: Floats, step: np.float32
+) -> tuple[QuantizedWeight, npt.NDArray[np.int32]]:
     """Round a bias to int32 in units of ``step * weight.scales``.
 
     Where a channel's weights are so small that its bias does not fit, the channel gets
@@ -66,7 +66,7 @@ def with_bias(
             shape[weight.axis] = -1
         ratio = (weight.scales / scales).reshape(shape)
         coarse = np.rint(weight.integers * ratio).astype(np.int8)
-        weight = Weight(f"{weight.name}_coarse", coarse, scales, weight.axis)
+        weight = QuantizedWeight(f"{weight.name}_coarse", coarse, scales, weight.axis)
     integers = np.rint(bias / (weight.scales.astype(np.float64) * step))
     return weight, integers.astype(np.int32)
 
@@ -89,7 +89,7 @@ def _other(addition: ir.Node, known: ir.Value) -> ir.Value | None:
     return right if left is known else left
 
 
-def _store(writer: Writer, node: ir.Node, index: int, weight: Weight) -> None:
+def _store(writer: Writer, node: ir.Node, index: int, weight: QuantizedWeight) -> None:
     fresh = writer.dequantized(
         weight.name, weight.integers, weight.scales, weight.axis, node
     )

@@ -8,7 +8,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
 from me2e_compress.targets.onnxruntime.kernels import channel_axis
-from me2e_compress.targets.weights import Weight
+from me2e_compress.targets.weights import QuantizedWeight
 
 QUANTIZE, DEQUANTIZE = "QuantizeLinear", "DequantizeLinear"
 Floats = npt.NDArray[np.float32]
@@ -41,7 +41,7 @@ def step_of(node: ir.Node) -> Floats:
     return scale.astype(np.float32)
 
 
-def weight_of(layer: ir.Node) -> Weight | None:
+def weight_of(layer: ir.Node) -> QuantizedWeight | None:
     """Read the weight of a layer; None if it is not quantized for its kernel.
 
     A MatMul by [1, ..., K, N] reads [K, N]. onnxruntime's own quantizer, and so
@@ -76,7 +76,7 @@ def weight_of(layer: ir.Node) -> Weight | None:
     scales = np.broadcast_to(step.reshape(-1), (integers.shape[axis],))
     source = node.inputs[0]
     name = str(layer.outputs[0].name if source is None else source.name)
-    return Weight(name, integers, np.ascontiguousarray(scales), axis)
+    return QuantizedWeight(name, integers, np.ascontiguousarray(scales), axis)
 
 
 def bias_of(layer: ir.Node) -> Floats | None:

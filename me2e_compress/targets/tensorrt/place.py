@@ -24,7 +24,7 @@ from me2e_compress.quantization.plan import (
     share_scales,
     tensors_of,
 )
-from me2e_compress.targets.weights import Weight, weights_of
+from me2e_compress.targets.weights import QuantizedWeight, weights_of
 
 MIN_OPSET = 13
 """The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
@@ -85,7 +85,9 @@ class _Writer:
         self._zero: ir.Value | None = None
         self._names = graph.value_names(where)
 
-    def apply(self, node: ir.Node, decision: Decision, weight: Weight | None) -> None:
+    def apply(
+        self, node: ir.Node, decision: Decision, weight: QuantizedWeight | None
+    ) -> None:
         """Let one node read int8."""
         for index in decision.activations:
             value = node.inputs[index]
@@ -117,7 +119,9 @@ class _Writer:
             self._activations[name] = dequantize.outputs[0]
         return self._activations[name]
 
-    def _weight(self, weight: Weight, like: ir.Value, reader: ir.Node) -> ir.Value:
+    def _weight(
+        self, weight: QuantizedWeight, like: ir.Value, reader: ir.Node
+    ) -> ir.Value:
         key = weight.name, weight.axis
         if key not in self._weights:
             name, scales = weight.name, weight.scales

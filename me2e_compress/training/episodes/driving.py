@@ -25,7 +25,7 @@ from me2e_compress.training.episodes.collection import (
     tasks_of,
 )
 from me2e_compress.training.episodes.episode_arrays import Arrays, arrays_of
-from me2e_compress.training.episodes.recording_policy import Recording
+from me2e_compress.training.episodes.recording_policy import RecordingPolicy
 
 SUFFIX, SKIPPED = ".npz", ".skipped"
 SHORTEST_US = 2_000_000
@@ -33,7 +33,7 @@ SHORTEST_US = 2_000_000
 
 
 @dataclass(frozen=True)
-class Progress:
+class CollectionProgress:
     """How far a collection is.
 
     Attributes:
@@ -50,7 +50,7 @@ def collect(
     what: Collection,
     student: Path | None,
     workers: int,
-    on_progress: Callable[[Progress], None],
+    on_progress: Callable[[CollectionProgress], None],
 ) -> None:
     """Drive what is missing of a collection, one file a route.
 
@@ -76,10 +76,10 @@ def collect(
     claim(folder, what)
     missing = [task for task in tasks if not _is_done(folder, task)]
     done = len(tasks) - len(missing)
-    on_progress(Progress(done, len(tasks)))
+    on_progress(CollectionProgress(done, len(tasks)))
     for _ in _driven(folder, what, student, missing, workers):
         done += 1
-        on_progress(Progress(done, len(tasks)))
+        on_progress(CollectionProgress(done, len(tasks)))
 
 
 def _check_student(what: Collection, student: Path | None) -> None:
@@ -166,7 +166,7 @@ def episode_of(
     Raises:
         EvaluationError: The student failed.
     """
-    recording = Recording(what.seed, what.noise, what.expert_share, student)
+    recording = RecordingPolicy(what.seed, what.noise, what.expert_share, student)
     route = task.route()
     episode = drive(route, recording, Conditions(image_size=what.image_size))
     if episode.ending is Ending.POLICY_FAILED or recording.world is None:

@@ -26,7 +26,7 @@ from me2e_compress.training.episodes.agents import (
     agents,
 )
 from me2e_compress.training.episodes.jpeg import pictures
-from me2e_compress.training.episodes.recording_policy import Frame
+from me2e_compress.training.episodes.recording_policy import LabelledFrame
 from me2e_compress.training.episodes.signs import signals
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -41,7 +41,7 @@ PATH_M: Floats = np.arange(0.0, 50.0, 2.0)
 def arrays_of(
     world: World,
     top: Floats,
-    frames: Sequence[Frame],
+    frames: Sequence[LabelledFrame],
     every: int,
     image_size: tuple[int, int],
 ) -> Arrays:
@@ -78,7 +78,7 @@ def arrays_of(
     }
 
 
-def _state(frame: Frame) -> Arrays:
+def _state(frame: LabelledFrame) -> Arrays:
     """Ego and label."""
     ego = frame.scene.ego
     return {
@@ -91,7 +91,7 @@ def _state(frame: Frame) -> Arrays:
     }
 
 
-def _route(frame: Frame, path: RoutePath, top: Floats) -> Arrays:
+def _route(frame: LabelledFrame, path: RoutePath, top: Floats) -> Arrays:
     """The route ahead, what the expert would do alone on it, and its signals."""
     scene, ego = frame.scene, frame.scene.ego
     s, lateral = path.project(ego.x, ego.y, frame.memory.at_m)
@@ -114,7 +114,7 @@ def _route(frame: Frame, path: RoutePath, top: Floats) -> Arrays:
     }
 
 
-def _rests(frames: Sequence[Frame]) -> Iterator[float]:
+def _rests(frames: Sequence[LabelledFrame]) -> Iterator[float]:
     """Seconds since the ego last stood, at every frame."""
     stood_us: int | None = None
     for frame in frames:

@@ -5,11 +5,15 @@ from zlib import crc32
 
 import numpy as np
 
-from me2e_compress.driving.contract import Observation, Plan, Policy
-from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.expert import Decision, Memory, ceiling, decide
+from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
+from me2e_compress.evaluators.highway.expert import (
+    ExpertDecision,
+    Memory,
+    ceiling,
+    decide,
+)
+from me2e_compress.evaluators.highway.observe import scene_and_world
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.world import Phase, World
 from me2e_compress.training.episodes.perturb import Perturbation
@@ -19,7 +23,7 @@ TURN_US = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class LabelledFrame:
     """One frame of the world and the expert's label.
 
     Attributes:
@@ -34,11 +38,11 @@ class Frame:
     phases: tuple[Phase, ...]
     command: int
     memory: Memory
-    decision: Decision
+    decision: ExpertDecision
 
 
 @dataclass
-class Recording:
+class RecordingPolicy:
     """The expert decides at every frame; it or the student drives, with noise.
 
     A student is asked at every frame, also while the expert drives, so that its
@@ -60,7 +64,7 @@ class Recording:
     expert_share: float = 1.0
     student: Policy | None = None
     privileged: bool = field(default=True, init=False)
-    frames: list[Frame] = field(default_factory=list, init=False)
+    frames: list[LabelledFrame] = field(default_factory=list, init=False)
     world: World | None = field(default=None, init=False)
     top: Floats = field(init=False, repr=False)
     _noise: Perturbation = field(init=False, repr=False)
@@ -72,7 +76,7 @@ class Recording:
         """Whether the student does."""
         return self.student is not None and self.student.needs_images
 
-    def reset(self, route: Route) -> None:
+    def reset(self, route: RouteInfo) -> None:
         """Begin a route."""
         words = [self.seed, crc32(route.id.encode())]
         self._noise = Perturbation(np.random.default_rng(words), self.noise)
@@ -83,16 +87,14 @@ class Recording:
 
     def plan(self, observation: Observation) -> Plan:
         """Keep the expert's decision and return what is driven."""
-        scene, world = observation.scene, observation.world
-        if scene is None or world is None:
-            raise EvaluationError("recording: the observation has no world")
+        scene, world = scene_and_world(observation, "recording")
         if self.world is None:
             self.world, self.top = world, ceiling(world.path)
         memory = self.frames[-1].decision.memory if self.frames else Memory()
         known = world.privileged()
         decision = decide(scene, known, world.path, self.top, memory)
         self.frames.append(
-            Frame(scene, known.phases, observation.command, memory, decision)
+            LabelledFrame(scene, known.phases, observation.command, memory, decision)
         )
         plan = decision.waypoints
         if self.student is not None:

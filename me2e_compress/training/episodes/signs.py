@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from me2e_compress.evaluators.highway.reference import in_ego_frame
 from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
-from me2e_compress.training.episodes.recording_policy import Frame
+from me2e_compress.training.episodes.recording_policy import LabelledFrame
 
 SIGNALS = 4
 SIGNAL_COLUMNS = 8
@@ -24,7 +24,7 @@ STATES = {
 }
 
 
-def signals(frame: Frame, ego_s_m: float) -> npt.NDArray[np.float32]:
+def signals(frame: LabelledFrame, ego_s_m: float) -> npt.NDArray[np.float32]:
     """float32 [4, 8]: kind, state, x, y, cosine, sine, metres to the line, served.
 
     Signals on the route come first, then the nearest. Kind and state are -1 where

@@ -24,7 +24,7 @@ that times how long ago, seconds. Without the age a displacement is no velocity.
 
 
 @dataclass
-class Motion:
+class EgoMotion:
     """How the ego moved since the last frame.
 
     Attributes:
@@ -202,7 +202,7 @@ class BevEncoder(nn.Module):
         seen: Tensor = cells.transpose(1, 2).unflatten(2, shape)
         return seen
 
-    def recall(self, prev_bev: Tensor, motion: Motion) -> Tensor:
+    def recall(self, prev_bev: Tensor, motion: EgoMotion) -> Tensor:
         """The memory [B, N, C + 2] as seen from here: [B, C + 2, rows, columns]."""
         cos, sin = motion.turn.cos()[:, None], motion.turn.sin()[:, None]
         x, y = self.centres[None, :, 0], self.centres[None, :, 1]
@@ -243,12 +243,12 @@ class BevEncoder(nn.Module):
         return bev
 
 
-def motion_of(can_bus: Tensor, elapsed_s: Tensor) -> Motion:
+def motion_of(can_bus: Tensor, elapsed_s: Tensor) -> EgoMotion:
     """Read how the ego moved from a CAN bus [B, 18] of the policy contract."""
     turn = can_bus[:, 17] * (math.pi / 180)
     before = can_bus[:, 16] - turn
     cos, sin = before.cos(), before.sin()
     dx, dy = can_bus[:, 0], can_bus[:, 1]
-    return Motion(
+    return EgoMotion(
         torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1), turn, elapsed_s
     )

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from me2e_compress.zoo.highway.config import STEPS
-from me2e_compress.zoo.highway.map import RoadMap, Route
+from me2e_compress.zoo.highway.map import MapRoute, RoadMap
 from me2e_compress.zoo.highway.motion import Futures
 from me2e_compress.zoo.highway.track import Tracks
 
@@ -36,7 +36,7 @@ class EgoState:
 
 
 @dataclass
-class World:
+class PlannerInput:
     """What the planner reads: the outputs of the other modules, and nothing else.
 
     Attributes:
@@ -103,12 +103,12 @@ class Candidates:
 def gather(
     tracks: Tracks,
     road: RoadMap,
-    route: Route,
+    route: MapRoute,
     raster: Tensor,
     futures: Futures,
     modes: Tensor,
     occupancy: Tensor,
-) -> World:
+) -> PlannerInput:
     """Lay out what the planner reads.
 
     Args:
@@ -120,7 +120,7 @@ def gather(
         modes: [B, A, M] probabilities, of the motion module.
         occupancy: [B, 6, H, W] probabilities, of the occ module.
     """
-    return World(
+    return PlannerInput(
         futures.query,
         tracks.boxes,
         tracks.score,

@@ -58,7 +58,7 @@ class RoadMap:
 
 
 @dataclass
-class Route:
+class MapRoute:
     """What the command picks from the map.
 
     Attributes:
@@ -79,19 +79,19 @@ class Route:
 class Choice(nn.Module):
     """The route of the command, as a module: exported nodes have its scope."""
 
-    def forward(self, road: RoadMap, command: Tensor) -> Route:
+    def forward(self, road: RoadMap, command: Tensor) -> MapRoute:
         """Pick for int64 [B] commands."""
         return route_of(road, command)
 
 
-def route_of(road: RoadMap, command: Tensor) -> Route:
+def route_of(road: RoadMap, command: Tensor) -> MapRoute:
     """The route of each command, int64 [B]."""
 
     def picked(values: Tensor) -> Tensor:
         where = command.view(-1, *(1 for _ in values.shape[1:]))
         return values.gather(1, where.expand(-1, 1, *values.shape[2:])).squeeze(1)
 
-    return Route(
+    return MapRoute(
         picked(road.lateral),
         picked(road.paths),
         picked(road.headings),

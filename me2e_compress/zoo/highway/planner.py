@@ -27,7 +27,7 @@ from me2e_compress.zoo.highway.interfaces import (
     SPEED_SCALE_MPS,
     Candidates,
     EgoState,
-    World,
+    PlannerInput,
 )
 from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
 from me2e_compress.zoo.highway.map import GAP_SCALE_M
@@ -87,7 +87,7 @@ class Planner(nn.Module):
         self.penalty = mlp(EGO_FEATURES, 16, 4)
         nn.init.constant_(self.penalty.get_parameter("2.bias"), CAUTION)
 
-    def forward(self, world: World, ego: EgoState, command: Tensor) -> Tensor:
+    def forward(self, world: PlannerInput, ego: EgoState, command: Tensor) -> Tensor:
         """Decide: the best plan [B, 6, 2].
 
         Args:
@@ -97,7 +97,7 @@ class Planner(nn.Module):
         """
         return self.consider(world, ego.features(), command).best()
 
-    def consider(self, world: World, ego: Tensor, command: Tensor) -> Candidates:
+    def consider(self, world: PlannerInput, ego: Tensor, command: Tensor) -> Candidates:
         """Make the candidates and score them.
 
         Args:
@@ -125,7 +125,7 @@ class Planner(nn.Module):
         aside = self.anchors[..., 1].expand_as(arc)
         return torch.stack([arc, aside], -1)
 
-    def _query(self, world: World, ego: Tensor, command: Tensor) -> Tensor:
+    def _query(self, world: PlannerInput, ego: Tensor, command: Tensor) -> Tensor:
         """[B, K, C]: each anchor looks at agents, route, signals and occupancy."""
         pick = command[:, None] == torch.arange(COMMANDS, device=command.device)
         aside = torch.stack([world.lateral, *(world.headings[:, i] for i in BENDS)], -1)
@@ -142,7 +142,12 @@ class Planner(nn.Module):
         return answer
 
     def _costs(
-        self, world: World, plans: Tensor, headings: Tensor, arc: Tensor, offset: Tensor
+        self,
+        world: PlannerInput,
+        plans: Tensor,
+        headings: Tensor,
+        arc: Tensor,
+        offset: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Everything [B, K, F], and what is plain harm [B, K, 4]."""
         overlap, near = agent_costs(
@@ -176,7 +181,7 @@ class Planner(nn.Module):
         )
         return torch.cat(costs, -1), harm
 
-    def _lines(self, world: World, arc: Tensor) -> Tensor:
+    def _lines(self, world: PlannerInput, arc: Tensor) -> Tensor:
         """[B, K, 6, 3] beyond the line of a closed light, a stop, a give-way sign."""
         there = world.signals[..., 0].sigmoid()
         closed = 1 - world.signals[:, 0, 2:].softmax(-1)[:, 2]
@@ -184,7 +189,7 @@ class Planner(nn.Module):
         gap = world.signals[..., 1] * GAP_SCALE_M
         return beyond_lines(arc, gap) * asked[:, None, None]
 
-    def _limits(self, world: World, arc: Tensor, offset: Tensor) -> Tensor:
+    def _limits(self, world: PlannerInput, arc: Tensor, offset: Tensor) -> Tensor:
         """[B, K, 6, 5] how far beyond each of `LIMITS`."""
         weights = hats(arc, world.path.shape[1]).flatten(1, 2)
         here = torch.matmul(weights, world.attributes).unflatten(1, arc.shape[1:])

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from me2e_compress.zoo.highway.backbone import Backbone, Neck
 from me2e_compress.zoo.highway.bev_encoder import BevEncoder
 from me2e_compress.zoo.highway.config import HighwayConfig
-from me2e_compress.zoo.highway.interfaces import EgoState, World, gather
+from me2e_compress.zoo.highway.interfaces import EgoState, PlannerInput, gather
 from me2e_compress.zoo.highway.map import Choice, Map, RoadMap
 from me2e_compress.zoo.highway.motion import Futures, Motion
 from me2e_compress.zoo.highway.occ import Occ
@@ -72,7 +72,7 @@ class Highway(nn.Module):
         road = self.map(bev, tokens, images)
         return Seen(tracks, road, self.motion(tracks, road), self.occ(bev))
 
-    def world(self, seen: Seen, command: Tensor) -> World:
+    def world(self, seen: Seen, command: Tensor) -> PlannerInput:
         """Gather what the planner reads; the command, int64 [B], picks the route.
 
         Every part is made in a scope of the exported graph that begins with the name

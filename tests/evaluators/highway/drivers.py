@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 
-from me2e_compress.driving.contract import Observation, Policy
+from me2e_compress.driving.contract import Observation, Policy, RouteInfo
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.simulator.routes import Route
@@ -30,7 +30,7 @@ class Misbehaving:
     needs_images: bool = False
     privileged: bool = True
 
-    def reset(self, route: Route) -> None:
+    def reset(self, route: RouteInfo) -> None:
         self.asked, self.blind = 0, Blind()
         self.blind.reset(route)
         if self.way == "no-reset":

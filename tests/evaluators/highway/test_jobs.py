@@ -17,8 +17,8 @@ from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.durations import EXPERT_S, longest_first
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.jobs import (
+    DrivingProgress,
     HighwayEvaluator,
-    Progress,
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.runner import Conditions
@@ -93,7 +93,7 @@ def test_wall_clock_times_lie_beside_the_folder(tmp_path: Path) -> None:
 
 
 def test_finished_routes_are_not_driven_again(results: Path) -> None:
-    reports = list[Progress]()
+    reports = list[DrivingProgress]()
     before = content(results)
     ages = {path: path.stat().st_mtime_ns for path in results.rglob("*.json")}
     again = HighwayEvaluator(BLIND, TWO, results, 220, on_progress=reports.append)
@@ -313,13 +313,13 @@ def test_long_types_begin_in_whatever_order_they_come() -> None:
 
 
 def test_progress_runs_with_the_scores(tmp_path: Path) -> None:
-    reports = list[Progress]()
+    reports = list[DrivingProgress]()
     one = HighwayEvaluator(
         BLIND, (PARKED, GREEN), tmp_path / "r", 220, on_progress=reports.append
     )
     list(one.episodes())
 
-    assert reports[0] == Progress(0, 2, None, None)
+    assert reports[0] == DrivingProgress(0, 2, None, None)
     assert [report.done for report in reports] == [0, 1, 2]
     assert reports[-1].driving_score is not None
     assert 0.0 < reports[-1].driving_score < 100.0

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.driving.contract import Observation, Plan
+from me2e_compress.driving.contract import Observation, Plan, RouteInfo
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.adapter import (
     Adapter,
@@ -17,7 +17,6 @@ from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.runner import Conditions, drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.simulator.routes import Route
 from tests.evaluators.highway.drivers import EXIT, PARKED, straight_on
 
 NORM = {"input": "img", "mean": [10, 20, 30], "std": [2, 4, 5], "order": "bgr"}
@@ -113,7 +112,7 @@ class Listening:
     needs_images: bool = False
     privileged: bool = False
 
-    def reset(self, route: Route) -> None:
+    def reset(self, route: RouteInfo) -> None:
         self.model.reset(route)
 
     def plan(self, observation: Observation) -> Plan:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from me2e_compress.driving.contract import Observation
+from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
@@ -17,7 +17,6 @@ from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.pictures import Moment
-from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Ego
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.drivers import (
@@ -41,7 +40,7 @@ class Standing:
     seen: list[Observation] = field(default_factory=list)
     resets: int = 0
 
-    def reset(self, route: Route) -> None:
+    def reset(self, route: RouteInfo) -> None:
         self.resets += 1
 
     def plan(self, observation: Observation) -> npt.NDArray[np.floating]:

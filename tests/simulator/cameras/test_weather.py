@@ -79,7 +79,7 @@ def test_frames_are_the_same_in_every_process() -> None:
             text=True,
             check=True,
             env={**os.environ, "PYTHONHASHSEED": salt},
-            cwd=Path(__file__).parents[4],
+            cwd=Path(__file__).parents[3],
         )
         return done.stdout.split()
 

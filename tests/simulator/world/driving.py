@@ -1,7 +1,7 @@
 """Small helpers of the world's tests."""
 
 from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.dry_run import Rehearsal, rehearse
+from me2e_compress.evaluators.highway.dry_run import DryRun, dry_run
 from me2e_compress.simulator.routes import Parameter, Route
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.simulator.scenarios.layouts.streets import two_way
@@ -28,8 +28,8 @@ def coast(world: World, frames: int, control: Control | None = None) -> None:
         world.step(control or Control(0.0, 0.0))
 
 
-def sleepwalk(route: Route, speed_mps: float) -> Rehearsal:
-    return rehearse(route, Blind(speed_mps))
+def sleepwalk(route: Route, speed_mps: float) -> DryRun:
+    return dry_run(route, Blind(speed_mps))
 
 
 def trace(route: Route, frames: int = 200, dt_us: int = 50_000) -> list[object]:

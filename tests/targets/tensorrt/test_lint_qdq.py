@@ -12,7 +12,7 @@ from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import rules_named
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import tensorrt
-from me2e_compress.targets.lint import Finding, lint
+from me2e_compress.targets.lint import LintFinding, lint
 from tests.nets import MODULES, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)
@@ -23,7 +23,7 @@ def found(text: str, opset: int = 17) -> list[tuple[str, str, str]]:
     return [shown(each) for each in lint(model, "tensorrt")]
 
 
-def shown(finding: Finding) -> tuple[str, str, str]:
+def shown(finding: LintFinding) -> tuple[str, str, str]:
     return finding.severity, finding.rule, finding.message
 
 

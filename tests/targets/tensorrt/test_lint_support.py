@@ -4,7 +4,7 @@ import onnx
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.targets.lint import Finding, lint
+from me2e_compress.targets.lint import LintFinding, lint
 from me2e_compress.targets.tensorrt.lint.operators import (
     LATER,
     SUPPORTED,
@@ -12,7 +12,7 @@ from me2e_compress.targets.tensorrt.lint.operators import (
 )
 
 
-def found(text: str, opset: int = 17) -> list[Finding]:
+def found(text: str, opset: int = 17) -> list[LintFinding]:
     head = f'<ir_version: 9, opset_import: ["" : {opset}, "trt" : 1]>'
     return list(lint(ir.from_onnx_text(head + text), "tensorrt"))
 

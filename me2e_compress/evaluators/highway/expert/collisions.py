@@ -3,7 +3,7 @@
 import numpy as np
 
 from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags, Forecast
-from me2e_compress.evaluators.highway.expert.futures import Candidates
+from me2e_compress.evaluators.highway.expert.futures import SampledFutures
 from me2e_compress.evaluators.highway.expert.lateral_targets import Place
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Ego
@@ -25,7 +25,7 @@ PRIORITY_S = 1.3
 
 
 def collision_cost(
-    future: Candidates, seen: Forecast, ego: Ego, place: Place
+    future: SampledFutures, seen: Forecast, ego: Ego, place: Place
 ) -> Floats:
     """[K] cost of touching, nearly touching, or cutting off an actor.
 
@@ -51,7 +51,7 @@ def followers(seen: Forecast, ego: Ego, place: Place) -> Flags:
     return np.asarray(aligned & beside & behind & seen.yields)
 
 
-def _in_reach(future: Candidates, seen: Forecast) -> Flags:
+def _in_reach(future: SampledFutures, seen: Forecast) -> Flags:
     """[A] whether an actor comes near anything that the ego might do."""
     margin = REACH_M + PRIORITY_S * seen.speed_mps[:, 1:]
     near = np.ones_like(margin, bool)
@@ -68,7 +68,7 @@ def _worst(clearance: Floats, margin: float) -> Floats:
 
 
 def _clearances(
-    future: Candidates, seen: Forecast, ego: Ego, others: Flags
+    future: SampledFutures, seen: Forecast, ego: Ego, others: Flags
 ) -> tuple[Floats, Floats]:
     """Metres from the ego's discs to each actor, and to its way ahead: [A, K, T]."""
     radius = ego.width / 2 + CORNER_M

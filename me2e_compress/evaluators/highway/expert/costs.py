@@ -8,7 +8,7 @@ import numpy as np
 
 from me2e_compress.evaluators.highway.expert.collisions import FADE, followers
 from me2e_compress.evaluators.highway.expert.forecast import Forecast
-from me2e_compress.evaluators.highway.expert.futures import Candidates
+from me2e_compress.evaluators.highway.expert.futures import SampledFutures
 from me2e_compress.evaluators.highway.expert.lateral_targets import SLOW_MPS, Place
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Ego, RoutePath
@@ -31,7 +31,7 @@ faster than this share of its speed."""
 
 
 def rule_cost(
-    future: Candidates,
+    future: SampledFutures,
     path: RoutePath,
     ego: Ego,
     place: Place,
@@ -60,7 +60,7 @@ def rule_cost(
 
 
 def headway_cost(
-    future: Candidates, seen: Forecast, ego: Ego, place: Place, passable: bool
+    future: SampledFutures, seen: Forecast, ego: Ego, place: Place, passable: bool
 ) -> Floats:
     """[K] cost of driving too close behind somebody, or up to an obstacle.
 
@@ -82,7 +82,7 @@ def headway_cost(
 
 
 def emergency_cost(
-    future: Candidates, seen: Forecast, ego: Ego, place: Place
+    future: SampledFutures, seen: Forecast, ego: Ego, place: Place
 ) -> Floats:
     """[K] cost of not letting an emergency vehicle pass that comes from behind.
 
@@ -100,7 +100,7 @@ def emergency_cost(
     return np.asarray(EMERGENCY * np.any(blocked, axis=1) + EMERGENCY_PER_MPS * hasty)
 
 
-def drive_cost(future: Candidates, ego: Ego, place: Place, kept_m: float) -> Floats:
+def drive_cost(future: SampledFutures, ego: Ego, place: Place, kept_m: float) -> Floats:
     """[K] lack of progress, effort, and restlessness.
 
     Args:

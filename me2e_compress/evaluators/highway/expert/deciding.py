@@ -45,7 +45,7 @@ class Memory:
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class ExpertDecision:
     """What the expert decided.
 
     Args:
@@ -69,7 +69,7 @@ def decide(
     path: RoutePath,
     top: Floats,
     memory: Memory,
-) -> Decision:
+) -> ExpertDecision:
     """Plan from any state.
 
     Args:
@@ -99,7 +99,7 @@ def decide(
     best = int(np.argmin(cost))
     target = float(future.target_m[best])
     columns = future.x[best, WAYPOINTS], future.y[best, WAYPOINTS]
-    return Decision(
+    return ExpertDecision(
         in_ego_frame(*columns, ego),
         float(future.acceleration[best]),
         target,

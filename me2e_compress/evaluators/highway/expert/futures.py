@@ -21,7 +21,7 @@ FULL_CHANGE_M = 3.5
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class SampledFutures:
     """K futures at the 18 times of `TIMES_S`.
 
     Args:
@@ -55,7 +55,7 @@ def sample(
     place: Place,
     options: Options,
     stop_m: float | None,
-) -> Candidates:
+) -> SampledFutures:
     """Roll out every pair of acceleration and lateral target.
 
     Args:
@@ -81,7 +81,7 @@ def sample(
     shifted = np.diff(lateral, axis=1, prepend=place.lateral_m)
     slip = np.clip(path.value(path.curvature, along) * ego.length / 2, -0.5, 0.5)
     heading = heading + np.arctan2(shifted, np.maximum(moved, 0.3)) - np.arcsin(slip)
-    return Candidates(
+    return SampledFutures(
         *(x, y, heading, along, lateral, speed),
         acceleration=np.tile(np.array(rates), repeat),
         target_m=target,

@@ -8,8 +8,8 @@ import onnx_ir as ir
 from me2e_compress.quantization.rules import CONVOLUTIONS, WEIGHTED
 from me2e_compress.runtime.native import operators as native_operators
 from me2e_compress.targets.finding import (
-    Finding,
-    Rule,
+    LintFinding,
+    LintRule,
     error,
     is_standard,
     nodes_of,
@@ -19,14 +19,14 @@ from me2e_compress.targets.standard import of_opset, valid
 from me2e_compress.targets.tensorrt.lint.qdq import QUANTIZE, is_pair
 
 
-def opset(model: ir.Model) -> Iterator[Finding]:
+def opset(model: ir.Model) -> Iterator[LintFinding]:
     """Find opsets beyond what ONNX itself has released."""
     found, newest = model.opset_imports.get("", 0), onnx.defs.onnx_opset_version()
     if found > newest:
         yield error("opset", None, f"opset {found}, the newest known is {newest}")
 
 
-def operators(model: ir.Model) -> Iterator[Finding]:
+def operators(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators that have neither a kernel nor a function in the file."""
     known = native_operators()
     for node in nodes_of(model):
@@ -37,7 +37,7 @@ def operators(model: ir.Model) -> Iterator[Finding]:
         yield error("operator", node, f"{name} has no kernel and no local function")
 
 
-def signed_activations(model: ir.Model) -> Iterator[Finding]:
+def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
     """Find layers that read int8: kernels are fast for uint8 by int8 only.
 
     Measured on AVX512-VNNI: int8 by int8 products run at 34 to 91 GOP/s, uint8 by int8
@@ -51,7 +51,7 @@ def signed_activations(model: ir.Model) -> Iterator[Finding]:
             )
 
 
-def unanswered(model: ir.Model) -> Iterator[Finding]:
+def unanswered(model: ir.Model) -> Iterator[LintFinding]:
     """Find quantized convolutions whose result is not: they run in float.
 
     A Relu or Clip may stand in between: it is fused. A convolution with a float weight
@@ -82,7 +82,7 @@ def _reads(value: ir.Value | None) -> ir.DataType | None:
     return None if integers is None else integers.dtype
 
 
-RULES: tuple[Rule, ...] = (
+RULES: tuple[LintRule, ...] = (
     valid,
     of_opset,
     opset,

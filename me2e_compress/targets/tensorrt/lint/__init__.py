@@ -1,6 +1,6 @@
 """Would TensorRT's ONNX parser take a graph, and run as int8 what is meant to be?"""
 
-from me2e_compress.targets.finding import Rule
+from me2e_compress.targets.finding import LintRule
 from me2e_compress.targets.standard import of_opset, valid
 from me2e_compress.targets.tensorrt.lint import (
     placement,
@@ -9,7 +9,7 @@ from me2e_compress.targets.tensorrt.lint import (
 )
 from me2e_compress.targets.tensorrt.lint.restrictions import restrictions
 
-RULES: tuple[Rule, ...] = (
+RULES: tuple[LintRule, ...] = (
     valid,
     of_opset,
     support.opset,

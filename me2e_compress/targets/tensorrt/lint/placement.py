@@ -8,7 +8,7 @@ from me2e_compress import graph
 from me2e_compress.quantization.plan import channel_axis
 from me2e_compress.quantization.rules import CONVOLUTIONS, WEIGHTED
 from me2e_compress.targets.finding import (
-    Finding,
+    LintFinding,
     error,
     is_standard,
     nodes_of,
@@ -23,7 +23,7 @@ from me2e_compress.targets.tensorrt.lint.qdq import (
 )
 
 
-def channel_scales(model: ir.Model) -> Iterator[Finding]:
+def channel_scales(model: ir.Model) -> Iterator[LintFinding]:
     """Activations have one scale; weights one, or one a channel of their layer."""
     for node in pairs_of(model):
         scale = graph.static_shape(node.inputs[1])
@@ -41,7 +41,7 @@ def channel_scales(model: ir.Model) -> Iterator[Finding]:
             yield from _axis(node)
 
 
-def _axis(node: ir.Node) -> Iterator[Finding]:
+def _axis(node: ir.Node) -> Iterator[LintFinding]:
     shape, scale = (
         graph.static_shape(node.inputs[0]),
         graph.static_shape(node.inputs[1]),
@@ -67,14 +67,14 @@ def _axis(node: ir.Node) -> Iterator[Finding]:
                 )
 
 
-def repeated_pairs(model: ir.Model) -> Iterator[Finding]:
+def repeated_pairs(model: ir.Model) -> Iterator[LintFinding]:
     """Nothing is quantized twice in a row."""
     for node in pairs_of(model):
         if node.op_type == QUANTIZE and is_pair(node.inputs[0]):
             yield warning("repeated-pair", node, "quantizes what was just dequantized")
 
 
-def outputs(model: ir.Model) -> Iterator[Finding]:
+def outputs(model: ir.Model) -> Iterator[LintFinding]:
     """Outputs of the graph are as precise as their layer gives them."""
     for value in model.graph.outputs:
         if is_pair(value):
@@ -83,7 +83,7 @@ def outputs(model: ir.Model) -> Iterator[Finding]:
             )
 
 
-def branches(model: ir.Model) -> Iterator[Finding]:
+def branches(model: ir.Model) -> Iterator[LintFinding]:
     """Of an Add behind a convolution only the residual branch has a pair."""
     for node in nodes_of(model):
         if node.op_type != "Add" or not is_standard(node):
@@ -97,7 +97,7 @@ def branches(model: ir.Model) -> Iterator[Finding]:
             )
 
 
-def half_quantized(model: ir.Model) -> Iterator[Finding]:
+def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
     """A layer reads int8 on both sides or on none."""
     for node in nodes_of(model):
         if node.op_type not in WEIGHTED or not is_standard(node):
@@ -115,7 +115,7 @@ def half_quantized(model: ir.Model) -> Iterator[Finding]:
             )
 
 
-def float_weights(model: ir.Model) -> Iterator[Finding]:
+def float_weights(model: ir.Model) -> Iterator[LintFinding]:
     """Weights are stored as int8, not as float that is quantized when it is built."""
     for node in pairs_of(model):
         value = node.inputs[0]

@@ -11,7 +11,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.targets.finding import Finding, error, is_standard, nodes_of
+from me2e_compress.targets.finding import LintFinding, error, is_standard, nodes_of
 
 QUANTIZE, DEQUANTIZE = "QuantizeLinear", "DequantizeLinear"
 
@@ -34,7 +34,7 @@ def stored(value: ir.Value | None) -> bool:
     return graph.array_of(value) is not None
 
 
-def scales(model: ir.Model) -> Iterator[Finding]:
+def scales(model: ir.Model) -> Iterator[LintFinding]:
     """Scales are constants, finite and above zero."""
     for node in pairs_of(model):
         scale = graph.array_of(node.inputs[1])
@@ -47,7 +47,7 @@ def scales(model: ir.Model) -> Iterator[Finding]:
             yield error("scale", node, f"scale {worst:g}, must be finite and above 0")
 
 
-def zero_points(model: ir.Model) -> Iterator[Finding]:
+def zero_points(model: ir.Model) -> Iterator[LintFinding]:
     """Quantization is symmetric and int8: zero points are 0, of type int8."""
     for node in pairs_of(model):
         value = node.inputs[2] if len(node.inputs) > 2 else None
@@ -63,7 +63,7 @@ def zero_points(model: ir.Model) -> Iterator[Finding]:
             yield error("zero-point", node, f"zero point {found}, must be 0")
 
 
-def biases(model: ir.Model) -> Iterator[Finding]:
+def biases(model: ir.Model) -> Iterator[LintFinding]:
     """Biases stay float: no int32 behind a DequantizeLinear, no pair on a bias."""
     for node in nodes_of(model):
         if node.op_type not in ("Conv", "ConvTranspose", "Gemm"):
@@ -72,14 +72,14 @@ def biases(model: ir.Model) -> Iterator[Finding]:
             yield error("bias-pair", node, "the bias is quantized, must be float")
 
 
-def scalars(model: ir.Model) -> Iterator[Finding]:
+def scalars(model: ir.Model) -> Iterator[LintFinding]:
     """What is quantized has at least one dimension."""
     for node in pairs_of(model):
         if graph.static_shape(node.inputs[0]) == ():
             yield error("scalar-pair", node, f"{node.op_type} of a 0-D tensor")
 
 
-def completeness(model: ir.Model) -> Iterator[Finding]:
+def completeness(model: ir.Model) -> Iterator[LintFinding]:
     """A QuantizeLinear is read by DequantizeLinears only, on the same scale."""
     for node in pairs_of(model):
         if node.op_type == QUANTIZE:
@@ -90,7 +90,7 @@ def completeness(model: ir.Model) -> Iterator[Finding]:
             yield error("unpaired", node, f"reads integers of {what}")
 
 
-def _readers(node: ir.Node) -> Iterator[Finding]:
+def _readers(node: ir.Node) -> Iterator[LintFinding]:
     result = node.outputs[0]
     if result.is_graph_output():
         yield error("unpaired", node, "its integers are a graph output")
@@ -104,7 +104,7 @@ def _readers(node: ir.Node) -> Iterator[Finding]:
         yield error("unpaired", node, "nothing reads its integers")
 
 
-def integers(model: ir.Model) -> Iterator[Finding]:
+def integers(model: ir.Model) -> Iterator[LintFinding]:
     """Indices and shapes are not made of dequantized numbers."""
     whole = {ir.DataType.INT32.value, ir.DataType.INT64.value}
     for node in nodes_of(model):

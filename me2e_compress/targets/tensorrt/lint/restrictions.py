@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.targets.finding import Finding, error, is_standard, nodes_of
+from me2e_compress.targets.finding import LintFinding, error, is_standard, nodes_of
 
 MAX_K = 3840
 """Most elements that TopK gives."""
@@ -17,7 +17,7 @@ _RESIZE_TRANSFORMS = (
 )  # fmt: skip
 
 
-def restrictions(model: ir.Model) -> Iterator[Finding]:
+def restrictions(model: ir.Model) -> Iterator[LintFinding]:
     """Ask what there is to ask of each node."""
     for node in nodes_of(model):
         for ask in _ASKED.get(node.op_type, ()) if is_standard(node) else ():

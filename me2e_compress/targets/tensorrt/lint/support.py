@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import onnx_ir as ir
 
 from me2e_compress.targets.finding import (
-    Finding,
+    LintFinding,
     error,
     is_standard,
     nodes_of,
@@ -27,7 +27,7 @@ _TYPE_OF_OUTPUT = ("Constant", "ConstantOfShape", "If", "Loop", "RandomNormal")
 _UNTYPED = ("RandomUniform", "Scan", "Shape", "Size")
 
 
-def opset(model: ir.Model) -> Iterator[Finding]:
+def opset(model: ir.Model) -> Iterator[LintFinding]:
     """Hold the graph's opset against what parsers read."""
     found = model.opset_imports.get("", 0)
     oldest, newest, later = OPSETS
@@ -39,7 +39,7 @@ def opset(model: ir.Model) -> Iterator[Finding]:
         )
 
 
-def operators(model: ir.Model) -> Iterator[Finding]:
+def operators(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators that the parser refuses or that nobody knows."""
     for node in nodes_of(model):
         if not is_standard(node) or node.op_type in PAIRS:
@@ -55,7 +55,7 @@ def operators(model: ir.Model) -> Iterator[Finding]:
             yield error("operator", node, f"{name} is in no support matrix: unknown")
 
 
-def element_types(model: ir.Model) -> Iterator[Finding]:
+def element_types(model: ir.Model) -> Iterator[LintFinding]:
     """Find data of a type that its operator is not taken with."""
     for node in nodes_of(model):
         taken = SUPPORTED.get(node.op_type) if is_standard(node) else None
@@ -75,7 +75,7 @@ def element_types(model: ir.Model) -> Iterator[Finding]:
             )
 
 
-def one_type(model: ir.Model) -> Iterator[Finding]:
+def one_type(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators of two float types: networks are strongly typed."""
     floats = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
     for node in nodes_of(model):
@@ -91,7 +91,7 @@ def one_type(model: ir.Model) -> Iterator[Finding]:
             )
 
 
-def plugins(model: ir.Model) -> Iterator[Finding]:
+def plugins(model: ir.Model) -> Iterator[LintFinding]:
     """Hold custom operators against the plugins that are known."""
     for node in nodes_of(model):
         if is_standard(node):
@@ -108,7 +108,7 @@ def plugins(model: ir.Model) -> Iterator[Finding]:
             )
 
 
-def _call(node: ir.Node, plugin: Plugin) -> Iterator[Finding]:
+def _call(node: ir.Node, plugin: Plugin) -> Iterator[LintFinding]:
     name, (least, most) = f"{node.op_type} of {plugin.source}", plugin.inputs
     if not least <= len(node.inputs) <= most:
         wanted = f"{least}" if least == most else f"{least} to {most}"

@@ -6,6 +6,6 @@ plugin library, so the graph is cut at plugins.
 """
 
 from me2e_compress.targets.tensorrt.rtx.built_layers import Kernel
-from me2e_compress.targets.tensorrt.rtx.check import SM, Verdict, check
+from me2e_compress.targets.tensorrt.rtx.check import SM, BuildResult, check
 
-__all__ = ["SM", "Kernel", "Verdict", "check"]
+__all__ = ["SM", "BuildResult", "Kernel", "check"]

@@ -28,7 +28,7 @@ EXTRA = "trt-check"
 
 
 @dataclasses.dataclass(frozen=True)
-class Verdict:
+class BuildResult:
     """What TensorRT-RTX made of a graph.
 
     Attributes:
@@ -60,7 +60,7 @@ class Verdict:
         return self.parsed and self.built is not False and not self.missing
 
 
-def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> Verdict:
+def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
     """Let TensorRT-RTX parse a graph and build it, without a GPU.
 
     A minute and 1 GB for 1,500 nodes and 55 convolutions.
@@ -88,7 +88,7 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> Verdict:
         answer, plan = _ask(part, Path(scratch), sm, build=build)
     kernels = () if plan is None else read_kernels(plan)
     errors = [*answer["errors"], *answer["log"]] if not _went_well(answer) else []
-    return Verdict(
+    return BuildResult(
         str(answer["version"]),
         gone,
         bool(answer["parsed"]),

@@ -8,21 +8,23 @@ import torch
 from torch import nn
 
 from me2e_compress.errors import TrainingError
-from me2e_compress.training.checkpoint import Checkpoint, fit
+from me2e_compress.training.checkpoint import TrainingCheckpoint, fit
 from me2e_compress.training.course import load
 from me2e_compress.zoo.highway.stack import Highway
 from tests.training.made import LITTLE
 
 
-def checkpoint(module: nn.Module, step: int = 3) -> Checkpoint:
+def checkpoint(module: nn.Module, step: int = 3) -> TrainingCheckpoint:
     state = module.state_dict()
-    return Checkpoint(state, state, {"a": torch.ones(2)}, {"lr": 0.1}, step, "{}")
+    return TrainingCheckpoint(
+        state, state, {"a": torch.ones(2)}, {"lr": 0.1}, step, "{}"
+    )
 
 
 def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
     saved = checkpoint(nn.Linear(2, 3))
     saved.save(tmp_path / "last.pt")
-    found = Checkpoint.load(tmp_path / "last.pt")
+    found = TrainingCheckpoint.load(tmp_path / "last.pt")
     assert torch.equal(found.model["weight"], saved.model["weight"])
     assert (found.step, found.optimizer, found.what) == (3, {"lr": 0.1}, "{}")
 
@@ -31,7 +33,7 @@ def test_strides_are_kept(tmp_path: Path) -> None:
     layer = nn.Conv2d(4, 4, 3)
     layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
     checkpoint(layer).save(tmp_path / "last.pt")
-    found = Checkpoint.load(tmp_path / "last.pt")
+    found = TrainingCheckpoint.load(tmp_path / "last.pt")
     assert found.model["weight"].stride() == layer.weight.stride()
 
 
@@ -39,7 +41,7 @@ def test_saving_replaces_in_one_step(tmp_path: Path) -> None:
     for step in (1, 2):
         checkpoint(nn.Linear(2, 3), step).save(tmp_path / "last.pt")
     assert [file.name for file in tmp_path.iterdir()] == ["last.pt"]
-    assert Checkpoint.load(tmp_path / "last.pt").step == 2
+    assert TrainingCheckpoint.load(tmp_path / "last.pt").step == 2
 
 
 def test_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
@@ -54,7 +56,7 @@ def test_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
 def test_a_file_that_is_none(tmp_path: Path, content: bytes, words: str) -> None:
     (tmp_path / "last.pt").write_bytes(content)
     with pytest.raises(TrainingError, match=rf"last\.pt: {words}") as caught:
-        Checkpoint.load(tmp_path / "last.pt")
+        TrainingCheckpoint.load(tmp_path / "last.pt")
     assert "\n" not in str(caught.value)
 
 
@@ -63,25 +65,25 @@ def test_half_a_file_is_none(tmp_path: Path) -> None:
     content = (tmp_path / "last.pt").read_bytes()
     (tmp_path / "last.pt").write_bytes(content[: len(content) // 2])
     with pytest.raises(TrainingError, match=r"last\.pt: not a checkpoint: "):
-        Checkpoint.load(tmp_path / "last.pt")
+        TrainingCheckpoint.load(tmp_path / "last.pt")
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match=r"gone\.pt: not a checkpoint: .*No such"):
-        Checkpoint.load(tmp_path / "gone.pt")
+        TrainingCheckpoint.load(tmp_path / "gone.pt")
 
 
 @pytest.mark.parametrize("content", [{"model": {}}, [1, 2], torch.zeros(3)])
 def test_weights_of_something_else(tmp_path: Path, content: object) -> None:
     torch.save(content, tmp_path / "last.pt")
     with pytest.raises(TrainingError, match="not a checkpoint of training: it lacks"):
-        Checkpoint.load(tmp_path / "last.pt")
+        TrainingCheckpoint.load(tmp_path / "last.pt")
 
 
 def test_code_in_a_checkpoint_is_not_run(tmp_path: Path) -> None:
     torch.save(Path("harmful"), tmp_path / "last.pt")
     with pytest.raises(TrainingError, match="not a checkpoint: Weights only load"):
-        Checkpoint.load(tmp_path / "last.pt")
+        TrainingCheckpoint.load(tmp_path / "last.pt")
 
 
 def test_a_checkpoint_of_another_model_names_the_difference(tmp_path: Path) -> None:
