@@ -14,7 +14,10 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import int8_layers, unranged
+from me2e_compress.targets.onnxruntime import (
+    int8_layers,
+    unranged,
+)
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, image, net
 

@@ -6,7 +6,7 @@ from me2e_compress import graph
 from me2e_compress.errors import FramesError
 from me2e_compress.targets.onnxruntime.draft import Draft
 from me2e_compress.targets.onnxruntime.grid import Grid
-from me2e_compress.targets.onnxruntime.int8_layers import write_layer
+from me2e_compress.targets.onnxruntime.layer_forms import write_layer
 from me2e_compress.targets.onnxruntime.pairs import write_pairs
 from me2e_compress.targets.onnxruntime.region import find_region
 from me2e_compress.targets.onnxruntime.writer import Writer

@@ -9,7 +9,12 @@ from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.lint import lint
-from me2e_compress.targets.onnxruntime import int8_layers, kept_float, place, tensors
+from me2e_compress.targets.onnxruntime import (
+    int8_layers,
+    kept_float,
+    place,
+    tensors,
+)
 from tests.nets import conv_attention
 from tests.targets.onnxruntime.lowered import (
     FULL,
