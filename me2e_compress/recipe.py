@@ -126,7 +126,7 @@ def build(name: str, options: Mapping[str, object]) -> Pass:
     if name not in known:
         raise RecipeError(f"no pass {name!r}; there are {', '.join(sorted(known))}")
     cls = known[name]
-    fields = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    fields = [f.name for f in dataclasses.fields(cls)]
     if unknown := [option for option in options if option not in fields]:
         raise RecipeError(
             f"{name} has no option {unknown[0]!r}; it has {', '.join(fields) or 'none'}"

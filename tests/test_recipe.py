@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from me2e_compress import recipe
 from me2e_compress.errors import RecipeError
-from me2e_compress.passes import PASSES, Context, PassResult
+from me2e_compress.passes import PASSES, Context, Pass, PassResult
 
 
 @dataclass(frozen=True)
-class Sample:
+class Sample(Pass):
     """Does nothing.
 
     Given:   x
@@ -23,7 +23,6 @@ class Sample:
 
     name: ClassVar[str] = "sample"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
     drop: tuple[str, ...] = ()
     limit: int = 512
     ratio: float = 0.5

@@ -10,7 +10,7 @@ from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Substitute
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.glue import hand_over
 from me2e_compress.passes.means import means_of
 from me2e_compress.passes.substitutes import (
@@ -26,7 +26,7 @@ from me2e_compress.passes.substitutes import (
 
 
 @dataclasses.dataclass(frozen=True)
-class AblateModules:
+class AblateModules(Pass):
     """Remove modules; what read them reads a substitute, a mean, or zeros.
 
     Given:   features -> occupancy -> plan
@@ -53,12 +53,16 @@ class AblateModules:
 
     name: ClassVar[str] = "ablate-modules"
     exact: ClassVar[bool] = False
-    changes_interface: ClassVar[bool] = False
     drop: tuple[str, ...]
     fill: Literal["zeros", "substitute", "means"] = "substitute"
     keep: tuple[str, ...] = ()
     drop_outputs: bool = False
     means: Path | None = None
+
+    @property
+    def needs_frames(self) -> bool:
+        """Whether means are to be measured."""
+        return self.fill == "means" and self.means is None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Re-wire, cut, sweep.

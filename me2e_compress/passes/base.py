@@ -1,11 +1,15 @@
 """What every pass is."""
 
+import abc
 import dataclasses
-from typing import ClassVar, Protocol, runtime_checkable
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar, Self
 
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import RecipeError
 from me2e_compress.modules import ModuleMap
 
 
@@ -42,21 +46,70 @@ class PassResult:
     removed_outputs: tuple[str, ...] = ()
 
 
-@runtime_checkable
-class Pass(Protocol):
-    """A named rewrite: a frozen dataclass whose fields are its options.
+@dataclasses.dataclass(frozen=True)
+class Pass(abc.ABC):
+    """A named rewrite of a graph: derive a frozen dataclass, its fields are options.
 
     Class attributes:
         name: what recipes and the command line call it.
         exact: True promises the same outputs, and the manager checks it by running
             the graph before and after; False is judged by fidelity and on the road.
         changes_interface: True if the pass may change inputs and outputs at will.
+        quantizes: True if it puts int8 on a float graph.
+        reads_ranges: True if it calibrates tensors; it then has the options ``ranges``
+            (a file that takes the place of frames) and ``method``.
     """
 
     name: ClassVar[str]
     exact: ClassVar[bool]
-    changes_interface: ClassVar[bool]
+    changes_interface: ClassVar[bool] = False
+    quantizes: ClassVar[bool] = False
+    reads_ranges: ClassVar[bool] = False
 
+    @abc.abstractmethod
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite the model, in place where that is cheaper."""
-        ...
+
+    @property
+    def needs_frames(self) -> bool:
+        """Whether it measures on recorded frames, with these options, on any graph."""
+        return False
+
+    def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
+        """Name the tensors that it reads a range of, on a graph of inferred shapes."""
+        return ()
+
+    def files(self) -> tuple[Path, ...]:
+        """List the files that its options name."""
+        values = [getattr(self, name) for name in self.option_names()]
+        return tuple(value for value in values if isinstance(value, Path))
+
+    def options(self) -> dict[str, object]:
+        """Return the options that differ from their defaults; functions left out."""
+        found: dict[str, object] = {}
+        for field in dataclasses.fields(self):
+            value, default = getattr(self, field.name), field.default
+            if field.default_factory is not dataclasses.MISSING:
+                default = field.default_factory()
+            if field.name != "name" and not callable(value) and value != default:
+                found[field.name] = value
+        return found
+
+    @classmethod
+    def option_names(cls) -> tuple[str, ...]:
+        """Name the options, in order."""
+        return tuple(field.name for field in dataclasses.fields(cls))
+
+    def with_options(self, options: Mapping[str, object]) -> Self:
+        """Return this pass with other options.
+
+        Raises:
+            RecipeError: it has no such option.
+        """
+        known = self.option_names()
+        if unknown := [name for name in options if name not in known]:
+            raise RecipeError(
+                f"{self.name} has no option {unknown[0]!r}; it has"
+                f" {', '.join(known) or 'none'}"
+            )
+        return dataclasses.replace(self, **options)

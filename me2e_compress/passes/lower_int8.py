@@ -7,13 +7,13 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.measured import measured_ranges
 from me2e_compress.targets import onnxruntime
 
 
 @dataclasses.dataclass(frozen=True)
-class LowerInt8:
+class LowerInt8(Pass):
     """Rewrite a graph that was quantized for TensorRT so that a CPU is fast with it.
 
     Given:   y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
@@ -33,7 +33,7 @@ class LowerInt8:
 
     name: ClassVar[str] = "lower-int8"
     exact: ClassVar[bool] = False
-    changes_interface: ClassVar[bool] = False
+    reads_ranges: ClassVar[bool] = True
     method: str = "max-min"
     ranges: Path | None = None
 
@@ -44,7 +44,7 @@ class LowerInt8:
             PreconditionError: the graph is not quantized, or not in symmetric int8.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
-        missing = onnxruntime.unranged(model)
+        missing = self.ranged_tensors(model, context)
         ranges = None
         if missing:
             ranges = measured_ranges(
@@ -66,3 +66,7 @@ class LowerInt8:
                 f"{len(missing)} tensors calibrated besides those of the graph",
             ),
         )
+
+    def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
+        """Name the tensors that the graph tells no range of."""
+        return onnxruntime.unranged(model)

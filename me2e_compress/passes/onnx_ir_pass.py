@@ -6,13 +6,13 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import digest
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 
 __all__ = ["OnnxIrPass"]
 
 
 @dataclasses.dataclass(frozen=True)
-class OnnxIrPass:
+class OnnxIrPass(Pass):
     """Run an onnx-ir pass and count its changes by the graph itself.
 
     Given:   OnnxIrPass(onnx_ir.passes.common.IdentityEliminationPass())
@@ -26,7 +26,6 @@ class OnnxIrPass:
 
     name: ClassVar[str] = "onnx-ir-pass"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
     inner: ir.passes.PassBase
 
     def run(self, model: ir.Model, context: Context) -> PassResult:

@@ -9,7 +9,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.measured import measured_ranges
 from me2e_compress.quantization.plan import (
     INT8,
@@ -30,7 +30,7 @@ _SHOWN = 5
 
 
 @dataclasses.dataclass(frozen=True)
-class QuantizeInt8:
+class QuantizeInt8(Pass):
     """Let layers and short attentions of some modules read int8.
 
     Given:   y = Conv(x, w, b)
@@ -58,7 +58,8 @@ class QuantizeInt8:
 
     name: ClassVar[str] = "quantize-int8"
     exact: ClassVar[bool] = False
-    changes_interface: ClassVar[bool] = False
+    quantizes: ClassVar[bool] = True
+    reads_ranges: ClassVar[bool] = True
     scheme: str = "full"
     modules: tuple[str, ...] = ()
     rules: str = "paper"
@@ -68,6 +69,11 @@ class QuantizeInt8:
     overrides: Path | None = None
     method: str = "max-min"
     ranges: Path | None = None
+
+    @property
+    def needs_frames(self) -> bool:
+        """Whether no saved ranges take the place of frames."""
+        return self.ranges is None
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Plan, calibrate, place.
@@ -86,9 +92,7 @@ class QuantizeInt8:
             )
         target = target_named(self.target)
         graph.infer_shapes(model)
-        plan = self.plan(model, context)
-        kept_float = target.kept_float(plan, model)
-        plan = dataclasses.replace(plan, kept_float=kept_float)
+        plan = self._placeable(model, context)
         tensors = target.tensors(plan, model)
         if not tensors:
             return PassResult(
@@ -118,6 +122,17 @@ class QuantizeInt8:
             overrides = Overrides.load(self.overrides)
         rules = rules_named(self.rules, self.attention_limit).without(self.without)
         return make_plan(model, self._scheme(context), rules, overrides)
+
+    def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
+        """Name what its target reads in int8."""
+        plan = self._placeable(model, context)
+        return target_named(self.target).tensors(plan, model)
+
+    def _placeable(self, model: ir.Model, context: Context) -> QuantPlan:
+        """Plan, and note what the target leaves in float nevertheless."""
+        plan = self.plan(model, context)
+        kept_float = target_named(self.target).kept_float(plan, model)
+        return dataclasses.replace(plan, kept_float=kept_float)
 
     def _scheme(self, context: Context) -> QuantScheme:
         if self.modules:

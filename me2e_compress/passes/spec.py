@@ -1,6 +1,5 @@
 """A pass as text: ``ablate-modules{drop=["occ"], fill="zeros"}``."""
 
-import dataclasses
 import json
 from collections.abc import Iterable
 
@@ -12,25 +11,8 @@ def to_text(passes: Iterable[Pass]) -> str:
     return ",".join(_one(current) for current in passes)
 
 
-def options(current: Pass) -> dict[str, object]:
-    """List the options of a pass that differ from their defaults."""
-    if not dataclasses.is_dataclass(current):
-        return {}
-    found: dict[str, object] = {}
-    for field in dataclasses.fields(current):
-        value = getattr(current, field.name)
-        if callable(value) or field.name == "name":  # a function has no text
-            continue
-        default = field.default
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        if value != default:
-            found[field.name] = value
-    return found
-
-
 def _one(current: Pass) -> str:
-    chosen = options(current)
+    chosen = current.options()
     if not chosen:
         return current.name
     inner = ", ".join(f"{name}={_value(value)}" for name, value in chosen.items())

@@ -10,13 +10,13 @@ import onnx_ir as ir
 from me2e_compress.errors import PassError
 from me2e_compress.graph import digest
 from me2e_compress.graph.surgeon import from_graphsurgeon, to_graphsurgeon
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 
 NodeKey = tuple[str, str, tuple[str | None, ...], tuple[str | None, ...]]
 
 
 @dataclasses.dataclass(frozen=True)
-class SurgeonFunction:
+class SurgeonFunction(Pass):
     """Run a function over the graph as onnx-graphsurgeon sees it.
 
     Modules, origins and other metadata, which graphsurgeon does not hold, come back
@@ -37,9 +37,11 @@ class SurgeonFunction:
     """
 
     function: Callable[[gs.Graph], gs.Graph | None]
-    name: str
-    exact: bool = False
-    changes_interface: bool = False
+    # of the object, not of the class: each function has its own
+    _: dataclasses.KW_ONLY
+    name: str  # type: ignore[misc]
+    exact: bool = False  # type: ignore[misc]
+    changes_interface: bool = False  # type: ignore[misc]
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Run the function on a copy.

@@ -7,11 +7,11 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 
 
 @dataclass(frozen=True)
-class _Sample:
+class _Sample(Pass):
     """Base of the samples.
 
     Given:   x
@@ -20,7 +20,6 @@ class _Sample:
 
     name: ClassVar[str] = "sample"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         return PassResult(model, 0)

@@ -40,7 +40,7 @@ def drop_second_relu(surgeon: gs.Graph) -> None:
 def test_it_is_a_frozen_dataclass_that_does_what_the_function_does(
     model: ir.Model,
 ) -> None:
-    current = SurgeonFunction(drop_second_relu, "drop-second-relu")
+    current = SurgeonFunction(drop_second_relu, name="drop-second-relu")
     result = current.run(model, CONTEXT)
     assert [node.name for node in result.model.graph] == ["n_a", "n_y"]
     assert [provenance.module_of(n) for n in result.model.graph] == ["neck", "planner"]
@@ -51,7 +51,7 @@ def test_it_is_a_frozen_dataclass_that_does_what_the_function_does(
 
 def test_the_model_that_it_was_given_stays(model: ir.Model) -> None:
     before = graph.digest(model)
-    SurgeonFunction(drop_second_relu, "drop-second-relu").run(model, CONTEXT)
+    SurgeonFunction(drop_second_relu, name="drop-second-relu").run(model, CONTEXT)
     assert graph.digest(model) == before
 
 
@@ -67,14 +67,14 @@ def test_a_returned_graph_counts_and_new_nodes_join_their_neighbours(
         last.inputs[0] = added
         return twin
 
-    result = SurgeonFunction(insert, "insert-abs").run(model, CONTEXT)
+    result = SurgeonFunction(insert, name="insert-abs").run(model, CONTEXT)
     by_name = {node.name: provenance.read(node) for node in result.model.graph}
     assert by_name["mine"] == Provenance("det", ("n_b",), ("insert-abs",))
     assert by_name["n_y"] == Provenance("planner", ("n_y",))
 
 
 def test_a_function_that_does_nothing_changes_nothing(model: ir.Model) -> None:
-    result = SurgeonFunction(lambda surgeon: None, "idle").run(model, CONTEXT)
+    result = SurgeonFunction(lambda surgeon: None, name="idle").run(model, CONTEXT)
     assert result.changes == 0
     assert result.model is model
 
@@ -83,6 +83,6 @@ def test_a_function_that_returns_something_else_is_refused(model: ir.Model) -> N
     def count(surgeon: gs.Graph) -> int:
         return len(surgeon.nodes)
 
-    current = SurgeonFunction(count, "count")  # pyright: ignore[reportArgumentType]
+    current = SurgeonFunction(count, name="count")  # pyright: ignore[reportArgumentType]
     with pytest.raises(PassError, match="count returned a int, not a graph or None"):
         current.run(model, CONTEXT)

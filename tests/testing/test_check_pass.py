@@ -25,7 +25,7 @@ def test_ablation_holds(driver: ir.Model, context: Context) -> None:
 
 
 @dataclass(frozen=True)
-class DropsOneNegation:
+class DropsOneNegation(Pass):
     """Says it is done while there is more to do.
 
     Given:   x -> Neg -> Neg -> Neg
@@ -34,7 +34,6 @@ class DropsOneNegation:
 
     name: ClassVar[str] = "drops-one-negation"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         for node in model.graph:
@@ -75,9 +74,8 @@ def test_a_pass_without_given_and_result_is_caught(
         check_pass(bad, driver, context)
 
 
-@dataclass
-class Loose:
-    """Could change under our hands.
+class Loose(Pass):
+    """Has lost its decorator.
 
     Given:   x
     Result:  x
@@ -85,7 +83,7 @@ class Loose:
 
     name: ClassVar[str] = "loose"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
+    limit: int = 3
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         return PassResult(model, 0)

@@ -8,7 +8,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress import graph as graphs
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edits import bypass, graphs_of, is_read, remove_dead
 from me2e_compress.passes.eliminate_redundant import sharing
 from me2e_compress.passes.eliminate_redundant.branches import inline_branch
@@ -22,7 +22,7 @@ ROUNDS = 32
 
 
 @dataclasses.dataclass(frozen=True)
-class EliminateRedundant:
+class EliminateRedundant(Pass):
     """Remove nodes that change nothing, merge pairs, share what is equal.
 
     Given:   x -> Identity -> Transpose -> Transpose -> y;  Add(a, b), Add(b, a)
@@ -38,7 +38,6 @@ class EliminateRedundant:
 
     name: ClassVar[str] = "eliminate-redundant"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
     across_modules: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:

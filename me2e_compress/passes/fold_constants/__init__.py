@@ -7,7 +7,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph as graphs
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edits import Array, graphs_of, remove_dead
 from me2e_compress.passes.fold_constants import commit, evaluation
 from me2e_compress.passes.fold_constants.choice import choose
@@ -35,7 +35,7 @@ class _Tally:
 
 
 @dataclasses.dataclass(frozen=True)
-class FoldConstants:
+class FoldConstants(Pass):
     """Replace what depends on weights and static shapes alone by its value.
 
     Given:   Shape(x) -> Gather(1) -> Concat -> Reshape;  Transpose(weight) -> MatMul
@@ -51,7 +51,6 @@ class FoldConstants:
 
     name: ClassVar[str] = "fold-constants"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
     bytes_per_node: int = 512
     through_compute: bool = True
 

@@ -12,7 +12,7 @@ import onnx_ir as ir
 from me2e_compress.errors import PassError
 from me2e_compress.graph import digest, load, node_count, save, sweep
 from me2e_compress.graph.restore import restore
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_with_onnxsim import onnxsim_main
 from me2e_compress.passes.import_normalize.constants import lift
 
@@ -20,7 +20,7 @@ _OWN_METADATA = "onnxsim."
 
 
 @dataclasses.dataclass(frozen=True)
-class FoldWithOnnxsim:
+class FoldWithOnnxsim(Pass):
     """Fold constants with onnxsim (its optimizer off) in a process of its own.
 
     onnxsim is native code: a crash or an endless loop there ends that process and not
@@ -38,7 +38,6 @@ class FoldWithOnnxsim:
 
     name: ClassVar[str] = "fold-with-onnxsim"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
 
     timeout_s: float = 600.0
 

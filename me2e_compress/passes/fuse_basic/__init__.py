@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph as graphs
 from me2e_compress.graph import array_of
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edits import graphs_of, is_standard, remove_dead
 from me2e_compress.passes.fuse_basic import activations, clip, linear
 from me2e_compress.passes.fuse_basic.affine import fuse_affine
@@ -35,7 +35,7 @@ ROUNDS = 16
 
 
 @dataclasses.dataclass(frozen=True)
-class FuseBasic:
+class FuseBasic(Pass):
     """Fuse patterns of standard operators into fewer standard operators.
 
     Given:   Conv -> BatchNormalization -> Relu;  x * 0.5 * (1 + Erf(x / sqrt 2))
@@ -51,7 +51,6 @@ class FuseBasic:
 
     name: ClassVar[str] = "fuse-basic"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
     swish: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:

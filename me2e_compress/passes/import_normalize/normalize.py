@@ -7,7 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import provenance
 from me2e_compress.modules import assign
-from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import constants, doubles, names, plugins
 from me2e_compress.passes.import_normalize.bodies import bodies
 
@@ -16,7 +16,7 @@ _FUNCTIONS_SINCE_IR = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class ImportNormalize:
+class ImportNormalize(Pass):
     """Give every node a name and a past, and spell four things the one right way.
 
     1. Nodes without a name, or with one that is taken, get one.
@@ -38,7 +38,6 @@ class ImportNormalize:
 
     name: ClassVar[str] = "import-normalize"
     exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite the model in place.
