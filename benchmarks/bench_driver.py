@@ -29,7 +29,7 @@ from benchmarks.driver_records import (
     scores_csv,
 )
 from me2e_compress import recipe
-from me2e_compress.cli.frames import record
+from me2e_compress.cli.commands.frames import record
 from me2e_compress.cli.models import model_path
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine

@@ -17,7 +17,7 @@ from time import process_time
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.cli.frames import record
+from me2e_compress.cli.commands.frames import record
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.reaction import plan_reaction
 from me2e_compress.manager import PassManager

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import bev_head, resnet50
 from benchmarks.subject import Subject, at
 from me2e_compress import graph, recipe
-from me2e_compress.cli.frames import record
+from me2e_compress.cli.commands.frames import record
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context

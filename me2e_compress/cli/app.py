@@ -3,21 +3,21 @@
 import typer
 from rich.markup import escape
 
-from me2e_compress.cli.calibrate import calibrate
-from me2e_compress.cli.compare import compare
-from me2e_compress.cli.compress import compress
+from me2e_compress.cli.commands.calibrate import calibrate
+from me2e_compress.cli.commands.compare import compare
+from me2e_compress.cli.commands.compress import compress
+from me2e_compress.cli.commands.demo import demo
+from me2e_compress.cli.commands.doctor import doctor
+from me2e_compress.cli.commands.export import export
+from me2e_compress.cli.commands.frames import frames
+from me2e_compress.cli.commands.inspect import inspect
+from me2e_compress.cli.commands.lint import lint
+from me2e_compress.cli.commands.plan import plan
+from me2e_compress.cli.commands.profile import profile
+from me2e_compress.cli.commands.search import search
+from me2e_compress.cli.commands.sensitivity import sensitivity
 from me2e_compress.cli.console import errors
-from me2e_compress.cli.demo import demo
-from me2e_compress.cli.doctor import doctor
-from me2e_compress.cli.export import export
 from me2e_compress.cli.extras import closed_loop, training
-from me2e_compress.cli.frames import frames
-from me2e_compress.cli.inspect import inspect
-from me2e_compress.cli.lint import lint
-from me2e_compress.cli.plan import plan
-from me2e_compress.cli.profile import profile
-from me2e_compress.cli.search import search
-from me2e_compress.cli.sensitivity import sensitivity
 from me2e_compress.errors import Me2eError
 
 app = typer.Typer(

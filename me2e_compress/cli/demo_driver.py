@@ -4,12 +4,12 @@ from pathlib import Path
 
 from me2e_compress import graph, recipe
 from me2e_compress.cli import job
-from me2e_compress.cli.compare import judge
+from me2e_compress.cli.commands.compare import judge
+from me2e_compress.cli.commands.frames import record
+from me2e_compress.cli.commands.inspect import weigh
+from me2e_compress.cli.commands.study import listener, shown
 from me2e_compress.cli.console import console, progress
-from me2e_compress.cli.frames import record
-from me2e_compress.cli.inspect import weigh
 from me2e_compress.cli.int8 import Int8Options
-from me2e_compress.cli.study import listener, shown
 from me2e_compress.cli.tables import (
     fidelity_table,
     modules_table,

@@ -7,7 +7,10 @@ from rich.table import Table
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.cli import job
-from me2e_compress.cli.compare import judge
+from me2e_compress.cli.commands.compare import judge
+from me2e_compress.cli.commands.export import export
+from me2e_compress.cli.commands.frames import frames
+from me2e_compress.cli.commands.inspect import weigh
 from me2e_compress.cli.console import (
     console,
     file_bytes,
@@ -15,9 +18,6 @@ from me2e_compress.cli.console import (
     progress,
     table,
 )
-from me2e_compress.cli.export import export
-from me2e_compress.cli.frames import frames
-from me2e_compress.cli.inspect import weigh
 from me2e_compress.cli.tables import (
     fidelity_table,
     modules_table,

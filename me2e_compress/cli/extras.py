@@ -17,10 +17,10 @@ def closed_loop(app: typer.Typer) -> None:
         for name in _NAMES:
             _advise_on(app, name, "highway")
         return
-    from me2e_compress.cli.evaluate import evaluate
-    from me2e_compress.cli.routes import routes
-    from me2e_compress.cli.score import score
-    from me2e_compress.cli.study import study
+    from me2e_compress.cli.commands.evaluate import evaluate
+    from me2e_compress.cli.commands.routes import routes
+    from me2e_compress.cli.commands.score import score
+    from me2e_compress.cli.commands.study import study
 
     for command in (evaluate, routes, score, study):
         app.command()(command)
@@ -31,7 +31,7 @@ def training(app: typer.Typer) -> None:
     if not _are_there((*_ROAD, *_ZOO)):
         _advise_on(app, "train", "zoo,highway")
         return
-    from me2e_compress.cli.train import train
+    from me2e_compress.cli.commands.train import train
 
     app.command()(train)
 

@@ -34,7 +34,7 @@ def on_routes(
         EvaluationError: no such route, or the model cannot drive.
     """
     need_closed_loop("what driving a variant needs")
-    from me2e_compress.cli.evaluate import routes_named
+    from me2e_compress.cli.commands.evaluate import routes_named
     from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
     from me2e_compress.evaluators.highway.engine import LocalEngine
     from me2e_compress.evaluators.highway.jobs import HighwayEvaluator

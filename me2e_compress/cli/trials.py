@@ -11,7 +11,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
-from me2e_compress.cli.calibrate import prepare
+from me2e_compress.cli.commands.calibrate import prepare
 from me2e_compress.cli.console import progress
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import Given, check_output

@@ -8,9 +8,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.evaluate import evaluate
-from me2e_compress.cli.profile import profile
-from me2e_compress.cli.score import score
+from me2e_compress.cli.commands.evaluate import evaluate
+from me2e_compress.cli.commands.profile import profile
+from me2e_compress.cli.commands.score import score
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.routes import save_routes
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on

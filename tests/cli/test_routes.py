@@ -5,7 +5,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.routes import routes
+from me2e_compress.cli.commands.routes import routes
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.routes import load_routes, save_routes
 from tests.simulator.world.driving import route_of

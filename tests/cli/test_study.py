@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.cli import evaluate, study
+from me2e_compress.cli.commands import evaluate, study
 from me2e_compress.errors import StudyError
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import Study

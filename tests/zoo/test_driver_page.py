@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.cli.inspect import look
+from me2e_compress.cli.commands.inspect import look
 from me2e_compress.zoo.shipped import shipped
 
 ROOT = Path(__file__).parents[2]

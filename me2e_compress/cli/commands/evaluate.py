@@ -7,11 +7,11 @@ import typer
 from pydantic import TypeAdapter, ValidationError
 from rich.markup import escape
 
+from me2e_compress.cli.commands.score import scores_table
 from me2e_compress.cli.console import console, errors, number, print_json, progress
 from me2e_compress.cli.drivers import driver_of
 from me2e_compress.cli.limits import check_number
 from me2e_compress.cli.output import check_folder
-from me2e_compress.cli.score import scores_table
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import image_size_of
