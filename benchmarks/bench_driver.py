@@ -33,7 +33,7 @@ from me2e_compress.cli.commands.frames import record
 from me2e_compress.cli.models import model_path
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.passes import Pass
+from me2e_compress.passes import PASSES, Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
@@ -101,7 +101,7 @@ class Bench:
         if not isinstance(current, QuantizeInt8):
             return current
         options = {"scheme": current.scheme, "target": self.target}
-        return recipe.build(current.name, options)
+        return PASSES.build(current.name, options)
 
     def study(
         self,

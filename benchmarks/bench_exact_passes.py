@@ -51,7 +51,7 @@ def ours(source: Path, target: Path, preset: str) -> Callable[[], None]:
     def work() -> None:
         model = graph.load(source)
         for name in names:
-            result = PASSES[name]().run(model, Context(modules))
+            result = PASSES.get(name)().run(model, Context(modules))
             print(f"{name}: {result.changes} changes", *result.notes, sep="\n  ")
         lost = provenance.missing(model)
         print(f"nodes without a past: {len(lost)}")

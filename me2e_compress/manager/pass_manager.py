@@ -20,7 +20,7 @@ from me2e_compress.manager import contract, equivalence, reproducer
 from me2e_compress.manager.report import Report, Step, Verification
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
-from me2e_compress.passes.spec import to_text
+from me2e_compress.recipe import to_text
 
 Progress = Callable[[int, int, str], None]
 Stretch = list[tuple[Pass, ir.Model]]

@@ -1,27 +1,25 @@
 """The passes. To add one: write its file, then add its class to this table."""
 
-from me2e_compress.passes.ablate_modules import AblateModules
+from me2e_compress.errors import RecipeError
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.eliminate_redundant import EliminateRedundant
-from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.fold_with_onnxsim import FoldWithOnnxsim
-from me2e_compress.passes.fuse_basic import FuseBasic
-from me2e_compress.passes.import_normalize import ImportNormalize
-from me2e_compress.passes.lower_int8 import LowerInt8
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
-
-PASSES: dict[str, type[Pass]] = {
-    cls.name: cls
-    for cls in (
-        ImportNormalize,
-        FoldConstants,
-        FoldWithOnnxsim,
-        EliminateRedundant,
-        AblateModules,
-        FuseBasic,
-        QuantizeInt8,
-        LowerInt8,
-    )
-}
+from me2e_compress.registry import Registry
 
 __all__ = ["PASSES", "Context", "Pass", "PassResult"]
+
+_HERE = "me2e_compress.passes"
+
+PASSES: Registry[Pass] = Registry(
+    "pass",
+    _HERE,
+    RecipeError,
+    {
+        "import-normalize": f"{_HERE}.import_normalize:ImportNormalize",
+        "fold-constants": f"{_HERE}.fold_constants:FoldConstants",
+        "fold-with-onnxsim": f"{_HERE}.fold_with_onnxsim:FoldWithOnnxsim",
+        "eliminate-redundant": f"{_HERE}.eliminate_redundant:EliminateRedundant",
+        "ablate-modules": f"{_HERE}.ablate_modules:AblateModules",
+        "fuse-basic": f"{_HERE}.fuse_basic:FuseBasic",
+        "quantize-int8": f"{_HERE}.quantize_int8:QuantizeInt8",
+        "lower-int8": f"{_HERE}.lower_int8:LowerInt8",
+    },
+)

@@ -15,7 +15,7 @@ from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
-from me2e_compress.passes.spec import to_text
+from me2e_compress.recipe import to_text
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.study.definition import Scheme, Study
 from me2e_compress.study.workplace import Listener, Workplace

@@ -1,0 +1,245 @@
+"""Names and the classes behind them; the fields of a class are its options."""
+
+import dataclasses
+import functools
+import importlib.metadata
+import inspect
+import sys
+from collections.abc import Iterable, Mapping
+from importlib.metadata import EntryPoint
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import pydantic
+
+from me2e_compress.errors import Me2eError
+from me2e_compress.registry.describe import (
+    Entry,
+    default_of,
+    fields_of,
+    first_line,
+    options_of,
+)
+from me2e_compress.registry.text import (
+    ParsedItem,
+    TextError,
+    read_all,
+    read_one,
+    write_item,
+)
+
+_OURS = "me2e-compress"
+
+
+class Item(Protocol):
+    """What is registered: a frozen dataclass.
+
+    Class attributes:
+        name: what recipes and the command line call it.
+    """
+
+    name: ClassVar[str]
+
+
+T = TypeVar("T", bound=Item)
+
+
+@dataclasses.dataclass(frozen=True)
+class Registry(Generic[T]):
+    """Classes by name: ours, then those of the entry points of other packages.
+
+    A class is a frozen dataclass: its ``name`` is the name it is registered under, its
+    fields are its options, in Python, in text and in files alike. It is imported when
+    it is asked for. An entry that cannot be used is an error only where it is asked
+    for; :meth:`describe` tells of it.
+
+    Attributes:
+        kind: what one entry is, in a word or two, for messages.
+        group: entry-point group of other packages.
+        error: what is raised.
+        builtin: ours, name to ``module:Class``.
+    """
+
+    kind: str
+    group: str
+    error: type[Me2eError]
+    builtin: Mapping[str, str]
+
+    def names(self) -> tuple[str, ...]:
+        """List the names: ours in their order, then others by the alphabet."""
+        others = {entry.name for entry in _installed(self.group)}
+        return (*self.builtin, *sorted(others - set(self.builtin)))
+
+    def get(self, name: str) -> type[T]:
+        """Import the class behind a name.
+
+        Raises:
+            error: no such name, two packages claim it, it does not load, or it is not
+                a frozen dataclass of that name.
+            MissingExtraError: what it needs is not installed.
+        """
+        claims = self._claims(name)
+        if not claims:
+            there = ", ".join(self.names()) or "none"
+            raise self.error(f"no {self.kind} {name!r}; there are {there}")
+        if len(claims) > 1:
+            packages = " and ".join(_source(entry) for entry in claims)
+            raise self.error(
+                f"{self.kind} {name!r} is claimed by {packages}: uninstall one of them"
+            )
+        return self._load(claims[0])
+
+    def usable(self) -> tuple[str, ...]:
+        """List the names whose classes can be imported."""
+        return tuple(entry.name for entry in self.describe() if not entry.error)
+
+    def build(self, name: str, options: Mapping[str, object]) -> T:
+        """Make an item from its options, each checked against the field's type.
+
+        Raises:
+            error: no such item or option, one is missing, or of another type.
+        """
+        return self.make(self.get(name), options)
+
+    def make(self, cls: type[T], options: Mapping[str, object]) -> T:
+        """Make an item of a class that need not be registered; see :meth:`build`."""
+        name, known = cls.name, [field.name for field in fields_of(cls)]
+        if unknown := [option for option in options if option not in known]:
+            raise self.error(
+                f"{name} has no option {unknown[0]!r}; it has"
+                f" {', '.join(known) or 'none'}"
+            )
+        try:
+            made: T = _adapter(cls).validate_python(dict(options))
+        except pydantic.ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(str(part) for part in first["loc"]) or "options"
+            if first["type"] == "missing":
+                raise self.error(f"{name} needs the option {where}") from error
+            raise self.error(f"{name}: {where}: {first['msg']}") from error
+        return made
+
+    def parse(self, text: str) -> T:
+        """Make an item from ``name``, ``name{option=value, ...}`` or ``name:value``.
+
+        What follows a colon is the value of the first option.
+
+        Raises:
+            error: the text is not of that form, or see :meth:`build`.
+        """
+        try:
+            item = read_one(text)
+        except TextError as error:
+            raise self.error(f"{self.kind}: {error}") from error
+        return self._built(item)
+
+    def parse_all(self, text: str) -> tuple[T, ...]:
+        """Make the items that a text lists, parted by commas.
+
+        Raises:
+            error: the text is not of that form, or see :meth:`build`.
+        """
+        try:
+            items = read_all(text)
+        except TextError as error:
+            raise self.error(f"{self.kind}: {error}") from error
+        return tuple(self._built(item) for item in items)
+
+    def text(self, item: T, *, defaults: bool = False) -> str:
+        """Write an item so that :meth:`parse` makes an equal one.
+
+        The single number of an item that has no other option stands behind a colon.
+        Fields that hold functions are left out: they have no text.
+
+        Args:
+            item: registered or not.
+            defaults: write options at their default too.
+        """
+        fields = [field for field in fields_of(type(item)) if field.name != "name"]
+        values = {field.name: getattr(item, field.name) for field in fields}
+        chosen = {
+            field.name: values[field.name]
+            for field in fields
+            if not callable(values[field.name])
+            and (defaults or values[field.name] != default_of(field))
+        }
+        return write_item(item.name, chosen, short=len(fields) == 1)
+
+    def text_all(self, items: Iterable[T]) -> str:
+        """Write items so that :meth:`parse_all` makes equal ones."""
+        return ",".join(self.text(item) for item in items)
+
+    def describe(self) -> tuple[Entry, ...]:
+        """Describe every entry; what cannot be used says why."""
+        return tuple(self._entry(name) for name in self.names())
+
+    def _entry(self, name: str) -> Entry:
+        source = " and ".join(_source(entry) for entry in self._claims(name))
+        try:
+            cls = self.get(name)
+        except Me2eError as error:
+            return Entry(name, source, error=str(error))
+        return Entry(name, source, first_line(cls), options_of(cls))
+
+    def _built(self, item: ParsedItem) -> T:
+        cls = self.get(item.name)
+        if item.value is None:
+            return self.make(cls, item.options)
+        first = next((each for each in fields_of(cls) if not each.kw_only), None)
+        if first is None:
+            raise self.error(f"{item.name} takes no value, found {item.value!r}")
+        return self.make(cls, {first.name: item.value})
+
+    def _claims(self, name: str) -> tuple[EntryPoint, ...]:
+        """List what is to be loaded for a name; more than one is a conflict."""
+        theirs = tuple(each for each in _installed(self.group) if each.name == name)
+        if name not in self.builtin:
+            return theirs
+        return (EntryPoint(name, self.builtin[name], self.group), *theirs)
+
+    def _load(self, entry: EntryPoint) -> type[T]:
+        what = f"{self.kind} {entry.name!r} of {_source(entry)} ({entry.value})"
+        try:
+            cls = entry.load()
+        except Me2eError:
+            raise
+        except Exception as error:  # whatever an import of theirs may raise: chained
+            line = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise self.error(f"{what} cannot be imported: {line}") from error
+        if not _is_frozen_dataclass(cls):
+            raise self.error(f"{what} is not a frozen dataclass")
+        if inspect.isabstract(cls):
+            lacks = ", ".join(sorted(cls.__abstractmethods__))
+            raise self.error(f"{what} does not define {lacks}")
+        if getattr(cls, "name", None) != entry.name:
+            raise self.error(f"{what} calls itself {getattr(cls, 'name', None)!r}")
+        found: type[T] = cls
+        return found
+
+
+@functools.cache
+def _adapter(cls: type) -> "pydantic.TypeAdapter[Any]":
+    return pydantic.TypeAdapter(cls)
+
+
+def _is_frozen_dataclass(cls: object) -> bool:
+    """Look at the class itself: one without decorator inherits that of its base."""
+    if not isinstance(cls, type):
+        return False
+    parameters = vars(cls).get("__dataclass_params__")
+    return parameters is not None and bool(parameters.frozen)
+
+
+def _source(entry: EntryPoint) -> str:
+    """Name the package that an entry point is of, with its version."""
+    return _OURS if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+
+
+def _installed(group: str) -> tuple[EntryPoint, ...]:
+    return _found(tuple(sys.path)).get(group, ())
+
+
+@functools.cache
+def _found(path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
+    """Find the entry points along the path that modules are looked for on, by group."""
+    found: Any = importlib.metadata.entry_points()  # a type of its own in Python 3.11
+    return {group: tuple(found.select(group=group)) for group in found.groups}

@@ -1,0 +1,218 @@
+"""Items as text: ``name``, ``name{option=value, ...}`` or ``name:value``.
+
+A value is a number, ``true`` or ``false``, ``null``, a list ``[a, b]``, a word, or a
+string in double quotes with JSON's escapes. A word needs no quotes, and may have braces
+of its own: ``quantize-int8{rules=paper{attention_limit=256}}``.
+"""
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping
+from typing import NoReturn
+
+_NAME = re.compile(r"[A-Za-z][\w.-]*", re.ASCII)
+_BEGINNING = re.compile(rf"\s*({_NAME.pattern})\s*(?=[:{{]|$)", re.ASCII)
+_KEY = re.compile(r"\w+(?=\s*=)")
+_QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
+_WORD = re.compile(r'[^\s\[\]{},="]+')
+_SHORT = re.compile(r"[^\s\[\]{},]+")
+_SPACE = re.compile(r"\s*")
+_NESTING = re.compile(r'"(?:[^"\\]|\\.)*"|[{}]')
+_INTEGER = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
+_FLOAT = re.compile(r"[+-]?[0-9]+(_[0-9]+)*(\.[0-9]+)?([eE][+-]?[0-9]+)?")
+_LITERALS = {"true": True, "false": False, "null": None}
+_SHOWN = 40
+
+
+class TextError(ValueError):
+    """A text does not follow the grammar; the message says from where on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ParsedItem:
+    """A name and what a text says about it.
+
+    Attributes:
+        name: of the item.
+        options: those in braces, by name.
+        value: what stands behind a colon; None without one.
+    """
+
+    name: str
+    options: Mapping[str, object] = dataclasses.field(default_factory=dict)
+    value: str | None = None
+
+
+def name_in(text: str) -> str:
+    """Return the name that a text begins with, empty if there is none.
+
+    A colon, a brace or the end of the text must follow it.
+    """
+    found = _NAME.match(text.strip())
+    if found is None or text.strip()[found.end() : found.end() + 1] not in (
+        "",
+        ":",
+        "{",
+    ):
+        return ""
+    return found.group()
+
+
+def read_one(text: str) -> ParsedItem:
+    """Read one item; what follows its colon is taken as it stands.
+
+    Raises:
+        TextError: it is not one item.
+    """
+    name, colon, value = text.strip().partition(":")
+    if colon and value and name == name_in(text):
+        return ParsedItem(name, value=value)
+    reader = _Reader(text)
+    item = reader.item()
+    reader.end()
+    return item
+
+
+def read_all(text: str) -> tuple[ParsedItem, ...]:
+    """Read items parted by commas, at least one.
+
+    Raises:
+        TextError: it is not such a list.
+    """
+    reader = _Reader(text)
+    items = [reader.item()]
+    while reader.take(","):
+        items.append(reader.item())
+    reader.end()
+    return tuple(items)
+
+
+def write_item(name: str, options: Mapping[str, object], *, short: bool = False) -> str:
+    """Write an item so that it is read back.
+
+    Args:
+        name: of the item.
+        options: to be written, by name.
+        short: write a single number behind a colon instead of in braces.
+    """
+    if not options:
+        return name
+    values = list(options.values())
+    if short and len(values) == 1 and type(values[0]) in (int, float):
+        return f"{name}:{str(values[0]).removesuffix('.0')}"
+    inner = ", ".join(f"{key}={write_value(value)}" for key, value in options.items())
+    return f"{name}{{{inner}}}"
+
+
+def write_value(value: object) -> str:
+    """Write the value of an option; what is no number or list becomes a string."""
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(write_value(item) for item in value) + "]"
+    if value is None or isinstance(value, bool | int | float | str):
+        return json.dumps(value)
+    return json.dumps(str(value))
+
+
+class _Reader:
+    """A text and how far it is read."""
+
+    def __init__(self, text: str) -> None:
+        self.text, self.at = text, 0
+
+    def item(self) -> ParsedItem:
+        name = self.match(_NAME)
+        if name is None:
+            self.fail("a name is expected")
+        if self.take(":"):
+            value = self.match(_SHORT)
+            if value is None:
+                self.fail(f"a value is expected behind {name}:")
+            return ParsedItem(name, value=value)
+        return ParsedItem(name, self.options() if self.take("{") else {})
+
+    def options(self) -> dict[str, object]:
+        options: dict[str, object] = {}
+        while not self.take("}"):
+            if options and not self.take(","):
+                self.fail("a comma or } is expected")
+            name = self.match(_KEY)
+            if name is None:
+                self.fail("option=value is expected")
+            if name in options:
+                self.fail(f"option {name} is given twice")
+            self.take("=")
+            options[name] = self.value()
+        return options
+
+    def value(self) -> object:
+        if self.take("["):
+            return self.sequence()
+        quoted = self.match(_QUOTED)
+        if quoted is not None:
+            return self.string(quoted)
+        word = self.match(_WORD)
+        if word is None:
+            self.fail("a value is expected")
+        if self.text.startswith("{", self.at):
+            return word + self.braces()
+        return _literal(word)
+
+    def sequence(self) -> list[object]:
+        values: list[object] = []
+        while not self.take("]"):
+            if values and not self.take(","):
+                self.fail("a comma or ] is expected")
+            values.append(self.value())
+        return values
+
+    def string(self, quoted: str) -> str:
+        try:
+            return str(json.loads(quoted, strict=False))
+        except json.JSONDecodeError as error:
+            self.fail(f"{quoted} is not a JSON string ({error.msg})")
+
+    def braces(self) -> str:
+        """Return the text from one brace to the one that closes it."""
+        start, depth = self.at, 0
+        for token in _NESTING.finditer(self.text, start):
+            depth += {"{": 1, "}": -1}.get(token.group(), 0)
+            if depth == 0:
+                self.at = token.end()
+                return self.text[start : self.at]
+        self.fail("a closing } is missing")
+
+    def end(self) -> None:
+        self.match(_SPACE)
+        if self.at < len(self.text):
+            self.fail("a comma or the end is expected")
+
+    def take(self, mark: str) -> bool:
+        """Pass a mark, and the space before it, if it comes next."""
+        self.match(_SPACE)
+        there = self.text.startswith(mark, self.at)
+        self.at += len(mark) * there
+        return there
+
+    def match(self, pattern: re.Pattern[str]) -> str | None:
+        """Pass what comes next, and the space before it, if it matches."""
+        space = _SPACE.match(self.text, self.at)
+        found = pattern.match(self.text, space.end() if space else self.at)
+        if found is None:
+            return None
+        self.at = found.end()
+        return found.group()
+
+    def fail(self, expected: str) -> NoReturn:
+        rest = self.text[self.at :]
+        where = f"from {rest[:_SHOWN]!r} on" if rest else "to the end"
+        raise TextError(f"cannot read {self.text!r} {where}: {expected}")
+
+
+def _literal(word: str) -> object:
+    """Return the number, truth value or null that a word is, or else the word."""
+    if word in _LITERALS:
+        return _LITERALS[word]
+    if _INTEGER.fullmatch(word):
+        return int(word)
+    return float(word) if _FLOAT.fullmatch(word) else word
