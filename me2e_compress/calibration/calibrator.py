@@ -9,7 +9,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.observers import observer
+from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.probes import Counts, Extremes, Gauge
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
@@ -27,7 +27,7 @@ class Calibrator:
 
     Attributes:
         method: how statistics become ranges, see
-            :func:`me2e_compress.calibration.observers.observer`.
+            :data:`me2e_compress.calibration.observers.OBSERVERS`.
         threads: within an operator; 0 for every core.
         optimize: False runs the nodes as they stand: the ranges are then those of
             tools that switch onnxruntime's optimizations off, to the bit.
@@ -51,7 +51,7 @@ class Calibrator:
     ) -> Ranges:
         """Collect statistics and read the ranges off them; see :meth:`collect`."""
         return Ranges.of(
-            self.collect(model, tensors, frames, progress), observer(self.method)
+            self.collect(model, tensors, frames, progress), OBSERVERS.parse(self.method)
         )
 
     def collect(
@@ -78,7 +78,7 @@ class Calibrator:
             GraphError: onnxruntime cannot run the graph.
             RecipeError: no such method.
         """
-        counting = observer(self.method).counts
+        counting = OBSERVERS.parse(self.method).counts
         if not len(frames):
             raise FramesError("no frames to calibrate on")
         blank = Statistics(

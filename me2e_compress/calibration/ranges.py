@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 import pydantic
 
-from me2e_compress.calibration.observers import Observer, observer
+from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_json
@@ -59,7 +59,7 @@ class Ranges:
         ends = zip(lows.tolist(), highs.tolist(), strict=True)
         return cls(
             dict(zip(seen.tensors, ends, strict=True)),
-            method.text,
+            OBSERVERS.text(method, defaults=True),
             len(seen.frames),
             seen.model,
             seen.source,
@@ -126,8 +126,9 @@ class Ranges:
                 f"ranges are stale: of graph {self.model[:12]}, not {model[:12]};"
                 f" {again}"
             )
-        own = method == self.method == IMPORTED
-        asked = IMPORTED if own else observer(method).text
+        asked = method
+        if not method == self.method == IMPORTED:
+            asked = OBSERVERS.text(OBSERVERS.parse(method), defaults=True)
         if self.method not in (asked, IMPORTED):
             raise FramesError(f"ranges are of method {self.method}, asked for {asked}")
         wanted = self.source if source is None else source

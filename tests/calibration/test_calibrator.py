@@ -119,7 +119,7 @@ def test_a_tensor_whose_range_one_element_makes_is_named(tmp_path: Path) -> None
 def test_an_unknown_tensor_or_method_is_an_error(frames: CalibrationSet) -> None:
     with pytest.raises(GraphError, match="no tensor nowhere"):
         Calibrator().run(conv_attention(), ["nowhere"], frames)
-    with pytest.raises(RecipeError, match=r"no calibration method int4; .*max-min"):
+    with pytest.raises(RecipeError, match=r"no calibration method 'int4'; .*max-min"):
         Calibrator("int4").run(conv_attention(), ["a"], frames)
 
 

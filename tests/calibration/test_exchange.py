@@ -122,8 +122,8 @@ def test_imported_ranges_fit_any_method_but_one_graph(tmp_path: Path) -> None:
     found.check(model="digest", tensors=NAMES, method=found.method)
     with pytest.raises(FramesError, match="of graph digest, not elsewhere"):
         found.check(model="elsewhere", tensors=NAMES, method="entropy")
-    with pytest.raises(RecipeError, match="no calibration method fp8"):
+    with pytest.raises(RecipeError, match="no calibration method 'fp8'"):
         found.check(model="digest", tensors=NAMES, method="fp8")
-    with pytest.raises(RecipeError, match="no calibration method imported"):
+    with pytest.raises(RecipeError, match="no calibration method 'imported'"):
         ranges().check(model="digest", tensors=NAMES, method="imported")
     assert np.isfinite(list(found.tensors.values())).all()

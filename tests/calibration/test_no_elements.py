@@ -8,7 +8,7 @@ import pytest
 
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.observers import METHODS
+from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.statistics import Statistics
 from tests.frames import record
 
@@ -28,7 +28,7 @@ def frames_of(folder: Path, *scores: np.ndarray) -> CalibrationSet:
     return CalibrationSet(record(folder, frames, (0,)))
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", OBSERVERS.names())
 def test_frames_without_elements_change_no_range(method: str, tmp_path: Path) -> None:
     random = np.random.default_rng(11)
     some = [random.uniform(-1, 1, 8).astype(np.float32) for _ in range(3)]

@@ -1,20 +1,23 @@
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.calibration.observers import (
+from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer, scale_of
+from me2e_compress.calibration.observers.extremes import MaxMin, MovingAverage
+from me2e_compress.calibration.observers.histogram import (
     Entropy,
-    MaxMin,
     MeanSquaredError,
-    MovingAverage,
     Percentile,
-    observer,
-    scale_of,
 )
 from me2e_compress.calibration.statistics import BINS, Statistics
 from me2e_compress.errors import FramesError, RecipeError
+from tests.installed import install
 
 Values = npt.NDArray[np.float64]
 
@@ -153,20 +156,43 @@ def test_histogram_methods_say_that_they_lack_histograms() -> None:
     ],
 )
 def test_methods_are_read_from_text(text: str, canonical: str) -> None:
-    assert observer(text).text == canonical
-    assert observer(canonical) == observer(text)
+    method = OBSERVERS.parse(text)
+    assert OBSERVERS.text(method, defaults=True) == canonical
+    assert OBSERVERS.parse(canonical) == method
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("fp8", "no calibration method fp8; there is max-min, .*entropy, all int8"),
-        ("mse:3", "mse takes no number, found '3'"),
-        ("percentile:x", "above 0 and at most 100, found 'x'"),
-        ("percentile:0", "above 0"),
-        ("moving-average:2", "at most 1, found '2'"),
+        ("fp8", "no calibration method 'fp8'; there are max-min, .*entropy"),
+        ("mse:3", "mse takes no value, found '3'"),
+        ("percentile:x", "percentile: percent: Input should be a valid number"),
+        ("percentile:nan", "percentile: percent must be above 0"),
+        ("percentile:0", "must be above 0 and at most 100, found 0"),
+        ("moving-average:2", "weight must be above 0 and at most 1, found 2"),
     ],
 )
 def test_what_is_no_method_is_refused(text: str, message: str) -> None:
     with pytest.raises(RecipeError, match=message):
-        observer(text)
+        OBSERVERS.parse(text)
+
+
+@dataclass(frozen=True)
+class RootMeanSquare(Observer):
+    """Some root mean squares to each side."""
+
+    name: ClassVar[str] = "rms"
+    times: float = 3.0
+
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+        reach = self.times * np.sqrt(seen.mean_squares.mean(axis=0))
+        return -reach, reach
+
+
+def test_a_number_goes_to_the_observer_that_it_is_written_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = {"rms": f"{__name__}:RootMeanSquare"}
+    install(monkeypatch, tmp_path, "an-rms", "me2e_compress.observers", entry)
+
+    assert OBSERVERS.parse("rms:4") == RootMeanSquare(4.0)

@@ -164,7 +164,7 @@ def test_close_decisions_are_noted(context: Context) -> None:
         ({"rules": "int4"}, RecipeError, "no rule set int4; there are paper, tensorrt"),
         ({"target": "qnn"}, RecipeError, "no target qnn; there are tensorrt"),
         ({"overrides": Path("none.toml")}, RecipeError, "none.toml: no such file"),
-        ({"method": "median"}, RecipeError, "no calibration method median"),
+        ({"method": "median"}, RecipeError, "no calibration method 'median'"),
     ],
 )
 def test_what_is_not_there_is_named(

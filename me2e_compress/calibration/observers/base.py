@@ -1,18 +1,22 @@
 """What every way from frames to ranges is."""
 
-from typing import ClassVar, Protocol, TypeAlias
+import abc
+import dataclasses
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.calibration.statistics import Statistics
+from me2e_compress.errors import RecipeError
 
-Ends: TypeAlias = npt.NDArray[np.float32]
-"""One end of the range of every tensor: float32 [tensors]."""
+Bounds: TypeAlias = npt.NDArray[np.float32]
+"""The low or the high bound of the range of every tensor: float32 [tensors]."""
 
 
-class Observer(Protocol):
-    """A frozen dataclass whose fields are its options.
+@dataclasses.dataclass(frozen=True)
+class Observer(abc.ABC):
+    """From statistics to ranges: derive a frozen dataclass, its fields are options.
 
     Class attributes:
         name: what recipes and the command line call it.
@@ -20,19 +24,26 @@ class Observer(Protocol):
     """
 
     name: ClassVar[str]
-    counts: ClassVar[bool]
+    counts: ClassVar[bool] = False
 
-    @property
-    def text(self) -> str:
-        """The method with its number, as :func:`observer` reads it."""
-        ...
-
-    def ranges(self, seen: Statistics) -> tuple[Ends, Ends]:
-        """Give the low and the high end of every tensor's range."""
-        ...
+    @abc.abstractmethod
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+        """Return the low and the high bound of every tensor's range."""
 
 
-def within(seen: Statistics, reach: Ends) -> tuple[Ends, Ends]:
+def check_option(name: str, option: str, value: float, largest: float) -> None:
+    """Refuse the option of an observer that is not above 0 and at most ``largest``.
+
+    Raises:
+        RecipeError: names observer and option.
+    """
+    if not 0 < value <= largest:  # NaN too
+        raise RecipeError(
+            f"{name}: {option} must be above 0 and at most {largest:g}, found {value:g}"
+        )
+
+
+def within(seen: Statistics, reach: Bounds) -> tuple[Bounds, Bounds]:
     """Cut the extremes of every tensor off at plus and minus its reach."""
     lows, highs = seen.lows.min(axis=0), seen.highs.max(axis=0)
     return np.maximum(lows, -reach), np.minimum(highs, reach)

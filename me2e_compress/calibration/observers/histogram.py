@@ -7,7 +7,12 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.calibration.observers.base import Ends, within
+from me2e_compress.calibration.observers.base import (
+    Bounds,
+    Observer,
+    check_option,
+    within,
+)
 from me2e_compress.calibration.observers.scale import QUANT_MAX
 from me2e_compress.calibration.statistics import BINS, Statistics
 
@@ -23,24 +28,26 @@ _STRIDE = BINS // 256
 
 
 @dataclasses.dataclass(frozen=True)
-class Percentile:
+class Percentile(Observer):
     """The magnitude that ``percent`` of all elements of all frames do not exceed.
 
     Attributes:
         percent: above 0 and at most 100; the default is that of TensorRT's and
             onnxruntime's tools.
+
+    Raises:
+        RecipeError: another percentage.
     """
 
     name: ClassVar[str] = "percentile"
     counts: ClassVar[bool] = True
     percent: float = 99.99
 
-    @property
-    def text(self) -> str:
-        """The method with its percentile."""
-        return f"{self.name}:{self.percent:g}"
+    def __post_init__(self) -> None:
+        """Check the percentage."""
+        check_option(self.name, "percent", self.percent, 100.0)
 
-    def ranges(self, seen: Statistics) -> tuple[Ends, Ends]:
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
         """Cut every tensor off at its percentile, rounded up to the edge of a bin."""
         return within(seen, _reaches(seen, self._edge))
 
@@ -51,24 +58,19 @@ class Percentile:
 
 
 @dataclasses.dataclass(frozen=True)
-class MeanSquaredError:
+class MeanSquaredError(Observer):
     """The threshold whose int8 grid moves the elements least, in mean square."""
 
     name: ClassVar[str] = "mse"
     counts: ClassVar[bool] = True
 
-    @property
-    def text(self) -> str:
-        """The method as it is named."""
-        return self.name
-
-    def ranges(self, seen: Statistics) -> tuple[Ends, Ends]:
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
         """Cut every tensor off where rounding and clipping cost least."""
         return within(seen, _reaches(seen, lambda counts: _best(counts, _noise)))
 
 
 @dataclasses.dataclass(frozen=True)
-class Entropy:
+class Entropy(Observer):
     """The threshold whose int8 grid keeps the distribution best: least KL divergence.
 
     Migacz's method. Zero stands on every grid, so the bin of zeros counts as its
@@ -78,17 +80,12 @@ class Entropy:
     name: ClassVar[str] = "entropy"
     counts: ClassVar[bool] = True
 
-    @property
-    def text(self) -> str:
-        """The method as it is named."""
-        return self.name
-
-    def ranges(self, seen: Statistics) -> tuple[Ends, Ends]:
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
         """Cut every tensor off where the distribution suffers least."""
         return within(seen, _reaches(seen, lambda counts: _best(counts, _divergence)))
 
 
-def _reaches(seen: Statistics, edge: Callable[[Counts], int]) -> Ends:
+def _reaches(seen: Statistics, edge: Callable[[Counts], int]) -> Bounds:
     """Turn the chosen edge of every histogram into a magnitude."""
     edges = [edge(counts) if counts.any() else BINS for counts in seen.counted()]
     return np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents).astype(
@@ -114,7 +111,7 @@ def _noise(counts: Counts, edge: int) -> float:
 
 
 def _divergence(counts: Counts, edge: int) -> float:
-    """Give the KL divergence between the bins below an edge and their grid of levels.
+    """Return the KL divergence between the bins below an edge and their grid of levels.
 
     What lies beyond the edge counts into the last bin before it. A level spreads its
     elements evenly over those of its bins that are not empty.

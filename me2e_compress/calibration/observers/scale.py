@@ -11,7 +11,7 @@ QUANT_MAX = 127
 
 
 def scale_of(low: float, high: float) -> np.float32:
-    """Give the int8 step of a range: ``max(|low|, |high|) / 127``, zero point 0.
+    """Return the int8 step of a range: ``max(|low|, |high|) / 127``, zero point 0.
 
     Equation 3 of the paper divides ``high - low`` by ``q_max - q_min``. That fits a
     range centred on zero; with zero point 0 it would clip the upper half of a tensor
@@ -21,7 +21,7 @@ def scale_of(low: float, high: float) -> np.float32:
     A tensor that is zero throughout has no step of its own: it gets 1.
 
     Raises:
-        FramesError: an end is NaN or infinite.
+        FramesError: a bound is NaN or infinite.
     """
     if not (math.isfinite(low) and math.isfinite(high)):
         raise FramesError(f"a range of {low:g} to {high:g} has no int8 step")

@@ -17,7 +17,7 @@ from me2e_compress.calibration.exchange import (
     write_onnxruntime_table,
     write_tensorrt_cache,
 )
-from me2e_compress.calibration.observers import observer
+from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import Part, draw, shard
 from me2e_compress.calibration.statistics import Statistics, merge
@@ -89,7 +89,7 @@ def calibrate(
     A run that was killed goes on from OUTPUT.checkpoint; compress takes the
     ranges by --ranges.
     """
-    observer(method)
+    OBSERVERS.parse(method)
     _check_sources(frames, shards, foreign, part)
     if part is not None and (as_json or tensorrt_cache or onnxruntime_table):
         raise FramesError(
@@ -108,7 +108,7 @@ def calibrate(
         found = read_foreign(foreign, graph.digest(ready), tensors)
     elif shards:
         seen = merge([Statistics.load(path) for path in shards])
-        found = Ranges.of(seen, observer(method))
+        found = Ranges.of(seen, OBSERVERS.parse(method))
         found.check(model=graph.digest(ready), tensors=tensors, method=method)
     else:
         chosen = _choose(model, frames or Path(), count, seed, part)
@@ -121,7 +121,7 @@ def calibrate(
             dataclasses.replace(seen, share=chosen.share).save(output)
             console.print(f"{output}: shard {part}, {len(chosen)} frames")
             return
-        found = Ranges.of(seen, observer(method))
+        found = Ranges.of(seen, OBSERVERS.parse(method))
     found.save(output)
     if tensorrt_cache is not None:
         write_tensorrt_cache(found, tensorrt_cache)
