@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.calibration.statistics import BINS
 
 Reading: TypeAlias = tuple[list[ir.Node], list[ir.Value]]
@@ -107,4 +107,4 @@ def _shared(where: ir.Graph, array: npt.NDArray[np.generic], name: str) -> ir.Va
     """Give a constant of the gauges, made where it is first asked for."""
     name = f"me2e_gauge_{name}"
     known = where.initializers.get(name)
-    return known if known is not None else graph.add_constant(where, array, name)
+    return known if known is not None else rewrite.add_constant(where, array, name)

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Substitute
@@ -90,10 +90,10 @@ class AblateModules(Pass):
         if self.fill == "substitute":
             for module in known:
                 notes += [self._substitute(model, each) for each in module.substitutes]
-        graph.sweep(model)
+        rewrite.sweep(model)
         notes += self._fill(model, context)
-        graph.sweep(model)
-        graph.sort(model)
+        rewrite.sweep(model)
+        model.graph.sort()
         removed = before - graph.node_count(model)
         notes.append(f"{removed} nodes removed")
         return PassResult(model, max(1, removed), tuple(notes), tuple(gone))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Pattern, exits, scope_of
@@ -119,7 +119,7 @@ def constant_like(where: ir.Graph, value: ir.Value, array: Array) -> ir.Value:
             f"a constant {array.dtype} {list(array.shape)} cannot stand for"
             f" {value.name}, which is {dtype} {list(shape)}"
         )
-    return graph.add_constant(where, array, f"{value.name}_mean")
+    return rewrite.add_constant(where, array, f"{value.name}_mean")
 
 
 def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
@@ -157,7 +157,7 @@ def zeros_like(
         PreconditionError: the shape is not static, or the value is itself a shape.
     """
     shape, dtype = layout_of(value)
-    size = graph.add_constant(where, np.array(shape, np.int64), f"{value.name}_shape")
+    size = rewrite.add_constant(where, np.array(shape, np.int64), f"{value.name}_shape")
     zero = ir.tensor(np.zeros(1, dtype), name="zero")
     node = ir.node("ConstantOfShape", [size], {"value": zero})
     provenance.inherit(node, readers, by=by)
@@ -175,7 +175,7 @@ def shaped_like(
     want = graph.static_shape(old)
     if graph.static_shape(new) == want:
         return new
-    size = graph.add_constant(where, np.array(want, np.int64), f"{old.name}_shape")
+    size = rewrite.add_constant(where, np.array(want, np.int64), f"{old.name}_shape")
     node = ir.node("Reshape", [new, size])
     provenance.inherit(node, readers, by=by)
     return _finished(where, node, old, f"{old.name}_stand_in")

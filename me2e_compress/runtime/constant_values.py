@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import run_once
 
@@ -52,7 +52,7 @@ def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array
     made = {str(each.name): each for node in part.graph for each in node.outputs}
     part.graph.outputs.clear()
     part.graph.outputs.extend(made[name] for name in names)
-    graph.sweep(part)
+    rewrite.sweep(part)
     used = [value for value in part.graph.inputs if value.uses()]
     part.graph.inputs.clear()
     part.graph.inputs.extend(used)

@@ -9,7 +9,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.cli import main
 from tests.conftest import DRIVER, DRIVER_MAP
 
@@ -47,7 +47,7 @@ def dense(files: Path) -> Path:
         ' ["/plan_head/MatMul"] plan = MatMul(a, w) }'
     )
     draws = np.random.default_rng(0).normal(size=(4, 32)).astype(np.float32)
-    weight = graph.add_constant(model.graph, draws, "w")
+    weight = rewrite.add_constant(model.graph, draws, "w")
     model.graph[1].replace_input_with(1, weight)
     graph.save(model, files / "dense.onnx")
     camera = np.random.default_rng(1).normal(size=(4, 4)).astype(np.float32)

@@ -7,7 +7,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from tests.cli.conftest import Command, write_frames
 
 Words = list[str | Path]
@@ -60,7 +60,7 @@ def test_a_truncated_file(refused: Callable[..., str], files: Path) -> None:
 def test_missing_external_data(refused: Callable[..., str], files: Path) -> None:
     model = graph.load(files / "in.onnx")
     big = np.random.default_rng(0).normal(size=(1, 4096)).astype(np.float32)
-    graph.add_constant(model.graph, big, "w")
+    rewrite.add_constant(model.graph, big, "w")
     graph.save(model, files / "ext.onnx", external=True)
     (files / "ext.onnx.data").unlink()
     line = refused(*compress(files, model="ext.onnx"))

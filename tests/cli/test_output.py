@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from tests.cli.conftest import Command
 
 Refused = Callable[[str], str]
@@ -89,7 +89,7 @@ def test_the_weights_beside_a_model_are_not_written_over(
 ) -> None:
     model = graph.load(dense / M)
     big = np.random.default_rng(0).normal(size=(1, 4096)).astype(np.float32)
-    graph.add_constant(model.graph, big, "more")
+    rewrite.add_constant(model.graph, big, "more")
     graph.save(model, dense / "dense.onnx", external=True)
 
     line = refused(f"{line} -o dense.onnx.data")

@@ -5,7 +5,7 @@ import onnx_ir as ir
 import onnxruntime as ort
 import pytest
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import ModuleMap
@@ -64,7 +64,7 @@ def test_a_new_name_never_takes_that_of_a_later_node() -> None:
 
 
 def _by_parameter(model: ir.Model) -> ModuleMap:
-    weight = graph.add_constant(model.graph, np.ones(2, np.float32), "head.weight")
+    weight = rewrite.add_constant(model.graph, np.ones(2, np.float32), "head.weight")
     model.graph[0].replace_input_with(0, weight)
     return ModuleMap.parse(
         '[modules.head]\nrole = "prediction"\npatterns = ["head"]', "head"

@@ -9,11 +9,11 @@ import onnx_ir.passes.common as common
 
 from me2e_compress import graph as graphs
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.edits import bypass, graphs_of, is_read, remove_dead
 from me2e_compress.passes.eliminate_redundant import sharing
 from me2e_compress.passes.eliminate_redundant.branches import inline_branch
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
 from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
+from me2e_compress.rewrite import bypass, graphs_of, is_read, remove_dead
 
 __all__ = ["EliminateRedundant"]
 

@@ -4,15 +4,9 @@ from collections.abc import Mapping
 
 import onnx_ir as ir
 
-from me2e_compress.graph import (
-    array_of,
-    fresh_name,
-    provenance,
-    replace_value,
-    value_names,
-)
-from me2e_compress.graph.rewrite import can_replace
+from me2e_compress.graph import array_of, provenance
 from me2e_compress.passes.fold_constants.inference import branch_fits
+from me2e_compress.rewrite import can_replace, fresh_name, replace_value, value_names
 
 
 def inline_branch(

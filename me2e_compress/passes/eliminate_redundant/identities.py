@@ -11,7 +11,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
-from me2e_compress.passes.edits import Array, is_read, is_standard
+from me2e_compress.rewrite import Array, is_read, is_standard
 
 Rule = Callable[[ir.Node, int], ir.Value | None]
 

@@ -10,14 +10,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import add_constant, array_of, provenance, static_shape
-from me2e_compress.passes.edits import (
-    bypass,
-    is_standard,
-    put,
-    single_reader,
-)
+from me2e_compress.graph import array_of, provenance, static_shape
 from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
+from me2e_compress.rewrite import add_constant, bypass, is_standard, put, sole_reader
 
 VIEWS = frozenset({"Flatten", "Reshape", "Squeeze", "Unsqueeze"})
 
@@ -127,7 +122,7 @@ def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
         return None
     if static_shape(source) == sizes and bypass(node.outputs[0], source):
         return node
-    if single_reader(inner.outputs[0]) is None:
+    if sole_reader(inner.outputs[0]) is None:
         return None
     shape = site.shape(sizes, node)
     return put(node, "Reshape", [source, shape], by=site.by, sources=[inner])
@@ -146,7 +141,7 @@ def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
         return None
     if perm == sorted(perm) and bypass(node.outputs[0], source):
         return node
-    if single_reader(inner.outputs[0]) is None:
+    if sole_reader(inner.outputs[0]) is None:
         return None
     return put(
         node,
@@ -175,7 +170,7 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
         return None
     if middle.name not in WIDENS.get(source, "").split():
         return None
-    if single_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
+    if sole_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
         return None
     attributes = {"to": node.attributes.get_int("to", 0)}
     return put(
@@ -193,7 +188,7 @@ def _slices(node: ir.Node, site: MergeSite) -> ir.Node | None:
     inner = _before(node)
     if inner is None or inner.op_type != "Slice" or site.opset < 10:
         return None
-    if single_reader(inner.outputs[0]) is None:
+    if sole_reader(inner.outputs[0]) is None:
         return None
     first, second = _window(inner), _window(node)
     if first is None or second is None or set(first[2]) & set(second[2]):
@@ -237,7 +232,7 @@ def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
             inner is not None
             and inner.op_type == "Concat"
             and inner.attributes.get_int("axis", 0) == axis
-            and single_reader(inner.outputs[0]) is node
+            and sole_reader(inner.outputs[0]) is node
         ):
             inputs.extend(inner.inputs)
             inner_nodes.append(inner)

@@ -5,8 +5,7 @@ import hashlib
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance
-from me2e_compress.graph.rewrite import can_replace
-from me2e_compress.passes.edits import bypass, has_subgraph, is_standard
+from me2e_compress.rewrite import bypass, can_replace, has_subgraph, is_standard
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
 

@@ -8,12 +8,12 @@ import onnx_ir as ir
 
 from me2e_compress import graph as graphs
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.edits import Array, graphs_of, remove_dead
 from me2e_compress.passes.fold_constants import commit, evaluation
 from me2e_compress.passes.fold_constants.choice import choose
 from me2e_compress.passes.fold_constants.knowledge import Sweep
 from me2e_compress.passes.fold_constants.ranges import seat_ranges
 from me2e_compress.passes.import_normalize import constants
+from me2e_compress.rewrite import Array, graphs_of, remove_dead
 
 __all__ = ["FoldConstants"]
 

@@ -5,9 +5,9 @@ import hashlib
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import add_constant, provenance, replace_value, value_names
-from me2e_compress.passes.edits import Array, put
+from me2e_compress.graph import provenance
 from me2e_compress.passes.fold_constants.choice import FoldChoice
+from me2e_compress.rewrite import Array, add_constant, put, replace_value, value_names
 
 
 def commit(

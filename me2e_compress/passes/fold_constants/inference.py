@@ -6,7 +6,7 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
-from me2e_compress.passes.edits import Array, is_standard
+from me2e_compress.rewrite import Array, is_standard
 
 
 def infer_node(

@@ -8,9 +8,10 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, static_shape
-from me2e_compress.passes.edits import NATIVE, Array, has_subgraph, is_standard
 from me2e_compress.passes.fold_constants import table
 from me2e_compress.passes.fold_constants.inference import infer_node
+from me2e_compress.passes.fold_constants.table import NATIVE
+from me2e_compress.rewrite import Array, has_subgraph, is_standard
 
 SMALL = 1024
 """Arrays up to so many elements are computed at once: shapes and indices are."""

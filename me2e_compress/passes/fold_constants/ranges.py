@@ -12,8 +12,9 @@ from collections.abc import Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import add_constant, provenance
+from me2e_compress.graph import provenance
 from me2e_compress.passes.fold_constants.inference import branch_fits
+from me2e_compress.rewrite import add_constant
 
 
 def seat_ranges(graph: ir.Graph, opsets: Mapping[str, int], by: str) -> int:

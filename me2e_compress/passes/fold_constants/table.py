@@ -12,7 +12,17 @@ from typing import Any
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.passes.edits import NATIVE, Array
+from me2e_compress.rewrite import Array
+
+NATIVE = frozenset(
+    {
+        *(ir.DataType.BOOL, ir.DataType.DOUBLE, ir.DataType.FLOAT, ir.DataType.FLOAT16),
+        *(ir.DataType.INT8, ir.DataType.INT16, ir.DataType.INT32, ir.DataType.INT64),
+        *(ir.DataType.UINT8, ir.DataType.UINT16),
+        *(ir.DataType.UINT32, ir.DataType.UINT64),
+    }
+)
+"""The element types that numpy itself computes with."""
 
 OLDEST_OPSET = 7
 """Broadcasting followed other rules before."""

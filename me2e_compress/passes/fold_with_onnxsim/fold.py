@@ -10,11 +10,12 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.errors import PassError
-from me2e_compress.graph import digest, load, node_count, save, sweep
+from me2e_compress.graph import digest, load, node_count, save
 from me2e_compress.graph.restore import restore
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_with_onnxsim import onnxsim_main
 from me2e_compress.passes.import_normalize.constants import lift
+from me2e_compress.rewrite import sweep
 
 _OWN_METADATA = "onnxsim."
 

@@ -10,11 +10,11 @@ import onnx_ir as ir
 from me2e_compress import graph as graphs
 from me2e_compress.graph import array_of
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.edits import graphs_of, is_standard, remove_dead
 from me2e_compress.passes.fuse_basic import activations, clip, linear
 from me2e_compress.passes.fuse_basic.affine import fuse_affine
 from me2e_compress.passes.fuse_basic.layer_norm import fuse_layer_norm
 from me2e_compress.passes.fuse_basic.match import Site, maker
+from me2e_compress.rewrite import graphs_of, is_standard, remove_dead
 
 __all__ = ["FuseBasic"]
 

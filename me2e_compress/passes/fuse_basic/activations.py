@@ -11,7 +11,6 @@ import math
 
 import onnx_ir as ir
 
-from me2e_compress.passes.edits import put, single_reader
 from me2e_compress.passes.fuse_basic.match import (
     Site,
     is_close,
@@ -21,6 +20,7 @@ from me2e_compress.passes.fuse_basic.match import (
     sole_maker,
 )
 from me2e_compress.passes.fuse_basic.products import Product, product_of, scaled
+from me2e_compress.rewrite import put, sole_reader
 
 SINCE = {"Gelu": 20, "HardSwish": 14, "Mish": 18, "Swish": 24}
 """The opset that brought each operator."""
@@ -42,7 +42,7 @@ def fuse_activation(node: ir.Node, site: Site) -> bool:
         return False
     for source, gate in (product.factors, product.factors[::-1]):
         found = _name(source, gate, product.scale)
-        if found is not None and single_reader(gate) is not None:
+        if found is not None and sole_reader(gate) is not None:
             return _replace(node, source, found, product, site)
     return False
 
@@ -176,10 +176,10 @@ def _is_relu6_plus_3(gate: ir.Value, source: ir.Value | None) -> ir.Value | None
 
 def _hard_sigmoid(node: ir.Node, product: Product, site: Site) -> bool:
     gate = product.factors[0]
-    if not is_close(product.scale, 1 / 6) or single_reader(gate) is None:
+    if not is_close(product.scale, 1 / 6) or sole_reader(gate) is None:
         return False
     source = _is_relu6_plus_3(gate, None)
-    reader = single_reader(node.outputs[0])
+    reader = sole_reader(node.outputs[0])
     if source is None or (reader is not None and source in reader.inputs):
         return False
     put(

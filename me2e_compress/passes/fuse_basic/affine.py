@@ -12,8 +12,7 @@ import dataclasses
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import add_constant, provenance, replace_value, static_shape
-from me2e_compress.passes.edits import Array, single_reader
+from me2e_compress.graph import provenance, static_shape
 from me2e_compress.passes.fuse_basic.match import (
     Numbers,
     Site,
@@ -21,6 +20,7 @@ from me2e_compress.passes.fuse_basic.match import (
     numbers_of,
     sole_maker,
 )
+from me2e_compress.rewrite import Array, add_constant, replace_value, sole_reader
 
 LAYERS = ("Conv", "ConvTranspose", "Gemm")
 
@@ -148,7 +148,7 @@ def _objection(
     value = layer.inputs[1]
     if value is None or value.dtype is None:
         return f"{layer.op_type} of unknown type"
-    if not (scale == 1).all() and single_reader(value) is None:
+    if not (scale == 1).all() and sole_reader(value) is None:
         return f"{layer.op_type} that shares its weights"
     limit = np.finfo(value.dtype.numpy()).max
     if not (np.all(np.abs(weight) <= limit) and np.all(np.abs(bias) <= limit)):
@@ -161,7 +161,7 @@ def _write(
 ) -> None:
     old = layer.inputs[1]
     kind = old.dtype.numpy() if old is not None and old.dtype is not None else None
-    if old is not None and single_reader(old) is layer:
+    if old is not None and sole_reader(old) is layer:
         old.const_value = ir.tensor(weight.astype(kind), name=old.name)
     _write_bias(layer, site, bias.astype(kind))
     if layer.op_type == "Gemm":
@@ -173,7 +173,7 @@ def _write(
 
 def _write_bias(layer: ir.Node, site: Site, bias: Array) -> None:
     old = layer.inputs[2] if len(layer.inputs) > 2 else None
-    if old is not None and single_reader(old) is layer:
+    if old is not None and sole_reader(old) is layer:
         old.const_value = ir.tensor(np.ascontiguousarray(bias), name=old.name)
         old.shape = ir.Shape(bias.shape)
         return

@@ -7,9 +7,9 @@ Result:  Clip(x, 0, 6)
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import add_constant, array_of, static_shape
-from me2e_compress.passes.edits import Array, put
+from me2e_compress.graph import array_of, static_shape
 from me2e_compress.passes.fuse_basic.match import Site, sole_maker
+from me2e_compress.rewrite import Array, add_constant, put
 
 SINCE = 12
 """The opset from which Clip takes its bounds as inputs, for all types."""

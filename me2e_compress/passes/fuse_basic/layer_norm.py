@@ -9,8 +9,7 @@ import dataclasses
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import add_constant, array_of, static_shape
-from me2e_compress.passes.edits import put, single_reader
+from me2e_compress.graph import array_of, static_shape
 from me2e_compress.passes.fuse_basic.match import (
     Site,
     constant_and_rest,
@@ -18,6 +17,7 @@ from me2e_compress.passes.fuse_basic.match import (
     scalar_of,
     sole_maker,
 )
+from me2e_compress.rewrite import add_constant, put, sole_reader
 
 KINDS = (ir.DataType.FLOAT, ir.DataType.FLOAT16)
 SINCE = 17
@@ -119,7 +119,7 @@ def _affine(
     node: ir.Node, op_type: str, shape: tuple[int, ...]
 ) -> tuple[ir.Node, ir.Value | None]:
     """Step over the Mul (Add) that scales (shifts) what was normalized."""
-    reader = single_reader(node.outputs[0])
+    reader = sole_reader(node.outputs[0])
     if reader is None or reader.op_type != op_type or reader.graph is not node.graph:
         return node, None
     for value in reader.inputs:

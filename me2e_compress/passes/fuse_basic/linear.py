@@ -10,14 +10,7 @@ attention patterns and misplace the quantizers.
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import (
-    add_constant,
-    array_of,
-    provenance,
-    replace_value,
-    static_shape,
-)
-from me2e_compress.passes.edits import FLOATS, put, single_reader
+from me2e_compress.graph import array_of, provenance, static_shape
 from me2e_compress.passes.fuse_basic.match import (
     Numbers,
     Site,
@@ -25,6 +18,7 @@ from me2e_compress.passes.fuse_basic.match import (
     numbers_of,
     sole_maker,
 )
+from me2e_compress.rewrite import FLOATS, add_constant, put, replace_value, sole_reader
 
 CANCELLATION = 1e3
 """Constants that cancel more than three decimal digits are not added up ahead."""
@@ -122,9 +116,7 @@ def _factor(node: ir.Node) -> tuple[Numbers, ir.Value] | None:
 
 def _is_owned(node: ir.Node, index: int) -> bool:
     value = node.inputs[index]
-    return (
-        value is not None and value.is_initializer() and (single_reader(value) is node)
-    )
+    return value is not None and value.is_initializer() and (sole_reader(value) is node)
 
 
 def _fits(numbers: Numbers, kind: ir.DataType) -> bool:

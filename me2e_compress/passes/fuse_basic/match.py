@@ -8,7 +8,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
-from me2e_compress.passes.edits import FLOATS, is_standard, single_reader
+from me2e_compress.rewrite import FLOATS, is_standard, sole_reader
 
 Numbers = npt.NDArray[np.float64]
 
@@ -43,7 +43,7 @@ def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
 def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
     """Give the maker of a value that one node reads, of the same graph."""
     node = maker(value, *op_types)
-    if node is None or value is None or single_reader(value) is None:
+    if node is None or value is None or sole_reader(value) is None:
         return None
     return node if value is node.outputs[0] else None
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.errors import PreconditionError
 from me2e_compress.targets.onnxruntime.kernels import biased_end
 from me2e_compress.targets.onnxruntime.writer import Writer
@@ -44,7 +44,7 @@ def write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Node
     if len(leading) > 1:
         answer = place.restored(answer, left, leading, size[1], name)
     answer.shape, answer.type = old.shape, old.type
-    graph.replace_value(old, answer)
+    rewrite.replace_value(old, answer)
     return gemm
 
 

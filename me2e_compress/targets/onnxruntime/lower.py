@@ -2,7 +2,7 @@
 
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.errors import FramesError
 from me2e_compress.targets.onnxruntime.draft import Draft
 from me2e_compress.targets.onnxruntime.grid import Grid
@@ -38,5 +38,5 @@ def lower(draft: Draft) -> ir.Model:
     write_pairs(writer, region, grids)
     for layer, weight, step in jobs:
         write_layer(writer, layer, weight, step)
-    graph.sweep(draft.model)
+    rewrite.sweep(draft.model)
     return draft.model

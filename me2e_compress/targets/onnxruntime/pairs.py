@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.targets.onnxruntime.grid import Grid
 from me2e_compress.targets.onnxruntime.region import Region
 from me2e_compress.targets.onnxruntime.writer import Writer
@@ -64,5 +64,5 @@ def _pair(
 
 def _hand_over(value: ir.Value, heir: ir.Value, quantize: ir.Node) -> None:
     """Make the dequantized tensor the output of the graph, under the old name."""
-    graph.replace_value(value, heir)
+    rewrite.replace_value(value, heir)
     quantize.replace_input_with(0, value)

@@ -2,10 +2,10 @@
 
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph.rewrite import can_replace
+from me2e_compress.rewrite import can_replace
 from me2e_compress.targets.onnxruntime.draft import Draft
 from me2e_compress.targets.onnxruntime.kernels import LAYERS, is_layer
 from me2e_compress.targets.onnxruntime.stored_constants import (
@@ -50,12 +50,12 @@ def draft_of_qdq(model: ir.Model) -> Draft:
         bias = bias_of(node)
         if bias is not None:
             name = f"{node.inputs[2].name}_stored" if node.inputs[2] else ""
-            node.replace_input_with(2, graph.add_constant(copy.graph, bias, name))
+            node.replace_input_with(2, rewrite.add_constant(copy.graph, bias, name))
     weights = {node: weight_of(node) for node in layers if is_layer(node)}
     for node, value in pairs.items():
         if can_replace(node.outputs[0], value):
-            graph.replace_value(node.outputs[0], value)
-    graph.sweep(copy)
+            rewrite.replace_value(node.outputs[0], value)
+    rewrite.sweep(copy)
     return Draft(
         copy,
         {str(n.outputs[0].name): w for n, w in weights.items() if w is not None},

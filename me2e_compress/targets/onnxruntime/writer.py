@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.graph import provenance
 
 BY = "quantize-int8"
@@ -23,14 +23,14 @@ class Writer:
     def __init__(self, where: ir.Graph) -> None:
         self.graph = where
         self._constants: dict[tuple[str, bytes], ir.Value] = {}
-        self._names = graph.value_names(where)
+        self._names = rewrite.value_names(where)
 
     def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
         """Give the initializer that holds an array, a new one if there is none."""
         kind = f"{array.dtype}{array.shape}"
         key = (kind, hashlib.sha256(array.tobytes()).digest())
         if key not in self._constants:
-            self._constants[key] = graph.add_constant(
+            self._constants[key] = rewrite.add_constant(
                 self.graph, array, name, self._names
             )
         return self._constants[key]
@@ -52,7 +52,7 @@ class Writer:
             sources: the nodes whose heir it is, the leading one first.
             attributes: integers.
         """
-        unique = graph.fresh_name(name, self._names)
+        unique = rewrite.fresh_name(name, self._names)
         node = ir.node(op, inputs, attributes or {}, name=unique)
         node.outputs[0].name = unique
         provenance.inherit(node, sources, by=BY)

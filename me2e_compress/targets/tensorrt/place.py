@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
@@ -70,7 +70,7 @@ def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
     writer = _Writer(copy.graph, share_scales(plan, ranges))
     for decision in plan.chosen:
         writer.apply(nodes[decision.output], decision, weights.get(decision.output))
-    graph.sweep(copy)
+    rewrite.sweep(copy)
     return copy
 
 
@@ -83,7 +83,7 @@ class _Writer:
         self._activations: dict[str, ir.Value] = {}
         self._weights: dict[tuple[str, int | None], ir.Value] = {}
         self._zero: ir.Value | None = None
-        self._names = graph.value_names(where)
+        self._names = rewrite.value_names(where)
 
     def apply(
         self, node: ir.Node, decision: Decision, weight: QuantizedWeight | None
@@ -139,7 +139,7 @@ class _Writer:
         return self._weights[key]
 
     def _constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-        return graph.add_constant(self._graph, array, name, self._names)
+        return rewrite.add_constant(self._graph, array, name, self._names)
 
     def _node(
         self,
@@ -149,7 +149,7 @@ class _Writer:
         like: ir.Value,
         reader: ir.Node,
     ) -> ir.Node:
-        unique = graph.fresh_name(f"{name}_{op}", self._names)
+        unique = rewrite.fresh_name(f"{name}_{op}", self._names)
         node = ir.node(op, inputs, name=unique)
         output = node.outputs[0]
         output.name, output.shape, output.type = unique, like.shape, like.type

@@ -6,7 +6,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
+from me2e_compress import rewrite
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import rules_named
@@ -85,7 +85,7 @@ def _float_reader(model: ir.Model) -> None:
 
 def _float_weight(model: ir.Model) -> None:
     conv = next(n for n in model.graph if n.op_type == "Conv")
-    weight = graph.add_constant(model.graph, np.ones((8, 3, 3, 3), np.float32), "v")
+    weight = rewrite.add_constant(model.graph, np.ones((8, 3, 3, 3), np.float32), "v")
     conv.replace_input_with(1, weight)
 
 

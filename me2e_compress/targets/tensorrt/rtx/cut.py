@@ -2,7 +2,7 @@
 
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError
 from me2e_compress.targets.finding import is_standard
 
@@ -30,7 +30,7 @@ def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
     names = tuple(node.name or str(node.outputs[0].name) for node in gone)
     for node in gone:
         _detach(copy.graph, node)
-    graph.sweep(copy)
+    rewrite.sweep(copy)
     return copy, names
 
 

@@ -1,16 +1,16 @@
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.graph import provenance
-from me2e_compress.graph.rewrite import can_replace
+from me2e_compress.rewrite import can_replace
 
 
 def test_replacing_an_output_keeps_its_name(driver: ir.Model) -> None:
     plan = driver.graph.outputs[0]
     features = driver.graph[0].outputs[0]
     before = graph.interface(driver)
-    graph.replace_value(plan, features)
+    rewrite.replace_value(plan, features)
     assert graph.interface(driver) == before
     assert driver.graph.outputs[0] is features
 
@@ -24,15 +24,15 @@ def test_an_inner_value_can_be_replaced_by_an_input(driver: ir.Model) -> None:
 
 
 def test_a_constant_takes_a_free_name(driver: ir.Model) -> None:
-    first = graph.add_constant(driver.graph, np.zeros(2, np.float32), "c")
-    second = graph.add_constant(driver.graph, np.ones(2, np.float32), "c")
+    first = rewrite.add_constant(driver.graph, np.zeros(2, np.float32), "c")
+    second = rewrite.add_constant(driver.graph, np.ones(2, np.float32), "c")
     assert (first.name, second.name) == ("c", "c_1")
 
 
 def test_a_constant_is_not_called_like_a_tensor(driver: ir.Model) -> None:
     taken = [str(driver.graph[0].outputs[0].name), str(driver.graph.inputs[0].name)]
 
-    made = [graph.add_constant(driver.graph, np.zeros(2), name) for name in taken]
+    made = [rewrite.add_constant(driver.graph, np.zeros(2), name) for name in taken]
 
     assert [value.name for value in made] == [f"{name}_1" for name in taken]
 

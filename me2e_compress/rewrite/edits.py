@@ -1,0 +1,168 @@
+"""The edits that every rewrite is made of; none of them touches the interface."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import onnx_ir as ir
+import onnx_ir.passes.common as common
+
+from me2e_compress.errors import GraphError
+from me2e_compress.graph import graphs_of, provenance
+from me2e_compress.rewrite.values import Array, is_read
+
+
+def value_names(graph: ir.Graph) -> set[str]:
+    """Collect the names of all values of a graph and of the bodies inside it."""
+    names: set[str] = set()
+    for body in (graph, *graph.subgraphs()):
+        names.update(value.name or "" for value in body.inputs)
+        names.update(body.initializers)
+        names.update(value.name or "" for node in body for value in node.outputs)
+    return names
+
+
+def fresh_name(name: str, names: set[str]) -> str:
+    """Take ``name``, or ``name_1``, ... where that is taken, and enter it."""
+    unique, count = name, 0
+    while unique in names:
+        count += 1
+        unique = f"{name}_{count}"
+    names.add(unique)
+    return unique
+
+
+def add_constant(
+    graph: ir.Graph, array: Array, name: str, names: set[str] | None = None
+) -> ir.Value:
+    """Register an initializer under this name, or ``name_1``, ... where it is taken.
+
+    Args:
+        graph: where.
+        array: what it holds.
+        name: what to call it, if that is free.
+        names: those that are taken, the new one is entered; None to look at the whole
+            graph, which whoever adds thousands had better do once.
+    """
+    unique = fresh_name(name, value_names(graph) if names is None else names)
+    flat = np.ascontiguousarray(array).reshape(array.shape)
+    tensor = ir.tensor(flat, name=unique)
+    value = ir.Value(
+        name=unique,
+        shape=ir.Shape(array.shape),
+        type=ir.TensorType(tensor.dtype),
+        const_value=tensor,
+    )
+    graph.register_initializer(value)
+    return value
+
+
+def can_replace(old: ir.Value, new: ir.Value) -> bool:
+    """Return whether ``new`` may stand for ``old`` without touching the interface."""
+    if not old.is_graph_output():
+        return True
+    return not (
+        new.is_graph_output()
+        or new.is_graph_input()
+        or new.is_initializer()
+        or new.graph is not old.graph
+    )
+
+
+def replace_value(old: ir.Value, new: ir.Value) -> None:
+    """Let every reader of one value read another; a graph output keeps its name.
+
+    Where ``old`` is a graph output, ``new`` takes its place and its name, so that the
+    interface stays as it was.
+
+    Raises:
+        GraphError: ``old`` is a graph output, and ``new`` cannot be it, being an
+            input, an initializer, another output or of another graph.
+    """
+    if not old.is_graph_output():
+        old.replace_all_uses_with(new)
+        return
+    graph = old.graph
+    if graph is None or not can_replace(old, new):
+        raise GraphError(f"output {old.name} cannot be made of {new.name}: add a node")
+    name, shape, kind = old.name, old.shape, old.type
+    old.replace_all_uses_with(new, replace_graph_outputs=True)
+    old.name = fresh_name(f"{name}_replaced", value_names(graph))
+    new.name, new.shape, new.type = name, shape, kind
+
+
+def bypass(old: ir.Value, new: ir.Value) -> bool:
+    """Let the readers of one value read another, if the interface allows it."""
+    if not can_replace(old, new):
+        return False
+    replace_value(old, new)
+    return True
+
+
+def put(
+    old: ir.Node,
+    op_type: str,
+    inputs: Sequence[ir.Value | None],
+    *,
+    by: str,
+    sources: Sequence[ir.Node] = (),
+    attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
+) -> ir.Node:
+    """Put a standard operator in a node's place; it takes over output and name.
+
+    Args:
+        old: the node whose first output lives on; it is removed.
+        op_type: the operator that takes its place.
+        inputs: what it reads.
+        by: the pass's name.
+        sources: the other nodes it stands for.
+        attributes: its attributes.
+
+    Raises:
+        GraphError: another output of the node is read.
+    """
+    graph, result = old.graph, old.outputs[0]
+    if not isinstance(graph, ir.Graph):
+        raise GraphError(f"node {old.name} stands in no graph: nothing to replace")
+    if read := [value.name for value in old.outputs[1:] if is_read(value)]:
+        raise GraphError(f"node {old.name} cannot be replaced: {read[0]} is read too")
+    new = ir.node(op_type, inputs, attributes, name=old.name, num_outputs=1)
+    new.outputs[0].shape, new.outputs[0].type = result.shape, result.type
+    new.outputs[0].name = result.name
+    provenance.inherit(new, (old, *sources), by=by)
+    graph.insert_before(old, new)
+    replace_value(result, new.outputs[0])
+    graph.remove(old, safe=True)
+    return new
+
+
+def remove_dead(graph: ir.Graph) -> int:
+    """Remove the nodes, and the initializers, that nothing reads; count the nodes.
+
+    Initializers go silently where a removed node was their last reader, but those
+    that were idle from the start count.
+    """
+    idle = sum(len(_idle(inner)) for inner in graphs_of(graph))
+    count = 0
+    for inner in reversed(list(graphs_of(graph))):
+        for node in reversed(inner):
+            if not any(is_read(value) for value in node.outputs):
+                inner.remove(node, safe=True)
+                count += 1
+    for inner in graphs_of(graph):
+        for value in _idle(inner):
+            del inner.initializers[value.name or ""]
+    return count + idle
+
+
+def _idle(graph: ir.Graph) -> list[ir.Value]:
+    return [
+        value
+        for value in graph.initializers.values()
+        if not is_read(value) and not value.is_graph_input()
+    ]
+
+
+def sweep(model: ir.Model) -> None:
+    """Drop the nodes, weights and functions that nothing reads any more."""
+    common.RemoveUnusedNodesPass()(model)
+    common.RemoveUnusedFunctionsPass()(model)  # type: ignore[no-untyped-call]
