@@ -41,7 +41,8 @@ from me2e_compress.quantization.plan import (
     QuantPlan,
     make_plan,
 )
-from me2e_compress.quantization.rules import WEIGHTED, tensorrt_rules
+from me2e_compress.quantization.rules import WEIGHTED
+from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
 from me2e_compress.runtime.interleaved import race
@@ -103,7 +104,7 @@ def compare_plans(subject: Subject, theirs: Reads, rounds: int) -> None:
     graph.infer_shapes(model)
     modules = ModuleMap.load(str(subject.map))
     scheme = QuantScheme.named("full", modules)
-    plan = make_plan(model, scheme, tensorrt_rules())
+    plan = make_plan(model, scheme, TensorRTRules())
     differing = [
         each for each in plan.decisions if (each.dtype == INT8) != (each.node in theirs)
     ]
@@ -241,7 +242,7 @@ def time_planning() -> None:
     ready = manager.run(model, Context(modules)).model
     graph.infer_shapes(ready)
     start = process_time()
-    plan = make_plan(ready, QuantScheme.named("feature-ext", modules), tensorrt_rules())
+    plan = make_plan(ready, QuantScheme.named("feature-ext", modules), TensorRTRules())
     spent = process_time() - start
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
     print(f"\n{len(plan.decisions)} nodes planned in {spent:.3f} CPU s: {counts}")

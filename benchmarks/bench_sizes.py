@@ -20,7 +20,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.modules import ModuleMap
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.rules import RULE_SETS, rules_named
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 
@@ -44,8 +44,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=options.out) as folder:
         for scheme in PAPER_MB:
-            for rules in RULE_SETS:
-                for target in TARGETS:
+            for rules in RULE_SETS.names():
+                for target in TARGETS.names():
                     made = placed(model, scheme, rules, target)
                     saved = Path(folder) / "placed.onnx"
                     graph.save(made, saved)
@@ -55,10 +55,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 def placed(model: ir.Model, scheme: str, rules: str, target: str) -> ir.Model:
     """Make one variant, every range [-1, 1]."""
     chosen = QuantScheme.named(scheme, ModuleMap.load("vad"))
-    plan = make_plan(model, chosen, rules_named(rules))
-    names = TARGETS[target].tensors(plan, model)
+    plan = make_plan(model, chosen, RULE_SETS.parse(rules))
+    names = TARGETS.parse(target).tensors(plan, model)
     ranges = Ranges(dict.fromkeys(names, (-1.0, 1.0)), "none", 0, "", "")
-    return TARGETS[target].place(model, plan, ranges)
+    return TARGETS.parse(target).place(model, plan, ranges)
 
 
 def show(

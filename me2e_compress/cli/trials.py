@@ -16,10 +16,10 @@ from me2e_compress.cli.console import progress
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import Given, check_output
 from me2e_compress.modules import map_of
-from me2e_compress.quantization.rules import rules_named
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
-from me2e_compress.targets import target_named
+from me2e_compress.targets import TARGETS
 
 Model = Annotated[Path, typer.Argument(help="the float ONNX file", parser=model_path)]
 Recording = Annotated[Path, typer.Argument(help="the recorded FRAMES")]
@@ -59,7 +59,7 @@ class Setting:
 
     def trials(self, drive: Drive | None = None) -> tuple[Trials, tuple[str, ...]]:
         """Prepare the graph, calibrate once, and name the modules to try."""
-        rules, target = rules_named(self.rules), target_named(self.target)
+        rules, target = RULE_SETS.parse(self.rules), TARGETS.parse(self.target)
         recording = CalibrationSet(self.frames)
         loaded = graph.load(self.model)
         recording.check(loaded)

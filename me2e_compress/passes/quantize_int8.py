@@ -19,9 +19,9 @@ from me2e_compress.quantization.plan import (
     sharing_costs,
     stamp_plan,
 )
-from me2e_compress.quantization.rules import rules_named
+from me2e_compress.quantization.rules import RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import target_named
+from me2e_compress.targets import TARGETS
 from me2e_compress.targets.lint import lint
 from me2e_compress.targets.quantized import describe_quantized
 
@@ -46,10 +46,12 @@ class QuantizeInt8(Pass):
         scheme: ``feature-ext``, ``prediction`` or ``full``.
         modules: module names instead of a scheme.
         rules: ``paper``, its two stages alone; ``tensorrt``, with what its kernels
-            and coordinates need besides.
-        without: ids of rules that are switched off, e.g. ``gemv``.
+            and coordinates need besides; a rule set of your own; each with options,
+            ``paper{extra=[my-rule]}``.
+        without: names of rules that are switched off, e.g. ``gemv``.
         target: who will run the graph.
-        attention_limit: longest attention that becomes int8, in tokens.
+        attention_limit: longest attention that becomes int8, in tokens; None leaves it
+            to the rules (512).
         overrides: TOML file of exceptions to the plan.
         method: how ranges are read from the frames: ``max-min``,
             ``moving-average:W``, ``percentile:P``, ``mse`` or ``entropy``.
@@ -65,7 +67,7 @@ class QuantizeInt8(Pass):
     rules: str = "paper"
     without: tuple[str, ...] = ()
     target: str = "tensorrt"
-    attention_limit: int = 512
+    attention_limit: int | None = None
     overrides: Path | None = None
     method: str = "max-min"
     ranges: Path | None = None
@@ -90,7 +92,7 @@ class QuantizeInt8(Pass):
                 " give the float graph that it was made of, or let lower-int8 rewrite"
                 " this one for onnxruntime"
             )
-        target = target_named(self.target)
+        target = TARGETS.parse(self.target)
         graph.infer_shapes(model)
         plan = self._placeable(model, context)
         tensors = target.tensors(plan, model)
@@ -120,19 +122,26 @@ class QuantizeInt8(Pass):
         overrides = Overrides()
         if self.overrides is not None:
             overrides = Overrides.load(self.overrides)
-        rules = rules_named(self.rules, self.attention_limit).without(self.without)
-        return make_plan(model, self._scheme(context), rules, overrides)
+        return make_plan(model, self._scheme(context), self._rules(), overrides)
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Name what its target reads in int8."""
         plan = self._placeable(model, context)
-        return target_named(self.target).tensors(plan, model)
+        return TARGETS.parse(self.target).tensors(plan, model)
 
     def _placeable(self, model: ir.Model, context: Context) -> QuantPlan:
         """Plan, and note what the target leaves in float nevertheless."""
         plan = self.plan(model, context)
-        kept_float = target_named(self.target).kept_float(plan, model)
+        kept_float = TARGETS.parse(self.target).kept_float(plan, model)
         return dataclasses.replace(plan, kept_float=kept_float)
+
+    def _rules(self) -> RuleSet:
+        """Build the rule set; what this pass says of it counts."""
+        rules = RULE_SETS.parse(self.rules)
+        options: dict[str, object] = {"without": (*rules.without, *self.without)}
+        if self.attention_limit is not None:
+            options["attention_limit"] = self.attention_limit
+        return RULE_SETS.with_options(rules, options)
 
     def _scheme(self, context: Context) -> QuantScheme:
         if self.modules:

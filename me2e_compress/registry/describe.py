@@ -57,8 +57,9 @@ def first_line(cls: type) -> str:
 
 
 def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
-    """Return the fields of a dataclass that are its options."""
-    return tuple(field for field in dataclasses.fields(cls) if field.init)
+    """Return the fields of a dataclass that are its options, those by keyword last."""
+    fields = [field for field in dataclasses.fields(cls) if field.init]
+    return tuple(sorted(fields, key=lambda field: field.kw_only is True))
 
 
 def options_of(cls: type) -> tuple[Option, ...]:

@@ -118,6 +118,11 @@ class Registry(Generic[T]):
             raise self.error(f"{name}: {where}: {first['msg']}") from error
         return made
 
+    def with_options(self, item: T, options: Mapping[str, object]) -> T:
+        """Make an item like another, with other options; see :meth:`build`."""
+        values = {each.name: getattr(item, each.name) for each in fields_of(type(item))}
+        return self.make(type(item), {**values, **options})
+
     def parse(self, text: str) -> T:
         """Make an item from ``name``, ``name{option=value, ...}`` or ``name:value``.
 

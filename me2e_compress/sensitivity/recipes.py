@@ -125,8 +125,8 @@ def write_recipe(
             "[[pass]]",
             'name = "quantize-int8"',
             f"modules = {_array(choice.modules)}",
-            f'rules = "{rules}"',
-            f'target = "{target}"',
+            f"rules = {_string(rules)}",
+            f"target = {_string(target)}",
         ]
         if choice.floats:
             options.append(f"overrides = {_string(overrides.name)}")

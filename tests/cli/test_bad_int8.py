@@ -154,8 +154,8 @@ def test_formats_that_are_not_made(refused: Refused, dense: Path, wanted: str) -
     how = ("--scheme", "full", *frames)
 
     assert f"no scheme {wanted}; " in refused("--scheme", wanted, *frames)
-    assert f"no rule set {wanted}; " in refused(*how, "--rules", wanted)
-    assert f"no target {wanted}; " in refused(*how, "--target", wanted)
+    assert f"no rule set '{wanted}'; " in refused(*how, "--rules", wanted)
+    assert f"no target '{wanted}'; " in refused(*how, "--target", wanted)
     assert f"no calibration method '{wanted}'; " in refused(*how, "--method", wanted)
     line = refused(*how, "--overrides", dense / "o.toml")
     assert f"dtype {wanted}: int8 and float are what there is" in line

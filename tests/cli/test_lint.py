@@ -54,7 +54,7 @@ def test_no_such_target(
     command: Command, twisted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command("lint", twisted, "--target", "npu") == 1
-    assert "no rules for target npu; there are tensorrt" in capsys.readouterr().err
+    assert "no target 'npu'; there are tensorrt" in capsys.readouterr().err
 
 
 def test_trt_check_says_what_was_asked_and_of_whom(

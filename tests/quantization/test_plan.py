@@ -6,13 +6,8 @@ import pytest
 
 from me2e_compress.errors import ModuleMapError, RecipeError
 from me2e_compress.quantization.plan import Decision, make_plan, tensors_of
-from me2e_compress.quantization.rules import (
-    RuleSet,
-    WeightedOperator,
-    WeightOperand,
-    paper_rules,
-    tensorrt_rules,
-)
+from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
+from me2e_compress.quantization.rules.stages import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, conv_attention, net
 
@@ -88,7 +83,7 @@ def test_short_attention_becomes_int8_on_both_sides(variant: str) -> None:
 def test_the_limit_is_an_option() -> None:
     model = net(ATTENTION % {"q": 65, "k": 16, "body": VARIANTS["plain"]}, {})
 
-    plan = make_plan(model, HEAD, paper_rules(attention_limit=64))
+    plan = make_plan(model, HEAD, PaperRules(attention_limit=64))
 
     assert plan.counts() == {"attention-length": 2}
 
@@ -219,7 +214,7 @@ def test_unknown_schemes_and_modules_are_errors() -> None:
 def test_a_rule_can_be_switched_off() -> None:
     model = net(LINEAR % ("1,64", "64,32", "1,32"), {"w": np.ones((64, 32))})
 
-    plan = make_plan(model, HEAD, RuleSet("own", (WeightedOperator(), WeightOperand())))
+    plan = make_plan(model, HEAD, PaperRules(without=("gemv",)))
 
     assert plan.counts() == {"layer": 1}
 
@@ -250,7 +245,7 @@ def test_five_thousand_nodes_are_planned_in_two_seconds() -> None:
     model = diamonds(1250)
     start = time.process_time()
 
-    plan = make_plan(model, HEAD, tensorrt_rules())
+    plan = make_plan(model, HEAD, TensorRTRules())
 
     assert len(plan.decisions) > 5000
     assert time.process_time() - start < 2

@@ -15,7 +15,7 @@ from me2e_compress.quantization.plan import (
     save_plan,
     stamp_plan,
 )
-from me2e_compress.quantization.rules import paper_rules
+from me2e_compress.quantization.rules.stages import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, conv_attention
 
@@ -48,7 +48,7 @@ def test_differences_name_what_changed_and_by_which_rule() -> None:
     model = conv_attention()
     overrides = Overrides.parse('[[override]]\nop = "Conv"\ndtype = "float"')
     old = make_plan(model, FULL)
-    new = make_plan(model, FULL, paper_rules(attention_limit=8), overrides)
+    new = make_plan(model, FULL, PaperRules(attention_limit=8), overrides)
 
     assert [str(each) for each in differences(old, new)] == [
         "/backbone/Conv: int8 (layer) -> float (override)",

@@ -15,7 +15,7 @@ from me2e_compress.quantization.plan import (
     share_scales,
     sharing_costs,
 )
-from me2e_compress.quantization.rules import paper_rules, tensorrt_rules
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, net
 
@@ -140,7 +140,7 @@ def joined(overrides: str = "", rules: str = "tensorrt") -> QuantPlan:
     model = net(
         CONCAT, {"w": np.ones((16, 16)), "v": np.ones((48, 16)), "u": np.ones((80, 16))}
     )
-    chosen = tensorrt_rules() if rules == "tensorrt" else paper_rules()
+    chosen = RULE_SETS.parse(rules)
     return make_plan(model, FULL, chosen, Overrides.parse(overrides))
 
 

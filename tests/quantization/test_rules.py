@@ -1,13 +1,22 @@
 """The rules beyond the paper's two stages."""
 
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
 import numpy as np
 import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import RecipeError
+from me2e_compress.graph import static_shape
+from me2e_compress.passes import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
-from me2e_compress.quantization.rules import rules_named, tensorrt_rules
+from me2e_compress.quantization.rules import RULE_SETS, Facts, Rule, RuleSet
+from me2e_compress.quantization.rules.stages import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
+from tests.installed import install
 from tests.nets import MODULES, net
 
 HEAD = QuantScheme.of(("head",), MODULES)
@@ -15,7 +24,7 @@ OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
 
 
 def planned(model: ir.Model, rules: str = "tensorrt") -> QuantPlan:
-    return make_plan(model, HEAD, rules_named(rules))
+    return make_plan(model, HEAD, RULE_SETS.parse(rules))
 
 
 def by_output(plan: QuantPlan) -> dict[str, Decision]:
@@ -23,14 +32,14 @@ def by_output(plan: QuantPlan) -> dict[str, Decision]:
 
 
 def test_no_such_rule_set() -> None:
-    with pytest.raises(RecipeError, match="no rule set nvidia; there are paper, tens"):
-        rules_named("nvidia")
+    with pytest.raises(RecipeError, match="no rule set 'nvidia'; there are paper"):
+        RULE_SETS.parse("nvidia")
 
 
 def test_rules_can_be_switched_off_one_by_one() -> None:
-    left = tensorrt_rules().without(("gemv", "coordinates"))
+    left = RULE_SETS.parse("tensorrt{without=[gemv, coordinates]}")
 
-    assert [rule.id for rule in left.rules] == [
+    assert [rule.name for rule in left.rules()] == [
         "operator", "module", "weight", "attention-length", "small-product",
         "narrow-convolution",
     ]  # fmt: skip
@@ -39,7 +48,7 @@ def test_rules_can_be_switched_off_one_by_one() -> None:
 @pytest.mark.parametrize("name", ["weight", "speed"])
 def test_other_rules_cannot(name: str) -> None:
     with pytest.raises(RecipeError, match=f"rule {name} cannot be switched off; of pa"):
-        rules_named("paper").without((name,))
+        RULE_SETS.parse(f"paper{{without=[{name}]}}").rules()
 
 
 @pytest.mark.parametrize(
@@ -205,9 +214,63 @@ def test_borderline_attention_is_reported(queries: int, keys: int, remark: str) 
         f" => (float[{queries},32] y)"
         " { s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v) }"
     )
-    plan = make_plan(net(text, {}), HEAD, tensorrt_rules())
+    plan = make_plan(net(text, {}), HEAD, RULE_SETS.parse("tensorrt"))
 
     assert [remark in each.borderline for each in plan.decisions] == [
         True, not remark, True,
     ]  # fmt: skip
     assert len(plan.borderline) == (2 if remark else 0)
+
+
+@dataclass(frozen=True)
+class OnlySmall(Rule):
+    """Products of more than some columns stay float."""
+
+    name: ClassVar[str] = "only-small"
+    columns: int = 8
+
+    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+        shape = static_shape(node.outputs[0])
+        return "too wide" if shape and shape[-1] > self.columns else None
+
+
+def test_a_rule_of_another_package_joins_a_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = {"only-small": f"{__name__}:OnlySmall"}
+    install(monkeypatch, tmp_path, "a-rule", "me2e_compress.rules", entry)
+    model = net(PRODUCTS, {"w": np.ones((32, 32)), "v": np.ones((32, 64))})
+
+    plan = planned(model, "paper{extra=[only-small{columns=32}]}")
+
+    assert by_output(plan)["y"].rule == "layer"
+    assert by_output(plan)["z"].rule == "only-small"
+    assert plan.rules == 'paper{extra=["only-small{columns=32}"]}'
+
+
+PRODUCTS = OPSETS + (
+    "p (float[9,32] x, float[32,32] w, float[32,64] v)"
+    " => (float[9,32] y, float[9,64] z) { y = MatMul(x, w) z = MatMul(x, v) }"
+)
+
+
+@dataclass(frozen=True)
+class NoRules(RuleSet):
+    """Everything that can be is int8."""
+
+    name: ClassVar[str] = "no-rules"
+
+    def own_rules(self) -> tuple[Rule, ...]:
+        return PaperRules().own_rules()[:3]
+
+
+def test_a_set_of_another_package_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = {"no-rules": f"{__name__}:NoRules"}
+    install(monkeypatch, tmp_path, "a-set", "me2e_compress.rule_sets", entry)
+    model = net(PRODUCTS, {"w": np.ones((32, 32)), "v": np.ones((32, 64))})
+
+    assert planned(model, "no-rules").counts()["layer"] == 2
+    with pytest.raises(RecipeError, match="no-rules has no option 'attention_limit'"):
+        QuantizeInt8(rules="no-rules", attention_limit=8).plan(model, Context(MODULES))

@@ -13,7 +13,7 @@ from me2e_compress.fidelity.compare import Displacement, Fidelity
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.rules import rules_named
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.sensitivity import (
     Budget,
     Drive,
@@ -81,8 +81,8 @@ def trials(tmp_path: Path, bad: int) -> Trials:
     ]
     recording = CalibrationSet(record(tmp_path / "frames", frames))
     model = delicate(bad)
-    target = TARGETS["tensorrt"]
-    rules = rules_named("paper")
+    target = TARGETS.parse("tensorrt")
+    rules = RULE_SETS.parse("paper")
     everything = QuantizeInt8(scheme="full").plan(model, Context(MODULES))
     ranges = Calibrator(threads=1).run(
         model, target.tensors(everything, model), recording
@@ -208,7 +208,7 @@ def test_a_recipe_without_int8_has_no_int8(tmp_path: Path) -> None:
 
 def driven(judge: Trials, drive: Drive) -> Trials:
     return Trials(
-        judge.model, MODULES, rules_named("paper"), TARGETS["tensorrt"],
+        judge.model, MODULES, RULE_SETS.parse("paper"), TARGETS.parse("tensorrt"),
         judge.ranges, judge.reference.frames, drive=drive, threads=1,
     )  # fmt: skip
 

@@ -186,10 +186,10 @@ def prepare_lowering(
 def tensors_of_all(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
     """Name what any rule set and target reads when every module is int8."""
     names: dict[str, None] = {}
-    for rules in RULE_SETS:
+    for rules in RULE_SETS.usable():
         options = QuantizeInt8(modules=modules.names(), rules=rules)
         plan = options.plan(model, Context(modules))
-        for target in TARGETS.values():
+        for target in map(TARGETS.parse, TARGETS.usable()):
             names |= dict.fromkeys(target.tensors(plan, model))
     return tuple(names)
 

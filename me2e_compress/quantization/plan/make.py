@@ -16,13 +16,7 @@ from me2e_compress.quantization.plan.decision import (
 from me2e_compress.quantization.plan.groups import find_groups
 from me2e_compress.quantization.plan.overrides import NONE, Overrides, Pins
 from me2e_compress.quantization.plan.residual import residuals
-from me2e_compress.quantization.rules import (
-    AttentionLength,
-    Facts,
-    Rule,
-    RuleSet,
-    paper_rules,
-)
+from me2e_compress.quantization.rules import RULE_SETS, Facts, Rule, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 
 
@@ -40,24 +34,25 @@ def make_plan(
     Args:
         model: the float graph: modules stamped on its nodes, shapes inferred.
         scheme: which modules are to be int8.
-        rules: asked in order; None for :func:`paper_rules`.
+        rules: asked in order; None for the set ``paper``.
         overrides: what the user has decided; it beats every rule that is not firm.
 
     Raises:
         RecipeError: an override matches no node, or wants int8 where it cannot be.
     """
-    asked = paper_rules() if rules is None else rules
+    asked = RULE_SETS.parse("paper") if rules is None else rules
+    in_order = asked.rules()
     facts = Facts.of(model, scheme.modules)
     pins = overrides.bind(model)
     main = model.graph
     decided = {
-        node: _decide(node, facts, asked.rules, pins, main) for node in main.all_nodes()
+        node: _decide(node, facts, in_order, pins, main) for node in main.all_nodes()
     }
     decided.update(residuals(main, decided, facts, pins))
     pins.check(decided)
     decisions = tuple(decided.values())
     groups = find_groups(main, decided, pins, concat=asked.share_concat)
-    return QuantPlan(scheme, decisions, asked.name, groups)
+    return QuantPlan(scheme, decisions, RULE_SETS.text(asked), groups)
 
 
 def tensors_of(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
@@ -92,7 +87,7 @@ def _decide(
         objection = rule.objection(node, facts)
         if objection is None or (pin is not None and not rule.firm):
             continue
-        return decision(rule=rule.id, reason=objection, borderline=close)
+        return decision(rule=rule.name, reason=objection, borderline=close)
     if pin is not None and pin.dtype == FLOAT:
         return decision(rule="override", reason=pin.reason, borderline=close)
     rule_id, reason, layout = _int8(node, facts)
@@ -124,11 +119,7 @@ def _int8(
 
 
 def _borderline(node: ir.Node, facts: Facts, rules: Sequence[Rule]) -> str:
-    remarks = (
-        rule.borderline(node, facts)
-        for rule in rules
-        if isinstance(rule, AttentionLength)
-    )
+    remarks = (rule.borderline(node, facts) for rule in rules)
     return next((remark for remark in remarks if remark), "")
 
 

@@ -1,13 +1,16 @@
-"""What a rule is, and what it may know."""
+"""What a rule is, what it may know, and what a set of rules is."""
 
+import abc
 import dataclasses
 from collections.abc import Collection, Mapping
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Self
 
 import onnx_ir as ir
 
+from me2e_compress.errors import RecipeError
 from me2e_compress.quantization.coordinates import find_coordinates
 from me2e_compress.quantization.find_attention import Attention, find_attention
+from me2e_compress.registry import Registry
 from me2e_compress.runtime.constant_values import constant_values
 
 CONVOLUTIONS = ("Conv", "ConvTranspose")
@@ -44,17 +47,95 @@ class Facts:
         )
 
 
-class Rule(Protocol):
-    """Keeps some nodes in float.
+@dataclasses.dataclass(frozen=True)
+class Rule(abc.ABC):
+    """Keeps some nodes in float: derive a frozen dataclass, its fields are options.
 
     Class attributes:
-        id: what plans and reports call it.
+        name: what plans, reports and recipes call it.
         firm: True where the node cannot be int8 at all, so that no override lifts it.
     """
 
-    id: ClassVar[str]
-    firm: ClassVar[bool]
+    name: ClassVar[str]
+    firm: ClassVar[bool] = False
 
+    @abc.abstractmethod
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
-        """Say why this node stays in float; None to have no objection."""
-        ...
+        """Return why this node stays in float; None if it need not."""
+
+    def borderline(self, node: ir.Node, facts: Facts) -> str | None:
+        """Return what is close about a node, for a reader to look at; None if nothing.
+
+        It may have decided for either side.
+        """
+        return None
+
+
+_HERE = "me2e_compress.quantization.rules"
+
+RULES: Registry[Rule] = Registry(
+    "rule",
+    "me2e_compress.rules",
+    RecipeError,
+    {
+        "operator": f"{_HERE}.scope:WeightedOperator",
+        "module": f"{_HERE}.scope:ModuleScope",
+        "weight": f"{_HERE}.scope:WeightOperand",
+        "attention-length": f"{_HERE}.stages:AttentionLength",
+        "gemv": f"{_HERE}.stages:MatrixVector",
+        "small-product": f"{_HERE}.kernel_limits:SmallProduct",
+        "narrow-convolution": f"{_HERE}.kernel_limits:NarrowConvolution",
+        "coordinates": f"{_HERE}.positions:Coordinates",
+    },
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class RuleSet(abc.ABC):
+    """Rules that are asked together: derive a frozen dataclass, its fields are options.
+
+    Class attributes:
+        name: what plans and recipes call it.
+        share_concat: whether what a Concat joins is put on one scale with what it
+            gives, so that it moves int8 without requantizing.
+
+    Attributes:
+        without: names of rules that are switched off.
+        extra: more rules, asked last: ``my-rule`` or ``my-rule{limit=3}``.
+    """
+
+    name: ClassVar[str]
+    share_concat: ClassVar[bool] = False
+    without: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
+    extra: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
+
+    @abc.abstractmethod
+    def own_rules(self) -> tuple[Rule, ...]:
+        """Return its rules in the order in which they are asked."""
+
+    def rules(self) -> tuple[Rule, ...]:
+        """Return the rules that are asked, in order.
+
+        Raises:
+            RecipeError: no such extra rule, or one that cannot be switched off.
+        """
+        rules = (*self.own_rules(), *(RULES.parse(text) for text in self.extra))
+        loose = [rule.name for rule in rules if not rule.firm]
+        for name in self.without:
+            if name not in loose:
+                raise RecipeError(
+                    f"rule {name} cannot be switched off; of {self.name} can"
+                    f" {', '.join(loose)}"
+                )
+        return tuple(rule for rule in rules if rule.name not in self.without)
+
+
+RULE_SETS: Registry[RuleSet] = Registry(
+    "rule set",
+    "me2e_compress.rule_sets",
+    RecipeError,
+    {
+        "paper": f"{_HERE}.stages:PaperRules",
+        "tensorrt": f"{_HERE}.kernel_limits:TensorRTRules",
+    },
+)

@@ -1,4 +1,4 @@
-"""What TensorRT's int8 kernels are too coarse for.
+"""What TensorRT's int8 kernels are too coarse for, and the set of rules for it.
 
 Bounds are those of NVIDIA's own quantizer (ModelOpt 0.47,
 ``modelopt/onnx/quantization/graph_utils.py``): int8 tensor cores work on tiles of 16
@@ -13,16 +13,17 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.quantization.extents import extent
-from me2e_compress.quantization.rules.base import CONVOLUTIONS, Facts
+from me2e_compress.quantization.rules.base import CONVOLUTIONS, Facts, Rule
+from me2e_compress.quantization.rules.positions import Coordinates
+from me2e_compress.quantization.rules.stages import PaperRules
 
 
 @dataclasses.dataclass(frozen=True)
-class SmallProduct:
+class SmallProduct(Rule):
     """A product whose inner or outer dimension is below one tile stays float."""
 
     minimum: int = 16
-    id: ClassVar[str] = "small-product"
-    firm: ClassVar[bool] = False
+    name: ClassVar[str] = "small-product"
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
         """Object if K or N is below the minimum."""
@@ -36,7 +37,7 @@ class SmallProduct:
 
 
 @dataclasses.dataclass(frozen=True)
-class NarrowConvolution:
+class NarrowConvolution(Rule):
     """A convolution of few channels stays float, unless a kernel takes it as it is.
 
     Below ``minimum`` channels on either side (inputs counted within a group), it is
@@ -47,8 +48,7 @@ class NarrowConvolution:
 
     minimum: int = 16
     packing: int = 8
-    id: ClassVar[str] = "narrow-convolution"
-    firm: ClassVar[bool] = False
+    name: ClassVar[str] = "narrow-convolution"
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
         """Object to narrow convolutions without a kernel."""
@@ -75,3 +75,22 @@ class NarrowConvolution:
             f"{inputs} to {outputs} channels in {group} groups, kernel {list(kernel)}:"
             " too narrow for int8 kernels"
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class TensorRTRules(PaperRules):
+    """The paper's rules, and what TensorRT's kernels and coordinates need beyond them.
+
+    Attributes:
+        attention_limit: longest attention that becomes int8, in tokens.
+        without: names of rules that are switched off, e.g. ``gemv``.
+        extra: more rules, asked last.
+    """
+
+    name: ClassVar[str] = "tensorrt"
+    share_concat: ClassVar[bool] = True
+
+    def own_rules(self) -> tuple[Rule, ...]:
+        """Return those of the paper and three more."""
+        more = (SmallProduct(), NarrowConvolution(), Coordinates())
+        return (*super().own_rules(), *more)

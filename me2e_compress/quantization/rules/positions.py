@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.quantization.rules.base import Facts
+from me2e_compress.quantization.rules.base import Facts, Rule
 
 
 @dataclasses.dataclass(frozen=True)
-class Coordinates:
+class Coordinates(Rule):
     """Layers that positions come from stay float: offsets, reference points.
 
     A position is right to a fraction of a cell or wrong; 8 bits over a map of 100
@@ -17,8 +17,7 @@ class Coordinates:
     go with them: neither then needs it in int8.
     """
 
-    id: ClassVar[str] = "coordinates"
-    firm: ClassVar[bool] = False
+    name: ClassVar[str] = "coordinates"
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
         """Object to what :func:`~me2e_compress.quantization.coordinates` found."""

@@ -7,14 +7,14 @@ import onnx_ir as ir
 
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.find_attention import FUSED
-from me2e_compress.quantization.rules.base import WEIGHTED, Facts
+from me2e_compress.quantization.rules.base import WEIGHTED, Facts, Rule
 
 
 @dataclasses.dataclass(frozen=True)
-class WeightedOperator:
+class WeightedOperator(Rule):
     """Only convolutions and matrix products are int8."""
 
-    id: ClassVar[str] = "operator"
+    name: ClassVar[str] = "operator"
     firm: ClassVar[bool] = True
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
@@ -33,11 +33,10 @@ class WeightedOperator:
 
 
 @dataclasses.dataclass(frozen=True)
-class ModuleScope:
+class ModuleScope(Rule):
     """Modules outside the scheme stay as they are."""
 
-    id: ClassVar[str] = "module"
-    firm: ClassVar[bool] = False
+    name: ClassVar[str] = "module"
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
         """Object to a node of another module, or of none."""
@@ -48,10 +47,10 @@ class ModuleScope:
 
 
 @dataclasses.dataclass(frozen=True)
-class WeightOperand:
+class WeightOperand(Rule):
     """The right operand is a float32 weight, or the product is an attention's."""
 
-    id: ClassVar[str] = "weight"
+    name: ClassVar[str] = "weight"
     firm: ClassVar[bool] = True
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:

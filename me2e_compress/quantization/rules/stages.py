@@ -1,4 +1,4 @@
-"""The two stages of the paper."""
+"""The two stages of the paper, and the set of rules that they make."""
 
 import dataclasses
 from typing import ClassVar
@@ -6,11 +6,16 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.quantization.extents import extent
-from me2e_compress.quantization.rules.base import CONVOLUTIONS, Facts
+from me2e_compress.quantization.rules.base import CONVOLUTIONS, Facts, Rule, RuleSet
+from me2e_compress.quantization.rules.scope import (
+    ModuleScope,
+    WeightedOperator,
+    WeightOperand,
+)
 
 
 @dataclasses.dataclass(frozen=True)
-class AttentionLength:
+class AttentionLength(Rule):
     """Stage 1: long attention stays float.
 
     TensorRT fuses int8 attention up to 512 queries and 512 keys, and errors of the
@@ -18,8 +23,7 @@ class AttentionLength:
     """
 
     limit: int = 512
-    id: ClassVar[str] = "attention-length"
-    firm: ClassVar[bool] = False
+    name: ClassVar[str] = "attention-length"
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
         """Object if queries or keys are more than the limit, or unknown in number."""
@@ -36,7 +40,7 @@ class AttentionLength:
         )
 
     def borderline(self, node: ir.Node, facts: Facts) -> str | None:
-        """Say what is close about a node: a reader may want to decide it otherwise.
+        """Return what is close about a node: a reader may want to decide it otherwise.
 
         Within an eighth of the limit; or only one of queries and keys is beyond it, so
         that tools which look at one of the two decide otherwise.
@@ -54,11 +58,10 @@ class AttentionLength:
 
 
 @dataclasses.dataclass(frozen=True)
-class MatrixVector:
+class MatrixVector(Rule):
     """Stage 2: a product that degenerates to GEMV gains nothing."""
 
-    id: ClassVar[str] = "gemv"
-    firm: ClassVar[bool] = False
+    name: ClassVar[str] = "gemv"
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
         """Object if one side of the product is a single row or column."""
@@ -68,3 +71,27 @@ class MatrixVector:
         if not size.is_vector:
             return None
         return f"{size.rows} rows by {size.columns} columns: a matrix-vector product"
+
+
+@dataclasses.dataclass(frozen=True)
+class PaperRules(RuleSet):
+    """The two stages of the paper alone, and what is no layer at all.
+
+    Attributes:
+        attention_limit: longest attention that becomes int8, in tokens.
+        without: names of rules that are switched off, e.g. ``gemv``.
+        extra: more rules, asked last.
+    """
+
+    name: ClassVar[str] = "paper"
+    attention_limit: int = 512
+
+    def own_rules(self) -> tuple[Rule, ...]:
+        """Return five rules, the stages last."""
+        return (
+            WeightedOperator(),
+            ModuleScope(),
+            WeightOperand(),
+            AttentionLength(self.attention_limit),
+            MatrixVector(),
+        )

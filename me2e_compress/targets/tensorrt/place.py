@@ -19,7 +19,6 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import (
     Decision,
-    KeptFloat,
     QuantPlan,
     share_scales,
     tensors_of,
@@ -35,11 +34,6 @@ BY = "quantize-int8"
 def tensors(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
     """Name the activations that :func:`place` needs a range of."""
     return tensors_of(plan, model)
-
-
-def kept_float(plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
-    """List the plan's nodes that :func:`place` leaves in float: none."""
-    return ()
 
 
 def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from me2e_compress import graph
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.rules import paper_rules
+from me2e_compress.quantization.rules.stages import PaperRules
 from me2e_compress.targets.onnxruntime import place, tensors
 from tests.nets import net
 from tests.targets.onnxruntime.lowered import (
@@ -157,7 +157,7 @@ def test_a_constant_that_lends_a_product_its_columns_is_no_bias() -> None:
     }
     """
     model = drawn(text, {"w": (8, 1), "b": (5,)})
-    plan = make_plan(model, FULL, paper_rules().without(["gemv"]))
+    plan = make_plan(model, FULL, PaperRules(without=("gemv",)))
     fed = feeds(2, x=(4, 8))
 
     result = place(model, plan, measured(model, tensors(plan, model), fed))

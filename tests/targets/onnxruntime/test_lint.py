@@ -5,7 +5,7 @@ import pytest
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import target_named
+from me2e_compress.targets import TARGETS
 from me2e_compress.targets.lint import lint
 from tests.nets import MODULES, conv_attention, net
 
@@ -74,7 +74,7 @@ def test_opsets_nobody_has_released() -> None:
 def test_what_we_place_for_it_has_no_findings() -> None:
     model = conv_attention()
     plan = make_plan(model, QuantScheme.named("full", MODULES))
-    target = target_named("onnxruntime")
+    target = TARGETS.parse("onnxruntime")
     ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
 
     placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
@@ -93,7 +93,7 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
     """
     model = net(text, {"w": np.ones((8, 8, 1, 1)), "t": np.ones((8, 8, 2, 2))})
     plan = make_plan(model, QuantScheme.named("full", MODULES))
-    target = target_named("onnxruntime")
+    target = TARGETS.parse("onnxruntime")
     ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
 
     placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))

@@ -9,7 +9,7 @@ import pytest
 from me2e_compress import rewrite
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.rules import rules_named
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import tensorrt
 from me2e_compress.targets.lint import LintFinding, lint
@@ -29,7 +29,7 @@ def shown(finding: LintFinding) -> tuple[str, str, str]:
 
 def placed(rules: str) -> ir.Model:
     model = conv_attention()
-    plan = make_plan(model, FULL, rules_named(rules))
+    plan = make_plan(model, FULL, RULE_SETS.parse(rules))
     tensors = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
     return tensorrt.place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 

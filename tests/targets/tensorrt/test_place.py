@@ -12,7 +12,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.int8_weights import quantize_weight
 from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.rules import tensorrt_rules
+from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.tensorrt.place import place
@@ -248,7 +248,7 @@ def test_what_a_concat_joins_is_on_one_scale() -> None:
     }
     """
     model = net(text, {"w": np.ones((16, 16)), "v": np.ones((32, 16))})
-    plan = make_plan(model, FULL, tensorrt_rules())
+    plan = make_plan(model, FULL, TensorRTRules())
     tensors = {"a": (-1.0, 1.0), "ab": (-1.0, 4.0)}
 
     result = place(model, plan, Ranges(tensors, "max-min", 1, "", ""))

@@ -11,7 +11,7 @@ from me2e_compress.manager import PassManager
 from me2e_compress.modules import map_of
 from me2e_compress.passes import Context
 from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
-from me2e_compress.quantization.rules import RULE_SETS, rules_named
+from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import tensorrt
 from me2e_compress.targets.lint import lint
@@ -34,14 +34,14 @@ def driver() -> ir.Model:
 def quantized(model: ir.Model, scheme: str, rules: str) -> ir.Model:
     """Place int8; what is built does not hang on the values of the scales."""
     chosen = QuantScheme.named(scheme, map_of(model, None))
-    plan = make_plan(model, chosen, rules_named(rules))
+    plan = make_plan(model, chosen, RULE_SETS.parse(rules))
     ranges = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
     placed = tensorrt.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
     stamp_plan(placed, plan)
     return placed
 
 
-@pytest.mark.parametrize("rules", RULE_SETS)
+@pytest.mark.parametrize("rules", RULE_SETS.names())
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_every_scheme_passes_the_lint(
     driver: ir.Model, scheme: str, rules: str
