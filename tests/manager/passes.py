@@ -77,6 +77,21 @@ class Rounds(_Sample):
 
 
 @dataclass(frozen=True)
+class Scales(_Sample):
+    """Multiplies every weight, and says it is exact."""
+
+    name: ClassVar[str] = "scales"
+    by: float = 1.0
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        for value in model.graph.initializers.values():
+            if value.const_value is not None:
+                data = value.const_value.numpy() * np.float32(self.by)
+                value.const_value = ir.tensor(data, name=value.name)
+        return PassResult(model, len(model.graph.initializers))
+
+
+@dataclass(frozen=True)
 class Breaks(_Sample):
     name: ClassVar[str] = "breaks"
 

@@ -1,10 +1,18 @@
+import ml_dtypes
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from me2e_compress.manager.equivalence import Probe, relative
+from me2e_compress.manager.equivalence import (
+    Probe,
+    errors,
+    passed,
+    relative,
+    tolerances,
+)
+from me2e_compress.manager.report import Verification
 from me2e_compress.runtime.frames import Frame
 
 FLOATS = hnp.arrays(
@@ -52,6 +60,29 @@ def test_a_new_non_number_is_infinite() -> None:
 
 def test_empty_outputs_are_equal() -> None:
     assert relative(np.zeros((0, 3)), np.zeros((0, 3))) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("dtype", "rounding", "change"),
+    [
+        ("float64", 5e-10, 2e-9),
+        ("float32", 5e-5, 2e-4),
+        ("float16", 5e-3, 2e-2),
+        ("bfloat16", 2.5e-2, 1e-1),
+    ],
+)
+def test_what_counts_as_rounding_depends_on_the_type(
+    dtype: str, rounding: float, change: float
+) -> None:
+    def is_rounding(share: float) -> bool:
+        kind = np.dtype(getattr(ml_dtypes, dtype, dtype))
+        a = np.linspace(-0.5, 1.0, 61)
+        left, right = {"y": a.astype(kind)}, {"y": (a * (1 + share)).astype(kind)}
+        found = errors([left], [right])
+        return passed(Verification(("p",), "recorded", found, tolerances(left)))
+
+    assert is_rounding(rounding)
+    assert not is_rounding(change)
 
 
 @given(FLOATS, st.integers(0, 9))

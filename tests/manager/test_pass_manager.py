@@ -76,6 +76,30 @@ def test_exact_passes_are_measured(chain: ir.Model, context: Context) -> None:
     assert check.inputs == "synthetic"
 
 
+LINEAR = """
+<ir_version: 9, opset_import: ["" : 17]>
+linear (float[1,8] x) => (float[1,8] y)
+<float[8] w = {1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0}> {
+    ["/backbone/Mul"] y = Mul(x, w)
+}
+"""
+"""Moves by the share that its weights move by."""
+
+
+def test_rounding_is_no_breach_of_exactness(context: Context) -> None:
+    report = run(ir.from_onnx_text(LINEAR), context, passes.Scales(1 + 5e-5))
+    (check,) = report.verifications
+    assert check.errors["y"] == pytest.approx(5e-5, rel=0.01)
+
+
+@pytest.mark.parametrize("share", [2e-4, 1e-3, 5e-2])
+def test_an_exact_pass_must_not_move_an_output_by_a_little(
+    share: float, context: Context
+) -> None:
+    with pytest.raises(VerificationError, match=r"^scales promises .* changed y by"):
+        run(ir.from_onnx_text(LINEAR), context, passes.Scales(1 + share))
+
+
 def test_a_lossy_pass_starts_a_new_stretch(chain: ir.Model, context: Context) -> None:
     report = run(
         chain, context, passes.Idle(), passes.Halves(), passes.DropsReluOfSigmoid()
