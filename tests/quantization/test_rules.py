@@ -177,6 +177,35 @@ def test_what_is_looked_up_or_inverted_is_a_position(reader: str) -> None:
     assert found["l"].rule == "coordinates"
 
 
+ROTATION = (
+    OPSETS
+    + """
+rotation (float[8,32] scene, float[32,32] shift, float[2,32] ego, float[32,16] turn,
+          float[32,16] middle) => (float[8,32] y) {
+    i = MatMul(scene, shift)
+    a = MatMul(ego, turn)
+    radians = Tanh(a)
+    c = MatMul(ego, middle)
+    halves = Sigmoid(c)
+    y = trt.%s<interpolation=1>(i, radians, halves)
+}
+"""
+)
+
+
+@pytest.mark.parametrize("plugin", ["RotateTRT", "RotateTRT2", "RotatePlugin"])
+def test_angle_and_centre_of_a_rotation_stay_float(plugin: str) -> None:
+    sizes = {"shift": (32, 32), "turn": (32, 16), "middle": (32, 16)}
+    model = net(ROTATION % plugin, {n: np.ones(s) for n, s in sizes.items()})
+
+    found = by_output(planned(model))
+
+    reason = f"positions that {plugin} reads come from it"
+    assert (found["a"].rule, found["a"].reason) == ("coordinates", reason)
+    assert (found["c"].rule, found["c"].reason) == ("coordinates", reason)
+    assert (found["i"].dtype, found["i"].rule) == ("int8", "layer")
+
+
 def test_a_layer_behind_a_layer_is_no_position() -> None:
     """The walk ends at the layer that gives the offsets."""
     text = (
