@@ -19,6 +19,7 @@ REFUSALS: tuple[type[Exception], ...] = (
     _native.NoSuchFile,
     _native.NotImplemented,
     _native.RuntimeException,
+    RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
 )
 """Everything raised where a graph cannot be read, built or run."""
 

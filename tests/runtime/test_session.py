@@ -94,6 +94,16 @@ def test_an_unknown_operator_is_named(counter: ir.Model) -> None:
         Session(plugin)
 
 
+def test_an_output_that_numpy_cannot_hold_is_an_error_of_the_graph() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[2] x) => (bfloat16[2] y) { y = Cast<to=16>(x) }"
+    )
+
+    with pytest.raises(GraphError, match=r"onnxruntime failed: .* bfloat16"):
+        Session(model).run({"x": np.ones(2, np.float32)})
+
+
 def test_a_wrong_shape_is_an_error_of_the_frame(counter: ir.Model) -> None:
     wrong = {"x": np.ones((1, 3), np.float32), "memory": np.ones((1, 2), np.float32)}
 
