@@ -31,6 +31,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.fidelity.compare import compare
+from me2e_compress.graph import WEIGHTED
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
@@ -41,7 +42,6 @@ from me2e_compress.quantization.plan import (
     QuantPlan,
     make_plan,
 )
-from me2e_compress.quantization.rules import WEIGHTED
 from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.constant_values import constant_values, evaluate_constants

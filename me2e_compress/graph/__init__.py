@@ -13,33 +13,52 @@ from me2e_compress.graph.files import (
     sha256_of,
 )
 from me2e_compress.graph.interface import Port, interface
+from me2e_compress.graph.layers import (
+    CONVOLUTIONS,
+    WEIGHTED,
+    bias_of,
+    channel_axis,
+)
 from me2e_compress.graph.nodes import (
     array_of,
     graphs_of,
     has_subgraph,
+    input_at,
     is_standard,
+    nodes_of,
+    opset_of,
+    producer_of,
 )
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.graph.shapes import infer_shapes, open_shape, static_shape
+from me2e_compress.graph.shapes import infer_shapes, open_shape, rank_of, static_shape
 from me2e_compress.graph.size_of import Size, macs, node_count, size
 
 __all__ = [
+    "CONVOLUTIONS",
+    "WEIGHTED",
     "Port",
     "Provenance",
     "Size",
     "array_of",
+    "bias_of",
+    "channel_axis",
     "digest",
     "file_bytes",
     "graphs_of",
     "has_subgraph",
     "infer_shapes",
+    "input_at",
     "interface",
     "is_external",
     "is_standard",
     "load",
     "macs",
     "node_count",
+    "nodes_of",
     "open_shape",
+    "opset_of",
+    "producer_of",
+    "rank_of",
     "save",
     "sha256_of",
     "size",

@@ -6,10 +6,36 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
+STANDARD = ("", "ai.onnx")
+"""The two spellings of the domain of ONNX's own operators."""
+
 
 def is_standard(node: ir.Node) -> bool:
     """Return whether a node is one of ONNX's own operators."""
-    return node.domain in ("", "ai.onnx")
+    return node.domain in STANDARD
+
+
+def opset_of(imports: ir.Model | ir.Function) -> int:
+    """Return the opset of ONNX's own operators that is imported; 0 if none is."""
+    found = imports.opset_imports
+    return next((found[domain] for domain in STANDARD if domain in found), 0)
+
+
+def nodes_of(model: ir.Model) -> Iterator[ir.Node]:
+    """Walk the nodes of the graph, of its bodies and of its functions."""
+    yield from model.graph.all_nodes()
+    for function in model.functions.values():
+        yield from function.all_nodes()
+
+
+def input_at(node: ir.Node, index: int) -> ir.Value | None:
+    """Return an input of a node; None if it is left out."""
+    return node.inputs[index] if index < len(node.inputs) else None
+
+
+def producer_of(value: ir.Value | None) -> ir.Node | None:
+    """Return the node that computes a value; None for inputs and initializers."""
+    return None if value is None else value.producer()
 
 
 def has_subgraph(node: ir.Node) -> bool:

@@ -23,6 +23,11 @@ def open_shape(value: ir.Value | None) -> tuple[int | None, ...] | None:
     return tuple(dim if isinstance(dim, int) else None for dim in value.shape)
 
 
+def rank_of(value: ir.Value | None) -> int | None:
+    """Return how many dimensions a value has; None if that is not known."""
+    return None if value is None or value.shape is None else len(value.shape)
+
+
 def infer_shapes(model: ir.Model) -> None:
     """Let ONNX infer types and shapes, data propagation included, in place.
 

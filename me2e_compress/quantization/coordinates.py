@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator
 
 import onnx_ir as ir
 
+from me2e_compress.graph import input_at
 from me2e_compress.quantization.nearest import behind
 
 _POSITIONS: dict[str, tuple[int, ...]] = {
@@ -74,7 +75,7 @@ _DATA_ONLY = {"Gather": 1, "GatherElements": 1, "GatherND": 1, "Pad": 1, "Slice"
 def find_coordinates(
     model: ir.Model, constants: Collection[ir.Value]
 ) -> dict[ir.Node, str]:
-    """Map every layer that positions come from to what it gives.
+    """Map every layer that positions come from to why it is one.
 
     From whatever takes positions (samplers, gathers, rotations) one walk goes back
     through arithmetic and changes of layout to the layers that they come from: sampling
@@ -106,7 +107,7 @@ def find_coordinates(
 def _positions(graph: ir.Graph) -> Iterator[tuple[ir.Value, str]]:
     for node in graph:
         for index in _POSITIONS.get(node.op_type, ()):
-            value = node.inputs[index] if index < len(node.inputs) else None
+            value = input_at(node, index)
             if value is not None:
                 yield value, node.op_type
 

@@ -5,7 +5,7 @@ import math
 
 import onnx_ir as ir
 
-from me2e_compress.graph import open_shape, static_shape
+from me2e_compress.graph import open_shape, rank_of, static_shape
 
 Dims = tuple[int | None, ...]
 
@@ -55,7 +55,7 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
 
 
 def is_one_matrix(product: ir.Node) -> bool:
-    """Say whether a MatMul multiplies every row by one and the same matrix.
+    """Return whether a MatMul multiplies every row by one and the same matrix.
 
     Its right operand is [K, N] then, or [1, ..., K, N] of no more dimensions than the
     left one has: without the leading ones it gives the same.
@@ -63,7 +63,7 @@ def is_one_matrix(product: ir.Node) -> bool:
     left, right = product.inputs[0], static_shape(product.inputs[1])
     if right is None or len(right) < 2:
         return False
-    rank = 0 if left is None or left.shape is None else len(left.shape)
+    rank = rank_of(left) or 0
     return len(right) == 2 or (math.prod(right[:-2]) == 1 and len(right) <= rank)
 
 
@@ -74,7 +74,7 @@ def _product(dims: Dims) -> int | None:
 
 
 def _sides(right: Dims) -> tuple[int | None, int | None]:
-    """Give N and K of a right operand; a vector is one column."""
+    """Return N and K of a right operand; a vector is one column."""
     return (right[-1], right[-2]) if len(right) > 1 else (1, _product(right))
 
 

@@ -6,7 +6,13 @@ from collections.abc import Collection, Iterable, Iterator
 
 import onnx_ir as ir
 
-from me2e_compress.graph import open_shape, static_shape
+from me2e_compress.graph import (
+    input_at,
+    is_standard,
+    open_shape,
+    producer_of,
+    static_shape,
+)
 from me2e_compress.quantization.nearest import Nearest, ahead, behind
 
 FUSED = frozenset(
@@ -103,13 +109,13 @@ def _products(nearest: Nearest, value: ir.Value) -> list[ir.Node]:
 
 
 def _is_product(node: ir.Node, constants: Collection[ir.Value]) -> bool:
-    """Say whether a node multiplies two things, neither of them a layer's weight.
+    """Return whether a node multiplies two things, neither of them a layer's weight.
 
     The left one may be constant: learned queries that have not met the scene yet.
     """
-    if node.op_type not in _PRODUCTS or node.domain not in ("", "ai.onnx"):
+    if node.op_type not in _PRODUCTS or not is_standard(node):
         return False
-    right = node.inputs[1] if len(node.inputs) > 1 else None
+    right = input_at(node, 1)
     if right is None:
         return False
     shape = static_shape(right) or ()
@@ -117,11 +123,11 @@ def _is_product(node: ir.Node, constants: Collection[ir.Value]) -> bool:
 
 
 def _fits(product: ir.Value, scores: ir.Value) -> bool:
-    """Say whether scores may be this product: as many, or as many a row."""
+    """Return whether scores may be this product: as many, or as many a row."""
     left, right = static_shape(product), static_shape(scores)
     if not left or not right:
-        ends = [(open_shape(value) or (None,))[-1:] for value in (product, scores)]
-        return (None,) in ends or ends[0] == ends[1]
+        widths = [(open_shape(value) or (None,))[-1] for value in (product, scores)]
+        return None in widths or widths[0] == widths[1]
     have, want = math.prod(left), math.prod(right)
     return have == want or (left[-1] == right[-1] and have > 0 and want % have == 0)
 
@@ -142,7 +148,7 @@ def _tokens(value: ir.Value | None) -> int | None:
 
 
 def _softmaxes(nodes: Iterable[ir.Node]) -> Iterator[tuple[ir.Value, ir.Value]]:
-    """Give (weights, scores) of every softmax."""
+    """Yield (weights, scores) of every softmax."""
     for node in nodes:
         if node.op_type == "Softmax" and node.inputs[0] is not None:
             yield node.outputs[0], node.inputs[0]
@@ -153,10 +159,9 @@ def _softmaxes(nodes: Iterable[ir.Node]) -> Iterator[tuple[ir.Value, ir.Value]]:
 
 
 def _decomposed(division: ir.Node) -> ir.Value | None:
-    """Give the x of ``Div(Exp(x), ReduceSum(Exp(x)))``."""
+    """Return the x of ``Div(Exp(x), ReduceSum(Exp(x)))``."""
     above, below = division.inputs[:2]
-    power = above.producer() if above is not None else None
-    total = below.producer() if below is not None else None
+    power, total = producer_of(above), producer_of(below)
     if power is None or total is None:
         return None
     if power.op_type != "Exp" or total.op_type != "ReduceSum":

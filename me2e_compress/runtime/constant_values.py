@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import onnx_ir as ir
 
 from me2e_compress import rewrite
+from me2e_compress.graph import is_standard
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import run_once
 
@@ -25,7 +26,7 @@ def constant_values(model: ir.Model) -> frozenset[ir.Value]:
     found = {value for value in model.graph.initializers.values() if _is_fixed(value)}
     for node in model.graph:
         if (
-            node.domain in ("", "ai.onnx")
+            is_standard(node)
             and node.op_type not in _UNSTEADY
             and not any(_has_body(each) for each in node.attributes.values())
             and all(each is None or each in found for each in node.inputs)

@@ -1,24 +1,28 @@
-"""What a rule finds, and what a rule is."""
+"""What a lint rule is, what it finds, and the rules that every target shares."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Literal, TypeAlias
 
+import onnx
 import onnx_ir as ir
+import onnx_ir.passes.common as common
+
+from me2e_compress.graph import is_standard, opset_of
 
 Severity = Literal["error", "warning"]
 
 
 @dataclasses.dataclass(frozen=True)
 class LintFinding:
-    """One thing that is wrong with a graph for its target.
+    """One problem of a graph for its target.
 
     Attributes:
         severity: ``error``: the target refuses the graph, or computes something else;
             ``warning``: it runs, but not as int8 or not as fast as it could.
         rule: id of the rule.
-        node: name of the node; empty where the graph as a whole is meant.
-        message: what was found and what there should be.
+        node: name of the node; empty where the finding is about the whole graph.
+        message: what was found and what is expected.
     """
 
     severity: Severity
@@ -28,29 +32,58 @@ class LintFinding:
 
 
 LintRule: TypeAlias = Callable[[ir.Model], Iterator[LintFinding]]
-"""Looks at a graph, with its shapes inferred, and yields what it finds."""
+"""Inspects a graph whose shapes are inferred and yields what it finds."""
 
 
 def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
-    """Make a finding that the target refuses."""
+    """Return a finding that makes the target refuse the graph."""
     return LintFinding("error", rule, _name(node), message)
 
 
 def warning(rule: str, node: ir.Node | None, message: str) -> LintFinding:
-    """Make a finding that the target runs badly."""
+    """Return a finding with which the target runs the graph badly."""
     return LintFinding("warning", rule, _name(node), message)
 
 
-def is_standard(node: ir.Node) -> bool:
-    """Say whether a node's operator is ONNX's own."""
-    return node.domain in ("", "ai.onnx")
+def valid(model: ir.Model) -> Iterator[LintFinding]:
+    """Run ONNX's checker."""
+    try:
+        common.CheckerPass()(model)
+    except (onnx.checker.ValidationError, ir.passes.PassError) as failure:
+        reason = str(failure.__cause__ or failure).strip().splitlines()[0]
+        yield error("onnx", None, f"not valid ONNX: {reason}")
 
 
-def nodes_of(model: ir.Model) -> Iterator[ir.Node]:
-    """Walk the nodes of the graph, of its bodies and of its functions."""
-    yield from model.graph.all_nodes()
+def of_opset(model: ir.Model) -> Iterator[LintFinding]:
+    """Find operators that are newer than the opset of the graph.
+
+    TensorRT's parser does not look at the opset; onnxruntime does.
+    """
+    main = opset_of(model)
+    yield from _too_new(model.graph.all_nodes(), main)
     for function in model.functions.values():
-        yield from function.all_nodes()
+        yield from _too_new(function.all_nodes(), opset_of(function) or main)
+
+
+def _too_new(nodes: Iterable[ir.Node], opset: int) -> Iterator[LintFinding]:
+    for node in nodes:
+        if not is_standard(node) or not onnx.defs.has(node.op_type, domain=""):
+            continue
+        if not onnx.defs.has(node.op_type, max_inclusive_version=opset, domain=""):
+            since = _first_version(node.op_type)
+            yield error(
+                "operator-of-opset",
+                node,
+                f"{node.op_type} came with opset {since}, the graph is of {opset}",
+            )
+
+
+def _first_version(op_type: str) -> int:
+    return min(
+        schema.since_version
+        for schema in onnx.defs.get_all_schemas_with_history()
+        if schema.name == op_type and schema.domain == ""
+    )
 
 
 def _name(node: ir.Node | None) -> str:

@@ -1,13 +1,14 @@
-"""Recognise a graph that somebody has quantized already."""
+"""Recognise quantized graphs: pairs of QuantizeLinear and DequantizeLinear, by whom."""
 
 from collections import Counter
+from collections.abc import Iterator
 
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.quantization.plan.plan_files import METADATA
+from me2e_compress.quantization.plan.decision import METADATA
 
-PAIRS = ("QuantizeLinear", "DequantizeLinear")
+QUANTIZE, DEQUANTIZE = PAIR = ("QuantizeLinear", "DequantizeLinear")
 INTEGER_OPS = frozenset(
     {
         "ConvInteger", "DynamicQuantizeLinear", "DynamicQuantizeLSTM",
@@ -21,22 +22,39 @@ INTEGER_OPS = frozenset(
 """Operators on integers (ONNX, com.microsoft): what runtimes' quantizers write."""
 
 
+def pairs_of(model: ir.Model) -> Iterator[ir.Node]:
+    """Walk the QuantizeLinear and DequantizeLinear nodes, those of functions too."""
+    for node in graph.nodes_of(model):
+        if graph.is_standard(node) and node.op_type in PAIR:
+            yield node
+
+
+def is_quantized(value: ir.Value | None) -> bool:
+    """Return whether a value comes out of a QuantizeLinear."""
+    return _comes_from(value, QUANTIZE)
+
+
+def is_dequantized(value: ir.Value | None) -> bool:
+    """Return whether a value comes out of a DequantizeLinear."""
+    return _comes_from(value, DEQUANTIZE)
+
+
 def describe_quantized(model: ir.Model) -> str | None:
-    """Say in words how a graph is quantized; None if it is not.
+    """Describe in words how a graph is quantized; None if it is not.
 
     Returns:
-        How many operators of which kind, on which grid, and by whom if it says so.
+        How many operators of which kind, on which grid, and by whom if that is known.
     """
     counts = Counter(
         node.op_type
         for node in model.graph.all_nodes()
-        if node.op_type in INTEGER_OPS or node.op_type in PAIRS
+        if node.op_type in INTEGER_OPS or node.op_type in PAIR
     )
     if not counts:
         return None
     listed = ", ".join(f"{count} {op}" for op, count in sorted(counts.items()))
     parts = [listed]
-    if any(op in counts for op in PAIRS):
+    if any(op in counts for op in PAIR):
         parts.append(_grid(model))
     if METADATA in model.metadata_props:
         parts.append("it carries the plan it was made by")
@@ -45,10 +63,15 @@ def describe_quantized(model: ir.Model) -> str | None:
     return "; ".join(parts)
 
 
+def _comes_from(value: ir.Value | None, op: str) -> bool:
+    node = graph.producer_of(value)
+    return node is not None and graph.is_standard(node) and node.op_type == op
+
+
 def _grid(model: ir.Model) -> str:
     """Name the element types of all pairs, and whether they are symmetric."""
-    pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIRS]
-    zeros = [node.inputs[2] if len(node.inputs) > 2 else None for node in pairs]
+    pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIR]
+    zeros = [graph.input_at(node, 2) for node in pairs]
     types = dict.fromkeys(_type(zero) for zero in zeros)
     arrays = [graph.array_of(zero) for zero in zeros]
     centred = not any(array.any() for array in arrays if array is not None)

@@ -1,4 +1,4 @@
-"""The weights that a plan makes int8, quantized."""
+"""Weights as int8, one scale a channel: those that a plan chose."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -7,11 +7,15 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
+from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
-from me2e_compress.quantization.int8_weights import quantize_weight
+from me2e_compress.graph import opset_of
 from me2e_compress.quantization.plan import Decision
 from me2e_compress.runtime.constant_values import evaluate_constants
 from me2e_compress.runtime.frames import Array
+
+MIN_OPSET = 13
+"""The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +49,14 @@ def weights_of(
         The weights by the name of the layer's first output.
 
     Raises:
-        PreconditionError: what the plan calls a weight is none.
+        PreconditionError: the graph is older than opset 13, or something that the plan
+            calls a weight is not one.
     """
+    if (opset := opset_of(model)) < MIN_OPSET:
+        raise PreconditionError(
+            f"the graph is of opset {opset}: int8 with one scale a channel needs"
+            f" {MIN_OPSET} or later, export it so"
+        )
     nodes = {str(node.outputs[0].name): node for node in model.graph}
     layers = {
         each.output: _planned(nodes[each.output], each, each.weight)
@@ -63,10 +73,34 @@ def weights_of(
     return {output: quantized[layer] for output, layer in layers.items()}
 
 
+def quantize_weight(
+    weight: npt.NDArray[np.float32], axis: int | None
+) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float32]]:
+    """Round a weight to int8, symmetric, one scale an index along an axis, or one.
+
+    ``scale = max|w| / 127`` over everything but the axis, ``q = round(w / scale)``,
+    halves to the even neighbour, as QuantizeLinear rounds. A channel that is zero
+    throughout gets scale 1.
+
+    Args:
+        weight: float32.
+        axis: which axis is the channel's; None for one scale everywhere.
+
+    Returns:
+        int8 of the same shape, and float32 [channels], or [] without an axis.
+    """
+    others = tuple(each for each in range(weight.ndim) if each != axis)
+    reach = np.abs(weight).max(axis=others, initial=0.0, keepdims=True)
+    steps = np.asarray(reach / np.float32(QUANT_MAX), np.float32)
+    steps[steps == 0] = 1
+    integers = np.clip(np.rint(weight / steps), -QUANT_MAX, QUANT_MAX).astype(np.int8)
+    return integers, steps.reshape(() if axis is None else -1)
+
+
 def _planned(
     node: ir.Node, decision: Decision, index: int
 ) -> tuple[ir.Value, int | None]:
-    """Give a weight and the axis of its channels; -1 is the last axis of a MatMul's."""
+    """Return a weight and the axis of its channels: -1, the last, for a MatMul."""
     weight, axis = node.inputs[index], decision.axis
     if weight is None:
         raise PreconditionError(f"{decision.node} is planned as a layer without weight")
@@ -82,7 +116,7 @@ def _quantize(
     elif value.const_value is not None:
         array = value.const_value.numpy()
     else:
-        raise PreconditionError(f"{name} is planned as a weight, but is none")
+        raise PreconditionError(f"{name} is planned as a weight, but is not a constant")
     if axis == -1:
         array, axis = array.reshape(array.shape[-2:]), 1
     integers, scales = quantize_weight(array.astype(np.float32), axis)

@@ -16,6 +16,7 @@ from me2e_compress.cli.job import run_on
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import check_output
 from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.graph import WEIGHTED
 from me2e_compress.modules import map_of
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -27,8 +28,7 @@ from me2e_compress.quantization.plan import (
     plan_of,
     save_plan,
 )
-from me2e_compress.quantization.plan.plan_files import record
-from me2e_compress.quantization.rules import WEIGHTED
+from me2e_compress.quantization.plan.decision import record
 from me2e_compress.targets.quantized import describe_quantized
 
 

@@ -6,24 +6,23 @@ from me2e_compress.quantization.plan.decision import (
     RESIDUAL,
     Decision,
     KeptFloat,
+    PlanDifference,
     QuantPlan,
     ScaleGroup,
+    differences,
+    load_plan,
+    plan_of,
+    record,
+    save_plan,
+    stamp_plan,
 )
 from me2e_compress.quantization.plan.groups import (
     SharingCost,
     share_scales,
     sharing_costs,
 )
-from me2e_compress.quantization.plan.make import channel_axis, make_plan, tensors_of
+from me2e_compress.quantization.plan.make import make_plan, tensors_of
 from me2e_compress.quantization.plan.overrides import Overrides
-from me2e_compress.quantization.plan.plan_files import (
-    PlanDifference,
-    differences,
-    load_plan,
-    plan_of,
-    save_plan,
-    stamp_plan,
-)
 
 __all__ = [
     "FLOAT",
@@ -36,11 +35,11 @@ __all__ = [
     "QuantPlan",
     "ScaleGroup",
     "SharingCost",
-    "channel_axis",
     "differences",
     "load_plan",
     "make_plan",
     "plan_of",
+    "record",
     "save_plan",
     "share_scales",
     "sharing_costs",

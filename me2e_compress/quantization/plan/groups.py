@@ -85,8 +85,8 @@ def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
     """Widen ranges so that the tensors of a concat group have one."""
     widened = dict(ranges.tensors)
     for group in _shared(plan, ranges):
-        ends = [widened[name] for name in group.tensors]
-        low, high = min(low for low, _ in ends), max(high for _, high in ends)
+        bounds = [widened[name] for name in group.tensors]
+        low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
         widened.update(dict.fromkeys(group.tensors, (low, high)))
     return dataclasses.replace(ranges, tensors=widened)
 
@@ -107,7 +107,7 @@ class SharingCost:
 
 
 def sharing_costs(plan: QuantPlan, ranges: Ranges) -> tuple[SharingCost, ...]:
-    """Say what each concat group costs: ``20 log10(shared step / own step)``."""
+    """Return what each concat group costs: ``20 log10(shared step / own step)``."""
     wide = share_scales(plan, ranges).tensors
     costs = []
     for group in _shared(plan, ranges):

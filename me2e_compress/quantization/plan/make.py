@@ -1,21 +1,28 @@
 """Decide for every node of a graph."""
 
+import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import onnx_ir as ir
 
-from me2e_compress.graph import provenance, static_shape
+from me2e_compress.graph import (
+    CONVOLUTIONS,
+    channel_axis,
+    is_standard,
+    provenance,
+    static_shape,
+)
 from me2e_compress.quantization.extents import is_one_matrix
 from me2e_compress.quantization.plan.decision import (
     FLOAT,
     INT8,
+    RESIDUAL,
     Decision,
     QuantPlan,
 )
 from me2e_compress.quantization.plan.groups import find_groups
 from me2e_compress.quantization.plan.overrides import NONE, Overrides, Pins
-from me2e_compress.quantization.plan.residual import residuals
 from me2e_compress.quantization.rules import RULE_SETS, Facts, Rule, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 
@@ -28,8 +35,8 @@ def make_plan(
 ) -> QuantPlan:
     """Decide for every node; one look at each, so linear in the graph.
 
-    First every node is asked by itself, then what must be decided together: residual
-    branches of Adds behind int8 convolutions, and scales that are shared.
+    First every node by itself, then what must be decided together: residual branches
+    of Adds behind int8 convolutions, and scales that are shared.
 
     Args:
         model: the float graph: modules stamped on its nodes, shapes inferred.
@@ -48,7 +55,7 @@ def make_plan(
     decided = {
         node: _decide(node, facts, in_order, pins, main) for node in main.all_nodes()
     }
-    decided.update(residuals(main, decided, facts, pins))
+    decided.update(_residuals(main, decided, facts, pins))
     pins.check(decided)
     decisions = tuple(decided.values())
     groups = find_groups(main, decided, pins, concat=asked.share_concat)
@@ -108,7 +115,7 @@ def _decide(
 def _int8(
     node: ir.Node, facts: Facts
 ) -> tuple[str, str, tuple[tuple[int, ...], int | None]]:
-    """Give rule, reason, and which inputs become activations and weight."""
+    """Return rule, reason, and which inputs become activations and weight."""
     constant = node.inputs[1] in facts.constants
     layout = ((0,), 1) if constant else ((0, 1), None)
     if node in facts.attention:
@@ -123,25 +130,8 @@ def _borderline(node: ir.Node, facts: Facts, rules: Sequence[Rule]) -> str:
     return next((remark for remark in remarks if remark), "")
 
 
-def channel_axis(node: ir.Node) -> int:
-    """Give the axis of a weight that its output channels run along.
-
-    Conv [M, C/g, ...]: 0. ConvTranspose [C, M/g, ...]: 1. MatMul [..., K, N]: the last.
-    Gemm [K, N]: 1, or 0 where it is transposed.
-    """
-    if node.op_type == "Conv":
-        return 0
-    if node.op_type == "ConvTranspose":
-        return 1
-    if node.op_type == "Gemm":
-        return 0 if node.attributes.get_int("transB", 0) else 1
-    weight = node.inputs[1]
-    rank = 2 if weight is None or weight.shape is None else len(weight.shape)
-    return rank - 1
-
-
 def _scale_axis(node: ir.Node) -> int | None:
-    """Give the axis of a weight's scales; None where it has one scale in all.
+    """Return the axis of a weight's scales; None where it has one scale in all.
 
     Kernels apply the scales of output channels to the result of one product: that of a
     MatMul by a batch of matrices, or by a vector, has no such channels.
@@ -149,3 +139,75 @@ def _scale_axis(node: ir.Node) -> int | None:
     if node.op_type == "MatMul" and not is_one_matrix(node):
         return None
     return channel_axis(node)
+
+
+def _residuals(
+    graph: ir.Graph, decided: Mapping[ir.Node, Decision], facts: Facts, pins: Pins
+) -> dict[ir.Node, Decision]:
+    """Decide the Adds that end a residual block: which branch is read as int8.
+
+    An Add right behind an int8 convolution is computed in the convolution's own kernel,
+    if its other branch is int8: that branch, and only that, gets a pair. Where both
+    branches end in a convolution, the longer path is the one that is fused and the
+    shorter the residual (a down-sampling projection), as NVIDIA's quantizer decides.
+
+    Returns:
+        New decisions for those Adds. The others stay what they are.
+    """
+    depth = _depths(graph)
+    found: dict[ir.Node, Decision] = {}
+    for node in graph:
+        if node.op_type != "Add" or not is_standard(node):
+            continue
+        fused = [i for i in (0, 1) if _ends_convolution(node.inputs[i], decided)]
+        if not fused or any(each in facts.constants for each in node.inputs):
+            continue
+        if static_shape(node.inputs[0]) != static_shape(node.inputs[1]):
+            continue
+        main = max(fused, key=lambda at: depth.get(node.inputs[at], 0))
+        found[node] = _residual(decided[node], node, 1 - main, pins)
+    return found
+
+
+def _residual(old: Decision, node: ir.Node, residual: int, pins: Pins) -> Decision:
+    pin = pins.of(node)
+    if pin is not None and pin.dtype == FLOAT:
+        return dataclasses.replace(old, rule="override", reason=pin.reason)
+    main, branch = node.inputs[1 - residual], node.inputs[residual]
+    return dataclasses.replace(
+        old,
+        dtype=INT8,
+        rule=RESIDUAL,
+        reason=f"computed with the convolution that gives {_name(main)}; its residual"
+        f" branch {_name(branch)} is read as int8",
+        activations=(residual,),
+    )
+
+
+def _ends_convolution(
+    value: ir.Value | None, decided: Mapping[ir.Node, Decision]
+) -> bool:
+    """Return whether a value comes from an int8 convolution and has one reader."""
+    if value is None or value.is_graph_output() or len(value.uses()) != 1:
+        return False
+    node = value.producer()
+    if node is not None and node.op_type == "BatchNormalization":
+        return _ends_convolution(node.inputs[0], decided)
+    return (
+        node is not None
+        and node.op_type in CONVOLUTIONS
+        and decided[node].dtype == INT8
+    )
+
+
+def _depths(graph: ir.Graph) -> dict[ir.Value | None, int]:
+    """Count the nodes on the longest path to every value."""
+    depth: dict[ir.Value | None, int] = {}
+    for node in graph:
+        below = 1 + max((depth.get(each, 0) for each in node.inputs), default=0)
+        depth.update(dict.fromkeys(node.outputs, below))
+    return depth
+
+
+def _name(value: ir.Value | None) -> str:
+    return "" if value is None else str(value.name)

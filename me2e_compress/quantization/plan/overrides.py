@@ -58,7 +58,7 @@ class Override(_Strict):
         return self
 
     def matches(self, node: ir.Node) -> bool:
-        """Say whether it speaks of a node."""
+        """Return whether it applies to a node."""
         return (
             (self.op is None or node.op_type == self.op)
             and (self.module is None or provenance.module_of(node) == self.module)
@@ -129,7 +129,7 @@ class Overrides(_Strict):
             raise RecipeError(f"{origin}: {where}: {first['msg']}") from error
 
     def bind(self, model: ir.Model) -> "Pins":
-        """Find the nodes of a graph that they speak of.
+        """Find the nodes of a graph that they apply to.
 
         Raises:
             RecipeError: one matches nothing.
@@ -166,7 +166,7 @@ class Pins:
         self.apart = apart
 
     def of(self, node: ir.Node) -> Pin | None:
-        """Give what the user decided for a node, if anything."""
+        """Return what the user decided for a node; None for nothing."""
         found = self._pinned.get(node)
         if found is None:
             return None

@@ -13,10 +13,6 @@ from me2e_compress.quantization.find_attention import Attention, find_attention
 from me2e_compress.registry import Registry
 from me2e_compress.runtime.constant_values import constant_values
 
-CONVOLUTIONS = ("Conv", "ConvTranspose")
-WEIGHTED = (*CONVOLUTIONS, "Gemm", "MatMul")
-"""Operators that have an int8 kernel worth feeding (TensorRT, "weighted layers")."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Facts:

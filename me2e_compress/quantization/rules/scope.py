@@ -5,9 +5,9 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph import provenance
+from me2e_compress.graph import WEIGHTED, is_standard, provenance
 from me2e_compress.quantization.find_attention import FUSED
-from me2e_compress.quantization.rules.base import WEIGHTED, Facts, Rule
+from me2e_compress.quantization.rules.base import Facts, Rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +19,7 @@ class WeightedOperator(Rule):
 
     def objection(self, node: ir.Node, facts: Facts) -> str | None:
         """Object to every other operator."""
-        if node.domain in ("", "ai.onnx") and node.op_type in WEIGHTED:
+        if is_standard(node) and node.op_type in WEIGHTED:
             return None
         if node not in facts.attention:
             return f"{node.op_type} is no weighted layer"

@@ -5,8 +5,9 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress.graph import CONVOLUTIONS
 from me2e_compress.quantization.extents import extent
-from me2e_compress.quantization.rules.base import CONVOLUTIONS, Facts, Rule, RuleSet
+from me2e_compress.quantization.rules.base import Facts, Rule, RuleSet
 from me2e_compress.quantization.rules.scope import (
     ModuleScope,
     WeightedOperator,

@@ -9,8 +9,11 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import KeptFloat, QuantPlan
 from me2e_compress.targets.base import Target
 from me2e_compress.targets.finding import LintRule
-from me2e_compress.targets.onnxruntime.census import int8_layers
-from me2e_compress.targets.onnxruntime.convert import convert, unranged
+from me2e_compress.targets.onnxruntime.convert import (
+    convert,
+    int8_layers,
+    unranged,
+)
 from me2e_compress.targets.onnxruntime.lint import RULES
 from me2e_compress.targets.onnxruntime.place import kept_float, place, tensors
 

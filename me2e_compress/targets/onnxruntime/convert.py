@@ -4,14 +4,24 @@ import dataclasses
 
 import onnx_ir as ir
 
+from me2e_compress import graph, rewrite
+from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.targets.onnxruntime.lower import lower
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import producer_of
+from me2e_compress.targets.onnxruntime.kernels import LAYERS, has_kernel
+from me2e_compress.targets.onnxruntime.lower import Draft, lower
 from me2e_compress.targets.onnxruntime.region import find_region
-from me2e_compress.targets.onnxruntime.strip import draft_of_qdq
+from me2e_compress.targets.onnxruntime.stored_constants import (
+    bias_of,
+    step_of,
+    weight_of,
+)
+from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE
 
 
 def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
-    """Give a copy of an int8 graph that onnxruntime runs in int8 on the CPU.
+    """Return a copy of an int8 graph that onnxruntime runs in int8 on the CPU.
 
     As it stands, such a graph is slower than a float one: onnxruntime's convolutions
     answer uint8 and so need a pair behind them, and it has no fast kernel for int8
@@ -26,18 +36,109 @@ def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
         PreconditionError: the pairs are not symmetric int8, or there are none.
         FramesError: the range of a tensor is missing.
     """
-    draft = draft_of_qdq(model)
+    draft = _draft_of_qdq(model)
     measured = {} if ranges is None else ranges.tensors
     more = {name: max(-low, high) for name, (low, high) in measured.items()}
     return lower(dataclasses.replace(draft, reach={**more, **draft.reach}))
 
 
 def unranged(model: ir.Model) -> tuple[str, ...]:
-    """Name the tensors whose range is needed, and which the graph does not tell.
+    """Name the tensors whose range is needed and does not stand in the graph.
 
     They are what convolutions answer where no pair follows: before a residual Add, and
     where a float node reads them.
     """
-    draft = draft_of_qdq(model)
+    draft = _draft_of_qdq(model)
     region = find_region(draft.model.graph, draft.weights)
     return tuple(name for name in region.ranged if name not in draft.reach)
+
+
+def int8_layers(model: ir.Model) -> tuple[ir.Node, ...]:
+    """List the layers whose two operands both come through a DequantizeLinear.
+
+    Whether a program computes them in integers is its own affair: on onnxruntime's CPU
+    those of a graph placed for TensorRT run in float.
+    """
+    return tuple(
+        node
+        for node in model.graph
+        if node.op_type in graph.WEIGHTED and all(map(_dequantized, node.inputs[:2]))
+    )
+
+
+def _dequantized(value: ir.Value | None) -> bool:
+    """Look for a DequantizeLinear before a value, through changes of layout."""
+    node = producer_of(value)
+    while node is not None and node.op_type in ("Reshape", "Transpose"):
+        node = producer_of(node.inputs[0])
+    return node is not None and node.op_type == DEQUANTIZE
+
+
+def _draft_of_qdq(model: ir.Model) -> Draft:
+    """Copy a quantized graph without the pairs of its activations.
+
+    A layer is to be int8 if both its input and its weight came through a pair, and
+    there is a kernel for it: weights stored as int8 or, as ModelOpt writes them, in
+    float behind a QuantizeLinear. Biases that are stored as int32 become float again.
+
+    Args:
+        model: the quantized graph; it stays as it is.
+
+    Raises:
+        PreconditionError: no activation is quantized, or a pair is not symmetric int8
+            with float32 scales, one for an activation.
+    """
+    copy = model.clone()
+    graph.infer_shapes(copy)
+    pairs = {node: value for node in copy.graph if (value := _activation(node))}
+    if not pairs:
+        raise PreconditionError(
+            "the graph has no quantized activation; lower a graph with int8 pairs, or"
+            " quantize a float one for this target"
+        )
+    reach = {value: _reach(node) for node, value in pairs.items()}
+    # Read biases and weights before the pairs go.
+    layers = [
+        node
+        for node in copy.graph
+        if node.op_type in LAYERS and producer_of(node.inputs[0]) in pairs
+    ]
+    for node in layers:
+        bias = bias_of(node)
+        if bias is not None:
+            name = f"{node.inputs[2].name}_stored" if node.inputs[2] else ""
+            node.replace_input_with(2, rewrite.add_constant(copy.graph, bias, name))
+    weights = {node: weight_of(node) for node in layers if has_kernel(node)}
+    for node, value in pairs.items():
+        if rewrite.can_replace(node.outputs[0], value):
+            rewrite.replace_value(node.outputs[0], value)
+    rewrite.sweep(copy)
+    return Draft(
+        copy,
+        {str(n.outputs[0].name): w for n, w in weights.items() if w is not None},
+        {str(value.name): largest for value, largest in reach.items()},
+    )
+
+
+def _activation(node: ir.Node) -> ir.Value | None:
+    """Return the tensor that a DequantizeLinear stands for, if it is not a constant."""
+    quantize = producer_of(node.inputs[0]) if node.op_type == DEQUANTIZE else None
+    if quantize is None or quantize.op_type != QUANTIZE:
+        return None
+    value = quantize.inputs[0]
+    return value if graph.array_of(value) is None else None
+
+
+def _reach(dequantize: ir.Node) -> float:
+    """Return the largest magnitude on a pair's grid.
+
+    Raises:
+        PreconditionError: the pair has several scales.
+    """
+    step = step_of(dequantize)
+    if step.size != 1:
+        raise PreconditionError(
+            f"{dequantize.name} has {step.size} scales: onnxruntime's kernels take one"
+            " for an activation"
+        )
+    return float(step.reshape(())) * QUANT_MAX

@@ -6,7 +6,9 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.graph import bias_of, is_standard, rank_of
 from me2e_compress.quantization.extents import extent, is_one_matrix
+from me2e_compress.rewrite import sole_reader
 
 MOVES = frozenset(
     {
@@ -24,18 +26,18 @@ JOINS = frozenset({"Add", "Concat"})
 """Operators that read several tensors of the network, each on a grid of its own."""
 
 
-def is_layer(node: ir.Node) -> bool:
-    """Say whether a layer has an int8 kernel; its weight is taken for granted."""
+def has_kernel(node: ir.Node) -> bool:
+    """Return whether a layer has an int8 kernel; its weight is taken for granted."""
     return objection(node) is None
 
 
 def objection(node: ir.Node) -> str | None:
-    """Say why a layer has no int8 kernel; None if it has one.
+    """Explain why a layer has no int8 kernel; None if it has one.
 
     There is QLinearConv, but none for ConvTranspose; QGemm has neither beta nor a
     transposed left operand; MatMul must have one weight for the whole batch.
     """
-    if node.domain not in ("", "ai.onnx") or node.op_type not in LAYERS:
+    if not is_standard(node) or node.op_type not in LAYERS:
         return f"there is no int8 kernel for {node.op_type}"
     if node.op_type == "Conv":
         stored = bias_of(node) is None or graph.array_of(bias_of(node)) is not None
@@ -43,14 +45,9 @@ def objection(node: ir.Node) -> str | None:
     if node.op_type == "Gemm":
         plain = _is_plain_gemm(node)
         return None if plain else "QGemm takes no factors, and one bias for all rows"
-    if rank_of(node.inputs[0]) < 2:
+    if (rank_of(node.inputs[0]) or 0) < 2:
         return "the left operand is a vector, or of unknown rank"
     return None if is_one_matrix(node) else "the weight is a batch of matrices"
-
-
-def rank_of(value: ir.Value | None) -> int:
-    """Give how many dimensions a value has; 0 where that is not known."""
-    return 0 if value is None or value.shape is None else len(value.shape)
 
 
 def _is_plain_gemm(node: ir.Node) -> bool:
@@ -63,24 +60,8 @@ def _is_plain_gemm(node: ir.Node) -> bool:
     )
 
 
-def channel_axis(node: ir.Node) -> int:
-    """Give the axis of a weight that its scales must run along.
-
-    Conv [M, C/g, ...]: 0. Gemm [K, N]: 1, or 0 where it is transposed. MatMul [K, N]:
-    1, leading ones not counted.
-    """
-    if node.op_type == "Gemm":
-        return 0 if node.attributes.get_int("transB", 0) else 1
-    return 0 if node.op_type == "Conv" else 1
-
-
-def bias_of(node: ir.Node) -> ir.Value | None:
-    """Give the bias of a Conv or Gemm."""
-    return node.inputs[2] if len(node.inputs) > 2 else None
-
-
 def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
-    """Say whether a value is a constant that adds one number to every column.
+    """Return whether a value is a constant that adds one number to every column.
 
     Args:
         value: what is added.
@@ -98,10 +79,10 @@ def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
 
 
 def biased_end(product: ir.Node) -> ir.Node | None:
-    """Give the Add that puts a bias on a MatMul, if nothing else reads the product."""
+    """Return the Add that puts a bias on a MatMul; None if others read the product."""
     value = product.outputs[0]
-    addition = _sole_reader(product)
-    rank = rank_of(product.inputs[0])
+    addition = sole_reader(value)
+    rank = rank_of(product.inputs[0]) or 0
     if addition is None or addition.op_type != "Add":
         return None
     others = [each for each in addition.inputs if each is not value]
@@ -111,8 +92,8 @@ def biased_end(product: ir.Node) -> ir.Node | None:
 
 
 def is_move(node: ir.Node) -> bool:
-    """Say whether a node only moves, picks or averages what its first input holds."""
-    if node.domain not in ("", "ai.onnx") or node.op_type not in MOVES:
+    """Return whether a node only moves, picks or averages what it reads first."""
+    if not is_standard(node) or node.op_type not in MOVES:
         return False
     if node.op_type == "Resize":
         return node.attributes.get_string("mode", "nearest") == "nearest"
@@ -120,27 +101,18 @@ def is_move(node: ir.Node) -> bool:
 
 
 def end_of(node: ir.Node) -> ir.Value:
-    """Give the value that a layer's kernel answers: behind the ReLU, if one follows.
+    """Return the value that a layer's kernel answers: behind the ReLU, if one follows.
 
     A ReLU costs nothing where its uint8 grid begins at zero: quantization clips.
     """
-    reader = _sole_reader(node)
+    reader = sole_reader(node.outputs[0])
     if reader is not None and is_clip_at_zero(reader):
         return reader.outputs[0]
     return node.outputs[0]
 
 
-def _sole_reader(node: ir.Node) -> ir.Node | None:
-    """Give the one reader of what a node answers, if it stands in the same graph."""
-    value = node.outputs[0]
-    readers = list(value.consumers())
-    if len(readers) != 1 or value.is_graph_output():
-        return None
-    return readers[0] if readers[0].graph is node.graph else None
-
-
 def is_clip_at_zero(node: ir.Node) -> bool:
-    """Say whether a node is a ReLU, or a Clip that begins at zero."""
+    """Return whether a node is a ReLU, or a Clip that begins at zero."""
     if node.op_type == "Clip" and len(node.inputs) > 1:
         low = graph.array_of(node.inputs[1])
         return low is not None and float(low) == 0.0

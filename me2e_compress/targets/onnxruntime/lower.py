@@ -1,15 +1,32 @@
-"""From a draft to a graph that onnxruntime runs in int8."""
+"""From a draft to a graph that onnxruntime runs in int8: pairs, then layers."""
 
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import rewrite
 from me2e_compress.errors import FramesError
-from me2e_compress.targets.onnxruntime.draft import Draft
-from me2e_compress.targets.onnxruntime.grid import Grid
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
-from me2e_compress.targets.onnxruntime.pairs import write_pairs
-from me2e_compress.targets.onnxruntime.region import find_region
+from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
 from me2e_compress.targets.onnxruntime.writer import Writer
+from me2e_compress.targets.weights import QuantizedWeight
+
+
+@dataclasses.dataclass(frozen=True)
+class Draft:
+    """A graph in which everything is read as float, and what of it becomes int8.
+
+    Attributes:
+        model: the graph; lowering writes into it.
+        weights: of every layer that is to be int8, by the name of its first output.
+        reach: max(|low|, |high|) of the activations whose range is known, by name.
+    """
+
+    model: ir.Model
+    weights: Mapping[str, QuantizedWeight]
+    reach: Mapping[str, float]
 
 
 def lower(draft: Draft) -> ir.Model:
@@ -35,8 +52,67 @@ def lower(draft: Draft) -> ir.Model:
         for layer, value in region.layers.items()
     ]
     writer = Writer(main)
-    write_pairs(writer, region, grids)
+    _write_pairs(writer, region, grids)
     for layer, weight, step in jobs:
         write_layer(writer, layer, weight, step)
     rewrite.sweep(draft.model)
     return draft.model
+
+
+def _write_pairs(
+    writer: Writer, region: Region, grids: Mapping[ir.Value, Grid]
+) -> None:
+    """Put a pair behind every uint8 tensor, and let the kernels of a region read it.
+
+    Whoever else reads such a tensor keeps the float one, unless there is none.
+
+    Args:
+        writer: of the graph.
+        region: what becomes uint8.
+        grids: of every uint8 tensor.
+    """
+    for value, grid in grids.items():
+        born = value in region.born
+        uses = [
+            (use.node, use.idx)
+            for use in value.uses()
+            if born or region.reads(use.node, use.idx)
+        ]
+        producer = value.producer()
+        source = producer if born and producer is not None else uses[0][0]
+        quantize, dequantize = _pair(writer, value, grid, source)
+        if producer is None:
+            writer.graph.insert_before(writer.graph[0], [quantize, dequantize])
+        else:
+            writer.graph.insert_after(producer, [quantize, dequantize])
+        for reader, index in uses:
+            reader.replace_input_with(index, dequantize.outputs[0])
+        if born and value.is_graph_output():
+            _hand_over(value, dequantize.outputs[0], quantize)
+
+
+def _pair(
+    writer: Writer, value: ir.Value, grid: Grid, source: ir.Node
+) -> tuple[ir.Node, ir.Node]:
+    name = str(value.name)
+    scale = writer.constant(np.array(grid.scale), f"{name}_scale")
+    zero = writer.constant(np.array(grid.zero, np.uint8), f"uint8_{grid.zero}")
+    quantize = writer.node(
+        "QuantizeLinear", [value, scale, zero], f"{name}_uint8", [source]
+    )
+    dequantize = writer.node(
+        "DequantizeLinear",
+        [quantize.outputs[0], scale, zero],
+        f"{name}_float",
+        [source],
+    )
+    quantize.outputs[0].dtype = ir.DataType.UINT8
+    dequantize.outputs[0].dtype = ir.DataType.FLOAT
+    quantize.outputs[0].shape = dequantize.outputs[0].shape = value.shape
+    return quantize, dequantize
+
+
+def _hand_over(value: ir.Value, heir: ir.Value, quantize: ir.Node) -> None:
+    """Make the dequantized tensor the output of the graph, under the old name."""
+    rewrite.replace_value(value, heir)
+    quantize.replace_input_with(0, value)

@@ -1,16 +1,26 @@
-"""Which tensors become uint8, and who reads them so."""
+"""Which tensors become uint8, on which grid, and who reads them so."""
 
 import dataclasses
 from collections.abc import Collection
+from typing import Self
 
+import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.calibration.observers import scale_of
+from me2e_compress.graph import producer_of
 from me2e_compress.targets.onnxruntime.kernels import (
     JOINS,
     end_of,
-    is_layer,
+    has_kernel,
+    is_clip_at_zero,
     is_move,
 )
+
+MIDDLE = 128
+"""uint8 zero point of a signed tensor: int8 value plus 128."""
+
+_UNSIGNED = frozenset({"Abs", "Exp", "HardSigmoid", "Relu", "Sigmoid", "Softmax"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +46,7 @@ class Region:
         return tuple(dict.fromkeys(str(each.name) for each in self.grids.values()))
 
     def reads(self, node: ir.Node, index: int) -> bool:
-        """Say whether a node takes an input as uint8, wherever that exists."""
+        """Return whether a node takes an input as uint8, wherever that exists."""
         if node in self.readers:
             return index == 0 or node.op_type in JOINS
         return node in self.layers and index == 0
@@ -62,7 +72,7 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
         for node in graph
         if node.outputs[0].name in chosen
         and node.inputs[0] is not None
-        and is_layer(node)
+        and has_kernel(node)
     }
     grids = {value: value for value in layers.values()}
     born: set[ir.Value] = set()
@@ -90,3 +100,54 @@ def _joins(
     return all(each in grids for each in node.inputs) and any(
         each in born for each in node.inputs
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The uint8 grid of one tensor: ``value = scale * (uint8 - zero)``.
+
+    Attributes:
+        scale: the step.
+        zero: 128 for a signed tensor, 0 for one that is never negative.
+    """
+
+    scale: np.float32
+    zero: int
+
+    @classmethod
+    def of(cls, value: ir.Value, reach: float) -> Self:
+        """Return the grid of a tensor whose largest magnitude is ``reach``.
+
+        A signed tensor keeps the plan's symmetric int8 grid to the point, moved up by
+        128: onnxruntime's kernels take uint8 activations 10 to 40 times faster than
+        int8 ones on processors with VNNI.
+
+        For a tensor that can never be negative the int8 grid wastes its lower half;
+        here its range [0, reach] is divided into 255 steps, not 127, and a ReLU before
+        it dissolves into the kernel's own clipping.
+        """
+        if never_negative(value):
+            step = np.float32(reach / 255)
+            return cls(step if step > 0 else np.float32(1), 0)
+        return cls(scale_of(-reach, reach), MIDDLE)
+
+
+def never_negative(value: ir.Value) -> bool:
+    """Prove by what makes a tensor that none of its elements is negative.
+
+    Linear in the nodes behind it: what several ways lead to is looked at once.
+    """
+    pending: list[ir.Value | None] = [value]
+    seen: set[ir.Value] = {value}
+    while pending:
+        node = producer_of(pending.pop())
+        if node is None:
+            return False
+        if node.op_type in _UNSIGNED or is_clip_at_zero(node):
+            continue
+        if node.op_type != "Concat" and not is_move(node):
+            return False
+        sources = node.inputs if node.op_type == "Concat" else node.inputs[:1]
+        pending += [each for each in sources if each not in seen]
+        seen.update(each for each in sources if each is not None)
+    return True

@@ -7,10 +7,10 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
-from me2e_compress.targets.onnxruntime.kernels import channel_axis
+from me2e_compress.graph import producer_of
+from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE
 from me2e_compress.targets.weights import QuantizedWeight
 
-QUANTIZE, DEQUANTIZE = "QuantizeLinear", "DequantizeLinear"
 Floats = npt.NDArray[np.float32]
 
 
@@ -22,7 +22,7 @@ def step_of(node: ir.Node) -> Floats:
             the zero point is not zero.
     """
     scale = graph.array_of(node.inputs[1])
-    zero = graph.array_of(node.inputs[2]) if len(node.inputs) > 2 else None
+    zero = graph.array_of(graph.input_at(node, 2))
     name = node.name or node.outputs[0].name
     if scale is None or scale.dtype != np.float32:
         kind = "computed" if scale is None else scale.dtype
@@ -54,20 +54,19 @@ def weight_of(layer: ir.Node) -> QuantizedWeight | None:
         PreconditionError: it is quantized, but not on the symmetric int8 grid with one
             scale an output channel, or one in all.
     """
-    value = layer.inputs[1]
-    node = None if value is None else value.producer()
+    node = producer_of(layer.inputs[1])
     if node is None or node.op_type != DEQUANTIZE:
         return None
     step = step_of(node)
-    axis = channel_axis(layer)
     integers = _integers(node, step)
     if integers is None:
         return None
     along = node.attributes.get_int("axis", 1) % integers.ndim
+    axis = graph.channel_axis(layer)
     if layer.op_type == "MatMul" and integers.ndim > 2:
         if step.size > 1 and along != integers.ndim - 1:
             return None
-        integers, along = integers.reshape(integers.shape[-2:]), axis
+        integers, along, axis = integers.reshape(integers.shape[-2:]), 1, 1
     if step.size > 1 and (along != axis or step.shape != (integers.shape[axis],)):
         raise PreconditionError(
             f"{node.name} has scales of shape {list(step.shape)} along axis {along},"
@@ -81,8 +80,7 @@ def weight_of(layer: ir.Node) -> QuantizedWeight | None:
 
 def bias_of(layer: ir.Node) -> Floats | None:
     """Read a bias that is stored as int32; None if there is none."""
-    value = layer.inputs[2] if len(layer.inputs) > 2 else None
-    node = None if value is None else value.producer()
+    node = producer_of(graph.bias_of(layer))
     if node is None or node.op_type != DEQUANTIZE:
         return None
     stored, scale = graph.array_of(node.inputs[0]), graph.array_of(node.inputs[1])
@@ -92,12 +90,12 @@ def bias_of(layer: ir.Node) -> Floats | None:
 
 
 def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
-    """Give what a DequantizeLinear reads, if it is constant, as int8."""
+    """Return what a DequantizeLinear reads, if it is constant, as int8."""
     source = dequantize.inputs[0]
     stored = graph.array_of(source)
     if stored is not None:
         return stored.astype(np.int8)
-    quantize = None if source is None else source.producer()
+    quantize = producer_of(source)
     if quantize is None or quantize.op_type != QUANTIZE:
         return None
     weight = graph.array_of(quantize.inputs[0])

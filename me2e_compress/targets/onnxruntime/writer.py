@@ -26,7 +26,7 @@ class Writer:
         self._names = rewrite.value_names(where)
 
     def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-        """Give the initializer that holds an array, a new one if there is none."""
+        """Return the initializer that holds an array, a new one if there is none."""
         kind = f"{array.dtype}{array.shape}"
         key = (kind, hashlib.sha256(array.tobytes()).digest())
         if key not in self._constants:
@@ -66,7 +66,7 @@ class Writer:
         axis: int | None,
         reader: ir.Node,
     ) -> ir.Value:
-        """Store integers and give the float tensor they stand for, before its reader.
+        """Store integers and return the float tensor they stand for, before its reader.
 
         Args:
             name: what the new names begin with.

@@ -15,7 +15,6 @@ import onnx_ir as ir
 from me2e_compress import rewrite
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import (
     Decision,
@@ -24,9 +23,6 @@ from me2e_compress.quantization.plan import (
     tensors_of,
 )
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
-
-MIN_OPSET = 13
-"""The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
 
 BY = "quantize-int8"
 
@@ -37,7 +33,7 @@ def tensors(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
 
 
 def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
-    """Give a copy of a graph in which the plan's nodes read int8.
+    """Return a copy of a graph in which the plan's nodes read int8.
 
     Args:
         model: the float graph that was planned and calibrated; it stays as it is.
@@ -50,17 +46,12 @@ def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
         behind a DequantizeLinear for the weights.
 
     Raises:
-        PreconditionError: the graph is older than opset 13.
+        PreconditionError: the graph is older than opset 13, or something that the plan
+            calls a weight is not one.
     """
-    opset = model.opset_imports.get("", 0)
-    if opset < MIN_OPSET:
-        raise PreconditionError(
-            f"the graph is of opset {opset}: int8 with one scale a channel needs"
-            f" {MIN_OPSET} or later, export it so"
-        )
+    weights = weights_of(model, plan.chosen)
     copy = model.clone()
     nodes = {str(node.outputs[0].name): node for node in copy.graph}
-    weights = weights_of(model, plan.chosen)
     writer = _Writer(copy.graph, share_scales(plan, ranges))
     for decision in plan.chosen:
         writer.apply(nodes[decision.output], decision, weights.get(decision.output))

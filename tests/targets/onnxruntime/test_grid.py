@@ -3,7 +3,7 @@ import time
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.targets.onnxruntime.grid import never_negative
+from me2e_compress.targets.onnxruntime.region import never_negative
 
 
 def nested(first: str, depth: int) -> ir.Value:

@@ -5,7 +5,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.targets.lint import LintFinding, lint
-from me2e_compress.targets.tensorrt.lint.operators import (
+from me2e_compress.targets.tensorrt.lint.tables import (
     LATER,
     SUPPORTED,
     UNSUPPORTED,
@@ -51,7 +51,7 @@ def test_every_operator_of_onnx_is_in_one_list() -> None:
             "m (float[2] x) => (float[2] y) { y = Swish(x) }",
             24,
             "operator",
-            "Swish is in no support matrix: unknown",
+            "Swish stands in no support matrix",
         ),
         (
             "m (double[2] x) => (double[2] y) { y = Relu(x) }",
@@ -64,7 +64,7 @@ def test_every_operator_of_onnx_is_in_one_list() -> None:
             " { y = MaxPool<kernel_shape=[1,1]>(x) }",
             17,
             "element-type",
-            "MaxPool of int32; it is taken with bfloat16, float, float16",
+            "MaxPool of int32; it accepts bfloat16, float, float16",
         ),
         (
             "m (float[9000] x, int64[1] k) => (float[4] y, int64[4] i)"
@@ -105,7 +105,7 @@ def test_every_operator_of_onnx_is_in_one_list() -> None:
             " { y, i = MaxPool<kernel_shape=[2,2], strides=[2,2]>(x) }",
             17,
             "restriction",
-            "MaxPool: only the first output is given",
+            "MaxPool: only the first output is supported",
         ),
         (
             "m (float[2,3] x, int64 a) => (float[2,3] y) { y = CumSum(x, a) }",
@@ -129,7 +129,7 @@ def test_two_float_types_in_one_operator() -> None:
         )
         if each.rule == "mixed-types"
     )
-    assert each.message == "Add of float and float16: one Cast"
+    assert each.message == "Add of float and float16: cast one of them"
 
 
 @pytest.mark.parametrize(
@@ -150,11 +150,11 @@ ROTATE = "m (float[2,4,4] x, float[1] a, float[2] c) => (float[2,4,4] y) { y = %
     ("call", "message"),
     [
         ("trt.RotateTRT<interpolation=1>(x, a, c)", None),
-        ("trt.RotateTRT(x, a, c)", "wants attributes interpolation"),
+        ("trt.RotateTRT(x, a, c)", "needs attributes interpolation"),
         ("trt.RotateTRT<interpolation=1>(x, a)", "takes 3 inputs, not 2"),
         ("trt.RotateTRT<interpolation=1>(a, a, c)", "takes rank 3, not 1"),
         ("trt.InverseTRT(x)", "takes rank 4, not 3"),
-        ("trt.Twist(x)", "trt::Twist is no operator, has no local function"),
+        ("trt.Twist(x)", "trt::Twist is neither an operator nor a known plugin"),
     ],
 )
 def test_plugins_are_called_as_they_want(call: str, message: str | None) -> None:

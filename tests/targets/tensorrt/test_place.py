@@ -10,12 +10,12 @@ from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
-from me2e_compress.quantization.int8_weights import quantize_weight
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.tensorrt.place import place
+from me2e_compress.targets.weights import quantize_weight
 from tests.nets import MODULES, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)

@@ -1,7 +1,6 @@
-"""Would TensorRT's ONNX parser take a graph, and run as int8 what is meant to be?"""
+"""Rules of TensorRT: would its parser take a graph, and run its int8 as int8?"""
 
-from me2e_compress.targets.finding import LintRule
-from me2e_compress.targets.standard import of_opset, valid
+from me2e_compress.targets.finding import LintRule, of_opset, valid
 from me2e_compress.targets.tensorrt.lint import (
     placement,
     qdq,

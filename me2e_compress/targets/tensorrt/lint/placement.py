@@ -5,26 +5,21 @@ from collections.abc import Iterator
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.quantization.plan import channel_axis
-from me2e_compress.quantization.rules import CONVOLUTIONS, WEIGHTED
-from me2e_compress.targets.finding import (
-    LintFinding,
-    error,
-    is_standard,
-    nodes_of,
-    warning,
-)
-from me2e_compress.targets.tensorrt.lint.qdq import (
+from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, nodes_of
+from me2e_compress.targets.finding import LintFinding, error, warning
+from me2e_compress.targets.quantized import (
     DEQUANTIZE,
+    PAIR,
     QUANTIZE,
-    is_pair,
+    is_dequantized,
+    is_quantized,
     pairs_of,
-    stored,
 )
+from me2e_compress.targets.tensorrt.lint.qdq import stored
 
 
 def channel_scales(model: ir.Model) -> Iterator[LintFinding]:
-    """Activations have one scale; weights one, or one a channel of their layer."""
+    """Check that activations have one scale, and weights one or one a channel."""
     for node in pairs_of(model):
         scale = graph.static_shape(node.inputs[1])
         if not scale or scale == (1,):
@@ -57,7 +52,7 @@ def _axis(node: ir.Node) -> Iterator[LintFinding]:
         return
     for reader in node.outputs[0].consumers():
         if reader.op_type in WEIGHTED and reader.inputs[1] is node.outputs[0]:
-            wanted = channel_axis(reader)
+            wanted = graph.channel_axis(reader)
             if axis != wanted:
                 yield error(
                     "weight-axis",
@@ -68,23 +63,23 @@ def _axis(node: ir.Node) -> Iterator[LintFinding]:
 
 
 def repeated_pairs(model: ir.Model) -> Iterator[LintFinding]:
-    """Nothing is quantized twice in a row."""
+    """Find what is quantized twice in a row."""
     for node in pairs_of(model):
-        if node.op_type == QUANTIZE and is_pair(node.inputs[0]):
+        if node.op_type == QUANTIZE and is_dequantized(node.inputs[0]):
             yield warning("repeated-pair", node, "quantizes what was just dequantized")
 
 
 def outputs(model: ir.Model) -> Iterator[LintFinding]:
-    """Outputs of the graph are as precise as their layer gives them."""
+    """Find outputs of the graph that are rounded to int8."""
     for value in model.graph.outputs:
-        if is_pair(value):
+        if is_dequantized(value):
             yield warning(
                 "output-pair", value.producer(), f"graph output {value.name} is rounded"
             )
 
 
 def branches(model: ir.Model) -> Iterator[LintFinding]:
-    """Of an Add behind a convolution only the residual branch has a pair."""
+    """Find pairs between a convolution and its Add: only the residual has one."""
     for node in nodes_of(model):
         if node.op_type != "Add" or not is_standard(node):
             continue
@@ -98,11 +93,11 @@ def branches(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
-    """A layer reads int8 on both sides or on none."""
+    """Find layers that read int8 on one side only."""
     for node in nodes_of(model):
         if node.op_type not in WEIGHTED or not is_standard(node):
             continue
-        sides = [is_pair(value) for value in node.inputs[:2]]
+        sides = [is_dequantized(value) for value in node.inputs[:2]]
         if sides == [True, False]:
             yield warning(
                 "half-quantized", node, "its weight is float: it runs in float"
@@ -116,7 +111,7 @@ def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def float_weights(model: ir.Model) -> Iterator[LintFinding]:
-    """Weights are stored as int8, not as float that is quantized when it is built."""
+    """Find weights that are stored as float and quantized when the engine is built."""
     for node in pairs_of(model):
         value = node.inputs[0]
         if node.op_type == QUANTIZE and stored(value):
@@ -124,29 +119,29 @@ def float_weights(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def _is_weight(node: ir.Node) -> bool:
-    """Say whether a pair stands on a constant."""
+    """Return whether a pair stands on a constant."""
     value = node.inputs[0]
-    return stored(value) or (is_pair(value, QUANTIZE) and _only_stored(value))
+    return stored(value) or (is_quantized(value) and _only_stored(value))
 
 
 def _only_stored(value: ir.Value | None) -> bool:
-    """Say whether a value is a constant behind at most a pair."""
-    node = None if value is None else value.producer()
-    if node is not None and node.op_type in (QUANTIZE, DEQUANTIZE):
+    """Return whether a value is a constant, a pair at most in between."""
+    node = graph.producer_of(value)
+    if node is not None and node.op_type in PAIR:
         return _only_stored(node.inputs[0])
     return stored(value)
 
 
 def _rounds_convolution(value: ir.Value | None) -> bool:
-    """Say whether a pair reads a convolution that nothing else reads."""
-    if value is None or not is_pair(value) or len(value.uses()) != 1:
+    """Return whether a pair reads a convolution that nothing else reads."""
+    if value is None or not is_dequantized(value) or len(value.uses()) != 1:
         return False
     node = value.producer()
-    quantize = node.inputs[0].producer() if node and node.inputs[0] else None
+    quantize = None if node is None else graph.producer_of(node.inputs[0])
     source = quantize.inputs[0] if quantize is not None else None
     return _is_convolution(source) and source is not None and len(source.uses()) == 1
 
 
 def _is_convolution(value: ir.Value | None) -> bool:
-    node = None if value is None else value.producer()
+    node = graph.producer_of(value)
     return node is not None and node.op_type in CONVOLUTIONS

@@ -1,7 +1,7 @@
 """Explicit quantization: QuantizeLinear and DequantizeLinear as TensorRT wants them.
 
 Sources: NvInfer.h and the ONNX parser of TensorRT 10.7; its developer guide, "Explicit
-quantization". What TensorRT-RTX's parser lets pass silently (scales by channel on
+quantization". What TensorRT-RTX's parser accepts silently (scales by channel on
 activations, uint8) is an error here.
 """
 
@@ -11,31 +11,24 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.targets.finding import LintFinding, error, is_standard, nodes_of
-
-QUANTIZE, DEQUANTIZE = "QuantizeLinear", "DequantizeLinear"
-
-
-def pairs_of(model: ir.Model) -> Iterator[ir.Node]:
-    """Walk the QuantizeLinear and DequantizeLinear nodes."""
-    for node in nodes_of(model):
-        if is_standard(node) and node.op_type in (QUANTIZE, DEQUANTIZE):
-            yield node
-
-
-def is_pair(value: ir.Value | None, op: str = DEQUANTIZE) -> bool:
-    """Say whether a value comes out of a DequantizeLinear (or QuantizeLinear)."""
-    node = None if value is None else value.producer()
-    return node is not None and is_standard(node) and node.op_type == op
+from me2e_compress.graph import is_standard, nodes_of
+from me2e_compress.targets.finding import LintFinding, error
+from me2e_compress.targets.quantized import (
+    DEQUANTIZE,
+    QUANTIZE,
+    is_dequantized,
+    is_quantized,
+    pairs_of,
+)
 
 
 def stored(value: ir.Value | None) -> bool:
-    """Say whether a value is an initializer or a Constant."""
+    """Return whether a value is an initializer or a Constant."""
     return graph.array_of(value) is not None
 
 
 def scales(model: ir.Model) -> Iterator[LintFinding]:
-    """Scales are constants, finite and above zero."""
+    """Check that scales are constants, finite and above 0."""
     for node in pairs_of(model):
         scale = graph.array_of(node.inputs[1])
         if scale is None:
@@ -48,9 +41,9 @@ def scales(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def zero_points(model: ir.Model) -> Iterator[LintFinding]:
-    """Quantization is symmetric and int8: zero points are 0, of type int8."""
+    """Check that quantization is symmetric: zero points are 0, of type int8."""
     for node in pairs_of(model):
-        value = node.inputs[2] if len(node.inputs) > 2 else None
+        value = graph.input_at(node, 2)
         kind = _integer_type(node, value)
         if kind != ir.DataType.INT8:
             name = "uint8" if kind is None else kind.name.lower()
@@ -64,28 +57,28 @@ def zero_points(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def biases(model: ir.Model) -> Iterator[LintFinding]:
-    """Biases stay float: no int32 behind a DequantizeLinear, no pair on a bias."""
+    """Check that biases stay float: no pair, no int32 behind a DequantizeLinear."""
     for node in nodes_of(model):
-        if node.op_type not in ("Conv", "ConvTranspose", "Gemm"):
+        if node.op_type not in (*graph.CONVOLUTIONS, "Gemm"):
             continue
-        if len(node.inputs) > 2 and is_pair(node.inputs[2]):
+        if is_dequantized(graph.bias_of(node)):
             yield error("bias-pair", node, "the bias is quantized, must be float")
 
 
 def scalars(model: ir.Model) -> Iterator[LintFinding]:
-    """What is quantized has at least one dimension."""
+    """Check that quantized tensors have at least one dimension."""
     for node in pairs_of(model):
         if graph.static_shape(node.inputs[0]) == ():
             yield error("scalar-pair", node, f"{node.op_type} of a 0-D tensor")
 
 
 def completeness(model: ir.Model) -> Iterator[LintFinding]:
-    """A QuantizeLinear is read by DequantizeLinears only, on the same scale."""
+    """Check that only DequantizeLinears of the same scale read a QuantizeLinear."""
     for node in pairs_of(model):
         if node.op_type == QUANTIZE:
             yield from _readers(node)
-        elif not stored(node.inputs[0]) and not is_pair(node.inputs[0], QUANTIZE):
-            made = node.inputs[0].producer() if node.inputs[0] is not None else None
+        elif not stored(node.inputs[0]) and not is_quantized(node.inputs[0]):
+            made = graph.producer_of(node.inputs[0])
             what = "a graph input" if made is None else made.op_type
             yield error("unpaired", node, f"reads integers of {what}")
 
@@ -105,10 +98,10 @@ def _readers(node: ir.Node) -> Iterator[LintFinding]:
 
 
 def integers(model: ir.Model) -> Iterator[LintFinding]:
-    """Indices and shapes are not made of dequantized numbers."""
+    """Check that indices and shapes are not made of dequantized numbers."""
     whole = {ir.DataType.INT32.value, ir.DataType.INT64.value}
     for node in nodes_of(model):
-        if node.op_type != "Cast" or not is_pair(node.inputs[0]):
+        if node.op_type != "Cast" or not is_dequantized(node.inputs[0]):
             continue
         if node.attributes.get_int("to", 0) in whole:
             yield error(
@@ -124,7 +117,7 @@ def _same_scale(one: ir.Node, other: ir.Node) -> bool:
 
 
 def _integer_type(node: ir.Node, zero: ir.Value | None) -> ir.DataType | None:
-    """Name the integer type: the zero point's, else the tensor's, else ONNX's uint8."""
+    """Return the integer type: the zero point's, else the tensor's, else uint8."""
     if node.op_type == DEQUANTIZE and node.inputs[0] is not None:
         kind = node.inputs[0].dtype
         if kind is not None:

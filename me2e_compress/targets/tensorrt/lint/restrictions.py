@@ -1,14 +1,15 @@
-"""What the parser wants of single operators, as the support matrix notes it."""
+"""Restrictions on single operators, as the support matrix of the parser notes them."""
 
 from collections.abc import Callable, Iterator
 
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.targets.finding import LintFinding, error, is_standard, nodes_of
+from me2e_compress.graph import input_at, is_standard, nodes_of, rank_of
+from me2e_compress.targets.finding import LintFinding, error
 
 MAX_K = 3840
-"""Most elements that TopK gives."""
+"""Largest K of a TopK."""
 
 _RESIZE_MODES = ("nearest", "linear")
 _RESIZE_TRANSFORMS = (
@@ -18,23 +19,21 @@ _RESIZE_TRANSFORMS = (
 
 
 def restrictions(model: ir.Model) -> Iterator[LintFinding]:
-    """Ask what there is to ask of each node."""
+    """Check every node against the restrictions on its operator."""
     for node in nodes_of(model):
-        for ask in _ASKED.get(node.op_type, ()) if is_standard(node) else ():
-            if objection := ask(node):
+        for check in _CHECKS.get(node.op_type, ()) if is_standard(node) else ():
+            if objection := check(node):
                 yield error("restriction", node, f"{node.op_type}: {objection}")
 
 
 def _image(node: ir.Node) -> str | None:
-    """Two or three spatial dimensions."""
-    value = node.inputs[0]
-    rank = None if value is None or value.shape is None else len(value.shape)
+    """Check for two or three spatial dimensions."""
+    rank = rank_of(node.inputs[0])
     return None if rank in (None, 4, 5) else f"rank {rank}, must be 4 or 5"
 
 
 def _four(node: ir.Node) -> str | None:
-    value = node.inputs[0]
-    rank = None if value is None or value.shape is None else len(value.shape)
+    rank = rank_of(node.inputs[0])
     return None if rank in (None, 4) else f"rank {rank}, must be 4"
 
 
@@ -45,17 +44,17 @@ def _undilated(node: ir.Node) -> str | None:
 
 def _first_output(node: ir.Node) -> str | None:
     extra = [value for value in node.outputs[1:] if value.name]
-    return None if not extra else "only the first output is given"
+    return None if not extra else "only the first output is supported"
 
 
 def _constant(index: int, name: str) -> Callable[[ir.Node], str | None]:
-    def ask(node: ir.Node) -> str | None:
-        value = node.inputs[index] if index < len(node.inputs) else None
+    def check(node: ir.Node) -> str | None:
+        value = input_at(node, index)
         if value is None or graph.array_of(value) is not None:
             return None
         return f"{name} is computed, must be a constant"
 
-    return ask
+    return check
 
 
 def _top_k(node: ir.Node) -> str | None:
@@ -83,20 +82,22 @@ def _resize(node: ir.Node) -> str | None:
     policy = text("keep_aspect_ratio_policy", "stretch")
     if policy != "stretch":
         return f"aspect ratio policy {policy}, must be stretch"
-    return "antialias" if node.attributes.get_int("antialias", 0) else None
+    return "antialias must be 0" if node.attributes.get_int("antialias", 0) else None
 
 
 def _even_pads(node: ir.Node) -> str | None:
     pads = tuple(node.attributes.get_ints("pads", ()))
     half = len(pads) // 2
-    return None if pads[:half] == pads[half:] else f"pads {list(pads)} differ by end"
+    if pads[:half] == pads[half:]:
+        return None
+    return f"pads {list(pads)} differ between begin and end"
 
 
 def _no_layout(node: ir.Node) -> str | None:
     return "layout must be 0" if node.attributes.get_int("layout", 0) else None
 
 
-_ASKED: dict[str, tuple[Callable[[ir.Node], str | None], ...]] = {
+_CHECKS: dict[str, tuple[Callable[[ir.Node], str | None], ...]] = {
     "AveragePool": (_image, _undilated),
     "Conv": (_image,),
     "ConvTranspose": (_image,),

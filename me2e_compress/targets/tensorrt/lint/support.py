@@ -1,24 +1,20 @@
-"""Operators and plugins: known, of a type that is taken, called as they want."""
+"""Operators and plugins: known, of an accepted type, with the inputs they need."""
 
 from collections.abc import Iterator
 
 import onnx_ir as ir
 
-from me2e_compress.targets.finding import (
-    LintFinding,
-    error,
-    is_standard,
-    nodes_of,
-    warning,
-)
-from me2e_compress.targets.tensorrt.lint.operators import (
+from me2e_compress.graph import input_at, is_standard, nodes_of, opset_of, rank_of
+from me2e_compress.targets.finding import LintFinding, error, warning
+from me2e_compress.targets.quantized import PAIR
+from me2e_compress.targets.tensorrt.lint.tables import (
     LATER,
+    PLUGINS,
     SUPPORTED,
     UNSUPPORTED,
+    Plugin,
 )
-from me2e_compress.targets.tensorrt.lint.plugin_table import PLUGINS, Plugin
 
-PAIRS = ("QuantizeLinear", "DequantizeLinear")
 OPSETS = (9, 20, 24)
 """Oldest opset; newest of TensorRT 10.1; newest of 10.15."""
 
@@ -28,8 +24,8 @@ _UNTYPED = ("RandomUniform", "Scan", "Shape", "Size")
 
 
 def opset(model: ir.Model) -> Iterator[LintFinding]:
-    """Hold the graph's opset against what parsers read."""
-    found = model.opset_imports.get("", 0)
+    """Check the graph's opset against those that parsers read."""
+    found = opset_of(model)
     oldest, newest, later = OPSETS
     if not oldest <= found <= later:
         yield error("opset", None, f"opset {found}: parsers read {oldest} to {later}")
@@ -40,9 +36,9 @@ def opset(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def operators(model: ir.Model) -> Iterator[LintFinding]:
-    """Find operators that the parser refuses or that nobody knows."""
+    """Find operators that the parser refuses, or that are unknown."""
     for node in nodes_of(model):
-        if not is_standard(node) or node.op_type in PAIRS:
+        if not is_standard(node) or node.op_type in PAIR:
             continue
         name = node.op_type
         if name in UNSUPPORTED:
@@ -52,11 +48,11 @@ def operators(model: ir.Model) -> Iterator[LintFinding]:
                 "operator", node, f"{name} needs TensorRT {LATER[name]} or later"
             )
         elif name not in SUPPORTED:
-            yield error("operator", node, f"{name} is in no support matrix: unknown")
+            yield error("operator", node, f"{name} stands in no support matrix")
 
 
 def element_types(model: ir.Model) -> Iterator[LintFinding]:
-    """Find data of a type that its operator is not taken with."""
+    """Find data of a type that its operator does not accept."""
     for node in nodes_of(model):
         taken = SUPPORTED.get(node.op_type) if is_standard(node) else None
         kind = _data_type(node)
@@ -71,7 +67,7 @@ def element_types(model: ir.Model) -> Iterator[LintFinding]:
             yield error(
                 "element-type",
                 node,
-                f"{node.op_type} of {kind.name.lower()}; it is taken with {names}",
+                f"{node.op_type} of {kind.name.lower()}; it accepts {names}",
             )
 
 
@@ -79,7 +75,7 @@ def one_type(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators of two float types: networks are strongly typed."""
     floats = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
     for node in nodes_of(model):
-        if not is_standard(node) or node.op_type in (*PAIRS, "CastLike", "Resize"):
+        if not is_standard(node) or node.op_type in (*PAIR, "CastLike", "Resize"):
             continue
         kinds = {each.dtype for each in node.inputs if each is not None}
         found = [each.name.lower() for each in floats if each in kinds]
@@ -87,12 +83,12 @@ def one_type(model: ir.Model) -> Iterator[LintFinding]:
             yield error(
                 "mixed-types",
                 node,
-                f"{node.op_type} of {' and '.join(found)}: one Cast",
+                f"{node.op_type} of {' and '.join(found)}: cast one of them",
             )
 
 
 def plugins(model: ir.Model) -> Iterator[LintFinding]:
-    """Hold custom operators against the plugins that are known."""
+    """Check custom operators against the known plugins."""
     for node in nodes_of(model):
         if is_standard(node):
             continue
@@ -103,8 +99,8 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
             yield error(
                 "plugin",
                 node,
-                f"{node.domain}::{node.op_type} is no operator, has no local function"
-                " and is no plugin that is known",
+                f"{node.domain}::{node.op_type} is neither an operator nor a known"
+                " plugin, and has no local function",
             )
 
 
@@ -117,12 +113,12 @@ def _call(node: ir.Node, plugin: Plugin) -> Iterator[LintFinding]:
         )
         return
     if missing := [each for each in plugin.attributes if each not in node.attributes]:
-        yield error("plugin", node, f"{name} wants attributes {', '.join(missing)}")
+        yield error("plugin", node, f"{name} needs attributes {', '.join(missing)}")
     first = node.inputs[0]
     kind = None if first is None else first.dtype
     if kind is not None and kind not in plugin.types:
         yield error("plugin", node, f"{name} does not take {kind.name.lower()}")
-    rank = None if first is None or first.shape is None else len(first.shape)
+    rank = rank_of(first)
     if None not in (rank, plugin.rank) and rank != plugin.rank:
         yield error("plugin", node, f"{name} takes rank {plugin.rank}, not {rank}")
     for index in plugin.integers:
@@ -139,5 +135,5 @@ def _data_type(node: ir.Node) -> ir.DataType | None:
     if node.op_type in _TYPE_OF_OUTPUT:
         return node.outputs[0].dtype
     index = _DATA_INPUT.get(node.op_type, 0)
-    value = node.inputs[index] if index < len(node.inputs) else None
+    value = input_at(node, index)
     return None if value is None else value.dtype

@@ -1,11 +1,18 @@
-"""Parse and build a graph, and hold the result against its quantization plan."""
+"""Parse and build a graph, and check what was built against its quantization plan.
+
+A built plan is a binary file that carries readable text for each kernel; its form is
+not documented. It is read to confirm what the quantization plan promises, and for
+nothing else: where the form changes no kernels are found, and that is reported.
+"""
 
 import dataclasses
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +21,6 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import GraphError, MissingExtraError, RecipeError
 from me2e_compress.quantization.plan import INT8, QuantPlan, plan_of
-from me2e_compress.targets.tensorrt.rtx.built_layers import (
-    Kernel,
-    read_kernels,
-    without_int8,
-)
 from me2e_compress.targets.tensorrt.rtx.cut import cut
 
 SM = (75, 80, 86, 89, 120, 121)
@@ -26,18 +28,50 @@ SM = (75, 80, 86, 89, 120, 121)
 
 EXTRA = "trt-check"
 
+_KERNEL = re.compile(
+    r"(corrltn|deconvolution|fully_connected)=\{ name=\"([^\"]+)\" output=\{([^}]*)\}"
+    r" input=\{([^}]*)\}"
+)
+_TENSOR = re.compile(r'name="([^"]+)"[^}]*?(?:\{[^}]*\}[^}]*?)*type=(\w+) \}')
+_WORD = re.compile(r'"([^"]+)"')
+_KINDS = {
+    "corrltn": "convolution",
+    "deconvolution": "deconvolution",
+    "fully_connected": "product",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """One convolution or matrix product of a built plan.
+
+    Attributes:
+        kind: ``convolution``, ``deconvolution`` or ``product``.
+        nodes: names of the ONNX nodes that it computes; merged ones together.
+        operands: element types of its first two operands, ``?`` if not said.
+    """
+
+    kind: str
+    nodes: tuple[str, ...]
+    operands: tuple[str, ...]
+
+    @property
+    def is_int8(self) -> bool:
+        """Whether both operands are int8."""
+        return self.operands == ("int8", "int8")
+
 
 @dataclasses.dataclass(frozen=True)
 class BuildResult:
-    """What TensorRT-RTX made of a graph.
+    """The answer of TensorRT-RTX to a graph.
 
     Attributes:
         version: of TensorRT-RTX.
         cut: nodes that were cut out, because it has no plugin library.
         parsed: whether the parser took the graph.
-        built: whether the builder did; None if it was not asked.
+        built: whether the builder did; None if it was not run.
         layers: of the parsed network.
-        errors: what parser and builder objected to.
+        errors: of parser and builder.
         kernels: convolutions and products of the built plan.
         missing: convolutions (Conv) that the graph's quantization plan makes int8 and
             that no int8 kernel computes; None if the graph carries no plan, or was not
@@ -56,12 +90,12 @@ class BuildResult:
 
     @property
     def passed(self) -> bool:
-        """Whether everything that was asked went well."""
+        """Whether every step that was run succeeded."""
         return self.parsed and self.built is not False and not self.missing
 
 
 def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
-    """Let TensorRT-RTX parse a graph and build it, without a GPU.
+    """Parse and build a graph by TensorRT-RTX, without a GPU.
 
     A minute and 1 GB for 1,500 nodes and 55 convolutions.
 
@@ -113,7 +147,7 @@ def _ask(
         check=False,
     )
     if not answer.is_file():
-        last = done.stderr.strip().splitlines()[-1:] or ["it said nothing"]
+        last = done.stderr.strip().splitlines()[-1:] or ["no message"]
         raise GraphError(
             f"TensorRT-RTX ended with code {done.returncode} on the graph: {last[0]}"
         )
@@ -136,3 +170,23 @@ def _missing(
         if each.dtype == INT8 and each.op == "Conv"
     ]
     return without_int8(wanted, kernels)
+
+
+def read_kernels(plan: bytes) -> tuple[Kernel, ...]:
+    """Find the convolutions and products in the text of a plan."""
+    text = plan.decode("latin1")
+    types = dict(_TENSOR.findall(text))
+    return tuple(
+        Kernel(
+            _KINDS[kind],
+            tuple(name.split("+")),
+            tuple(types.get(word, "?") for word in _WORD.findall(operands)[:2]),
+        )
+        for kind, name, _, operands in _KERNEL.findall(text)
+    )
+
+
+def without_int8(nodes: Iterable[str], kernels: Iterable[Kernel]) -> tuple[str, ...]:
+    """Name the nodes that no int8 kernel of the plan computes."""
+    done = {name for kernel in kernels if kernel.is_int8 for name in kernel.nodes}
+    return tuple(name for name in nodes if name not in done)

@@ -1,19 +1,19 @@
-"""Take out of a graph what TensorRT-RTX has no library for."""
+"""Cut out of a graph what TensorRT-RTX has no library for."""
 
 import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError
-from me2e_compress.targets.finding import is_standard
+from me2e_compress.graph import is_standard
 
 LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
 """Operators that TensorRT takes, by its own plugins, and TensorRT-RTX does not."""
 
 
 def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
-    """Cut a graph at plugins: what they give becomes input, what they read output.
+    """Cut a graph at plugins: their outputs become inputs, their inputs outputs.
 
-    Nodes that the file brings a local function for are no plugins: the parser reads it.
+    Nodes with a local function are not plugins: the parser reads the function.
 
     Args:
         model: the graph, shapes inferred; it stays as it is.
@@ -22,11 +22,11 @@ def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
         The copy, and the names of the nodes that were cut out.
 
     Raises:
-        PreconditionError: type or shape of what a plugin gives is not known.
+        PreconditionError: type or shape of a plugin's output is not known.
     """
     copy = model.clone()
     copy.metadata_props.clear()  # it speaks of inputs and outputs that change
-    gone = [node for node in copy.graph if _is_beyond(node, copy)]
+    gone = [node for node in copy.graph if _is_missing(node, copy)]
     names = tuple(node.name or str(node.outputs[0].name) for node in gone)
     for node in gone:
         _detach(copy.graph, node)
@@ -34,7 +34,7 @@ def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
     return copy, names
 
 
-def _is_beyond(node: ir.Node, model: ir.Model) -> bool:
+def _is_missing(node: ir.Node, model: ir.Model) -> bool:
     if is_standard(node):
         return node.op_type in LACKING
     return node.op_identifier() not in model.functions
@@ -48,8 +48,8 @@ def _detach(where: ir.Graph, node: ir.Node) -> None:
             continue
         if value.dtype is None or graph.static_shape(value) is None:
             raise PreconditionError(
-                f"{node.op_type} {node.name!r} gives {value.name} of unknown type or"
-                " shape: the graph cannot be cut there"
+                f"{node.op_type} {node.name!r}: the type or shape of its output"
+                f" {value.name} is not known, so the graph cannot be cut there"
             )
         name = str(value.name)
         value.name = f"{name}_cut"

@@ -1,4 +1,4 @@
-from me2e_compress.targets.tensorrt.rtx.built_layers import (
+from me2e_compress.targets.tensorrt.rtx.check import (
     Kernel,
     read_kernels,
     without_int8,

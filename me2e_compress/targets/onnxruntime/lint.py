@@ -1,27 +1,33 @@
-"""Would onnxruntime's CPU run a graph, and its int8 fast?"""
+"""Rules of onnxruntime: would its CPU run a graph, and its int8 fast?"""
 
 from collections.abc import Iterator
 
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.quantization.rules import CONVOLUTIONS, WEIGHTED
+from me2e_compress.graph import (
+    CONVOLUTIONS,
+    WEIGHTED,
+    is_standard,
+    nodes_of,
+    opset_of,
+    producer_of,
+)
 from me2e_compress.runtime.native import operators as native_operators
 from me2e_compress.targets.finding import (
     LintFinding,
     LintRule,
     error,
-    is_standard,
-    nodes_of,
+    of_opset,
+    valid,
     warning,
 )
-from me2e_compress.targets.standard import of_opset, valid
-from me2e_compress.targets.tensorrt.lint.qdq import QUANTIZE, is_pair
+from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
 
 
 def opset(model: ir.Model) -> Iterator[LintFinding]:
-    """Find opsets beyond what ONNX itself has released."""
-    found, newest = model.opset_imports.get("", 0), onnx.defs.onnx_opset_version()
+    """Find opsets that ONNX has not released."""
+    found, newest = opset_of(model), onnx.defs.onnx_opset_version()
     if found > newest:
         yield error("opset", None, f"opset {found}, the newest known is {newest}")
 
@@ -45,7 +51,7 @@ def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
     """
     for node in _layers(model):
         value = node.inputs[0]
-        if is_pair(value) and _reads(value) == ir.DataType.INT8:
+        if is_dequantized(value) and _reads(value) == ir.DataType.INT8:
             yield warning(
                 "signed-activation", node, "reads int8, the fast kernels read uint8"
             )
@@ -58,7 +64,8 @@ def unanswered(model: ir.Model) -> Iterator[LintFinding]:
     is meant to run in float, whatever it reads.
     """
     for node in _layers(model):
-        if node.op_type not in CONVOLUTIONS or not all(map(is_pair, node.inputs[:2])):
+        quantized = all(map(is_dequantized, node.inputs[:2]))
+        if node.op_type not in CONVOLUTIONS or not quantized:
             continue
         value = node.outputs[0]
         readers = list(value.consumers())
@@ -77,7 +84,7 @@ def _layers(model: ir.Model) -> Iterator[ir.Node]:
 
 
 def _reads(value: ir.Value | None) -> ir.DataType | None:
-    node = None if value is None else value.producer()
+    node = producer_of(value)
     integers = None if node is None else node.inputs[0]
     return None if integers is None else integers.dtype
 
