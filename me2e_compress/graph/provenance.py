@@ -95,3 +95,70 @@ def missing(model: ir.Model) -> list[str]:
         for node in model.graph.all_nodes()
         if MODULE not in node.metadata_props or ORIGINS not in node.metadata_props
     ]
+
+
+def sign(before: ir.Model, after: ir.Model, by: str) -> None:
+    """Put a pass's name on every node that it made or changed, where it is missing."""
+    for node in _unsigned(before, after, by):
+        inherit(node, [node], by=by)
+
+
+def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
+    """Name the nodes that a pass made or changed without putting its name on them.
+
+    A node is changed where its operator or an attribute is another; reading another
+    value of the same meaning is no change of its own.
+
+    Args:
+        before: the graph that the pass was given.
+        after: the graph that it returned.
+        by: the pass's name.
+    """
+    return [node.name or node.op_type for node in _unsigned(before, after, by)]
+
+
+def foreign(before: ir.Model, after: ir.Model) -> list[str]:
+    """Name the nodes that claim to stand for nodes which the graph before never knew.
+
+    Empty where the graph before says nothing of its nodes: somebody must say it first.
+    """
+    if missing(before):
+        return []
+    texts = {node.metadata_props[ORIGINS] for node in before.graph.all_nodes()}
+    names = {
+        name for node in before.graph.all_nodes() for name in _names(node, ORIGINS)
+    }
+    return [
+        node.name or node.op_type
+        for node in after.graph.all_nodes()
+        if node.metadata_props[ORIGINS] not in texts
+        and not names.issuperset(_names(node, ORIGINS))
+    ]
+
+
+def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
+    known = {node.name: node for node in before.graph.all_nodes()}
+    return [
+        node
+        for node in after.graph.all_nodes()
+        if f'"{by}"' not in node.metadata_props.get(PASSES, "")
+        and not _same(known.get(node.name), node)
+    ]
+
+
+def _same(old: ir.Node | None, new: ir.Node) -> bool:
+    """Whether two nodes compute the same of what they read."""
+    if old is None or (old.domain, old.op_type) != (new.domain, new.op_type):
+        return False
+    if old.attributes.keys() != new.attributes.keys():
+        return False
+    return all(
+        mine is theirs or mine.type in _BODIES or repr(mine) == repr(theirs)
+        for mine, theirs in zip(
+            old.attributes.values(), new.attributes.values(), strict=True
+        )
+    )
+
+
+_BODIES = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
+"""Kinds of attributes whose nodes are looked at one by one."""

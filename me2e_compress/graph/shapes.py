@@ -1,7 +1,5 @@
 """What shapes are known, and how to know more."""
 
-from collections.abc import Iterator
-
 import onnx
 import onnx_ir as ir
 
@@ -39,26 +37,40 @@ def infer_shapes(model: ir.Model) -> None:
         proto = onnx.shape_inference.infer_shapes(
             _without_weights(model), strict_mode=False, data_prop=True
         )
-        inferred = ir.from_proto(proto)
     except (
         onnx.checker.ValidationError,
         onnx.shape_inference.InferenceError,
         ir.serde.SerdeError,
     ):
         return
-    interface = set(model.graph.outputs)
-    for body, answer in zip(model.graphs(), inferred.graphs(), strict=True):
-        known = {value.name: value for value in _computed(answer)}
-        for value in _computed(body):
-            found = known.get(value.name)
-            if found is not None and value not in interface:
-                value.type = found.type if found.type is not None else value.type
-                value.shape = found.shape if found.shape is not None else value.shape
+    _adopt(model.graph, proto.graph, set(model.graph.outputs))
 
 
-def _computed(graph: ir.Graph) -> Iterator[ir.Value]:
-    for node in graph:
-        yield from (value for value in node.outputs if value.name)
+def _adopt(
+    graph: ir.Graph, inferred: onnx.GraphProto, interface: set[ir.Value]
+) -> None:
+    """Copy what was inferred onto the values of a graph and of the graphs in it.
+
+    Only types and shapes are read: building the whole graph anew from its message
+    would take as long as the inference.
+    """
+    known = {info.name: info for info in (*inferred.value_info, *inferred.output)}
+    for node, written in zip(graph, inferred.node, strict=True):
+        for value in node.outputs:
+            info = known.get(value.name or "")
+            if info is None or value in interface:
+                continue
+            kind = ir.serde.deserialize_type_proto_for_type(info.type)
+            shape = ir.serde.deserialize_type_proto_for_shape(info.type)
+            value.type = kind if kind is not None else value.type
+            value.shape = shape if shape is not None else value.shape
+        for body in written.attribute:
+            if body.type == onnx.AttributeProto.GRAPH:
+                _adopt(node.attributes[body.name].as_graph(), body.g, interface)
+            elif body.type == onnx.AttributeProto.GRAPHS:
+                bodies = node.attributes[body.name].as_graphs()
+                for inner, message in zip(bodies, body.graphs, strict=True):
+                    _adopt(inner, message, interface)
 
 
 def _without_weights(model: ir.Model) -> onnx.ModelProto:

@@ -10,21 +10,29 @@ from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Pass, PassResult
 
 
-def check(current: Pass, before: ir.Model, result: PassResult) -> None:
-    """Hold a pass to its contract; the interface before is the graph's own.
+def check(current: Pass, before: ir.Model, result: PassResult, known: str) -> str:
+    """Check that a pass kept its contract.
+
+    Args:
+        current: the pass.
+        before: the graph that a copy of was given to it; the interface is its own.
+        result: what the pass returned.
+        known: the digest of the graph before.
+
+    Returns:
+        The digest of the graph after.
 
     Raises:
         VerificationError: the pass lied about having changed something, changed the
-            interface, lost the past of a node, or left an invalid graph.
+            interface, lost or made up the past of a node, or left an invalid graph.
     """
-    _check_claim(current, before, result)
+    after = graph.digest(result.model)
+    _check_claim(current, result, changed=after != known)
     if not current.changes_interface:
         _check_interface(current, before, result)
-    if lost := provenance.missing(result.model):
-        raise VerificationError(
-            f"{current.name} lost where {len(lost)} nodes come from, {lost[0]} first"
-        )
+    _check_provenance(current, before, result.model)
     check_valid(current.name, result.model)
+    return after
 
 
 def check_valid(name: str, model: ir.Model) -> None:
@@ -41,14 +49,30 @@ def check_valid(name: str, model: ir.Model) -> None:
         raise VerificationError(f"{name} left an invalid graph: {reason}") from error
 
 
-def _check_claim(current: Pass, before: ir.Model, result: PassResult) -> None:
-    same = graph.digest(before) == graph.digest(result.model)
-    if same and result.changes:
+def _check_claim(current: Pass, result: PassResult, *, changed: bool) -> None:
+    if result.changes and not changed:
         raise VerificationError(
             f"{current.name} claims {result.changes} changes but made none"
         )
-    if not same and not result.changes:
+    if changed and not result.changes:
         raise VerificationError(f"{current.name} changed the graph and denies it")
+
+
+def _check_provenance(current: Pass, before: ir.Model, after: ir.Model) -> None:
+    if lost := provenance.missing(after):
+        raise VerificationError(
+            f"{current.name} lost where {len(lost)} nodes come from, {lost[0]} first"
+        )
+    if unstamped := provenance.unstamped(before, after, current.name):
+        raise VerificationError(
+            f"{current.name} made or changed {len(unstamped)} nodes that do not name"
+            f" it among their passes, {unstamped[0]} first"
+        )
+    if foreign := provenance.foreign(before, after):
+        raise VerificationError(
+            f"{current.name} says that {len(foreign)} nodes stand for nodes that never"
+            f" were, {foreign[0]} first"
+        )
 
 
 def _check_interface(current: Pass, before: ir.Model, result: PassResult) -> None:

@@ -1,7 +1,9 @@
 """The pass manager: clone, run, check, commit; verify exact passes; find the guilty."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import process_time
 
@@ -56,18 +58,19 @@ class PassManager:
             PassError: a pass broke.
             VerificationError: a pass broke the contract or changed the outputs.
         """
-        model = model.clone()
+        with _collector_paused():
+            return self._run(model.clone(), context, progress or _silent)
+
+    def _run(self, model: ir.Model, context: Context, progress: Progress) -> Report:
         graph.infer_shapes(model)
         passes = self._with_import(model)
         books = _Books(self, context, checkpoint=model)
         for done, current in enumerate(passes):
-            if progress:
-                progress(done, len(passes), current.name)
+            progress(done, len(passes), current.name)
             if not current.exact:
                 books.verify(model)
             model = books.transact(current, model)
-        if progress:
-            progress(len(passes), len(passes), "verify")
+        progress(len(passes), len(passes), "verify")
         books.verify(model)
         return Report(
             model, to_text(passes), tuple(books.steps), tuple(books.verifications)
@@ -79,6 +82,26 @@ class PassManager:
         if known or first == ImportNormalize.name:
             return self.passes
         return (ImportNormalize(), *self.passes)
+
+
+@contextlib.contextmanager
+def _collector_paused() -> Iterator[None]:
+    """Let Python's cycle collector rest: it would walk a million live nodes in vain.
+
+    A quarter of the time of a run goes into that otherwise. What a pass leaves behind
+    is collected once, at the end.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def _silent(done: int, total: int, what: str) -> None:
+    """Tell nobody."""
 
 
 class _Books:
@@ -93,17 +116,27 @@ class _Books:
         self.verifications: list[Verification] = []
         self._stretch: list[tuple[Pass, ir.Model]] = []
         self._size = graph.size(checkpoint)
+        self._digest = graph.digest(checkpoint)
 
     def transact(self, current: Pass, model: ir.Model) -> ir.Model:
-        """Run one pass on a clone; give the clone back only if all checks hold."""
+        """Run one pass on a clone; return the clone only if all checks hold.
+
+        The graph goes in, and comes out, with its shapes inferred.
+        """
+        # Run and check: a copy is changed, and the contract compares both.
         start = process_time()
-        result = attempt(current, model, self.context)
-        seconds = process_time() - start
-        if isinstance(result, PassError | VerificationError):
-            raise self._with_reproducer(current, model, result) from result.__cause__
-        if isinstance(result, Me2eError):
-            raise result
-        self._enter(current, result, seconds)
+        found = attempt(current, model, self.context, self._digest)
+        if isinstance(found, PassError | VerificationError):
+            raise self._with_reproducer(current, model, found) from found.__cause__
+        if isinstance(found, Me2eError):
+            raise found
+        # Commit: what the next pass is given has its shapes, and is hashed once.
+        result = found.result
+        if result.changes:
+            graph.infer_shapes(result.model)
+        bodies = any(True for _ in result.model.graph.subgraphs())
+        self._digest = graph.digest(result.model) if bodies else found.digest
+        self._enter(current, result, process_time() - start)
         if current.exact:
             self._stretch.append((current, model))
         return result.model
@@ -183,18 +216,40 @@ class _Books:
         return type(error)(f"{error}; reproducer ({len(piece.graph)} nodes): {where}")
 
 
-def attempt(current: Pass, model: ir.Model, context: Context) -> PassResult | Me2eError:
-    """Run a pass on a clone and hold it to its contract; failures are values here."""
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    """What a pass returned, found to keep its contract.
+
+    Attributes:
+        result: the graph and what to say about it.
+        digest: of the graph.
+    """
+
+    result: PassResult
+    digest: str
+
+
+def attempt(
+    current: Pass, model: ir.Model, context: Context, digest: str | None = None
+) -> Checked | Me2eError:
+    """Run a pass on a clone and check its contract; failures are values here.
+
+    Args:
+        current: the pass.
+        model: the graph, shapes inferred; it stays as it is.
+        context: what the pass may ask for.
+        digest: of the graph, if that is known.
+    """
+    known = graph.digest(model) if digest is None else digest
     try:
         result = current.run(model.clone(), context)
-        contract.check(current, model, result)
+        return Checked(result, contract.check(current, model, result, known))
     except Me2eError as error:
         return error
     except Exception as cause:  # whatever a pass may raise: chained, never swallowed
         broken = PassError(f"{current.name} broke: {type(cause).__name__}: {cause}")
         broken.__cause__ = cause
         return broken
-    return result
 
 
 def _bisect(
@@ -221,7 +276,7 @@ def _fails_alike(
         return False
     try:
         probe = equivalence.Probe.of(part, None, context.seed, 1)
-        found = equivalence.verify((), part, result.model, probe)
+        found = equivalence.verify((), part, result.result.model, probe)
     except (GraphError, PreconditionError):
         return False
     return not equivalence.passed(found)

@@ -82,7 +82,6 @@ class AblateModules(Pass):
         _require_nodes(model, self.drop)
         for pattern in self.keep:
             result_of(model, pattern)
-        graph.infer_shapes(model)
         before = graph.node_count(model)
         hand_over(model, self._goes)
         gone = self._cut_outputs(model)

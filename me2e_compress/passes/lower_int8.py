@@ -7,6 +7,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.measured import measured_ranges
 from me2e_compress.targets import onnxruntime
@@ -56,7 +57,7 @@ class LowerInt8(Pass):
                 saved=self.ranges,
             )
         lowered = onnxruntime.convert(model, ranges)
-        graph.infer_shapes(lowered)
+        provenance.sign(model, lowered, self.name)
         layers = onnxruntime.int8_layers(lowered)
         return PassResult(
             lowered,

@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -93,7 +92,6 @@ class QuantizeInt8(Pass):
                 " this one for onnxruntime"
             )
         target = TARGETS.parse(self.target)
-        graph.infer_shapes(model)
         plan = self._placeable(model, context)
         tensors = target.tensors(plan, model)
         if not tensors:

@@ -82,12 +82,13 @@ def _check_form(current: Pass) -> None:
 
 def _run(current: Pass, ready: ir.Model, context: Context) -> PassResult:
     before = graph.digest(ready)
-    result = attempt(current, ready, context)
-    if isinstance(result, Me2eError):
-        raise result
+    found = attempt(current, ready, context, before)
+    if isinstance(found, Me2eError):
+        raise found
     if graph.digest(ready) != before:
         raise VerificationError(f"{current.name} reached into a clone's source")
-    return result
+    graph.infer_shapes(found.result.model)
+    return found.result
 
 
 def _check_exact(

@@ -1,6 +1,6 @@
 """Passes that misbehave, each in one way, and one that does not."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -58,6 +58,7 @@ class TurnsTanhIntoSigmoid(_Sample):
         for node in model.graph:
             if node.op_type == "Tanh":
                 node.op_type = "Sigmoid"
+                provenance.inherit(node, [node], by=self.name)
                 changes += 1
         return PassResult(model, changes)
 
@@ -102,6 +103,19 @@ class Breaks(_Sample):
 
 
 @dataclass(frozen=True)
+class Witness(_Sample):
+    """Writes down the shape of every value that it is shown."""
+
+    name: ClassVar[str] = "witness"
+    shapes: list[str] = field(default_factory=list)
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        values = [value for node in model.graph for value in node.outputs]
+        self.shapes.extend(str(value.shape) for value in values)
+        return PassResult(model, 0)
+
+
+@dataclass(frozen=True)
 class RenamesOutput(_Sample):
     name: ClassVar[str] = "renames-output"
 
@@ -127,6 +141,25 @@ class DeniesIt(_Sample):
 
 
 @dataclass(frozen=True)
+class LeavesNoName(_Sample):
+    name: ClassVar[str] = "leaves-no-name"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        return TurnsTanhIntoSigmoid().run(model, context)
+
+
+@dataclass(frozen=True)
+class MakesUpAPast(_Sample):
+    name: ClassVar[str] = "makes-up-a-past"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        node = model.graph[0]
+        past = provenance.Provenance("backbone", ("/no/such/node",), (self.name,))
+        provenance.stamp(node, past)
+        return PassResult(model, 1)
+
+
+@dataclass(frozen=True)
 class Forgets(_Sample):
     name: ClassVar[str] = "forgets"
 
@@ -141,6 +174,7 @@ class Invalidates(_Sample):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         model.graph[0].op_type = "NoSuchOperator"
+        provenance.inherit(model.graph[0], [model.graph[0]], by=self.name)
         return PassResult(model, 1)
 
 

@@ -51,6 +51,14 @@ def test_the_given_model_stays_as_it_is(chain: ir.Model, context: Context) -> No
     assert graph.digest(chain) == before
 
 
+def test_a_pass_finds_the_shapes_of_all_values(
+    chain: ir.Model, context: Context
+) -> None:
+    seen = passes.Witness()
+    run(chain, context, passes.DropsReluOfSigmoid(), seen)
+    assert set(seen.shapes) == {"[1,8]"}
+
+
 def test_import_is_put_in_front(chain: ir.Model, context: Context) -> None:
     report = run(chain, context, passes.Idle())
     assert [step.name for step in report.steps] == ["import-normalize", "idle"]
@@ -193,6 +201,8 @@ def test_a_broken_pass_leaves_a_reproducer(
         (passes.DeniesIt(), "denies-it changed the graph and denies it"),
         (passes.Forgets(), "forgets lost where 1 nodes come from, /backbone/Mul"),
         (passes.Invalidates(), "invalidates left an invalid graph"),
+        (passes.LeavesNoName(), "1 nodes that do not name it among their passes"),
+        (passes.MakesUpAPast(), "1 nodes stand for nodes that never were, /backbone"),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )

@@ -35,8 +35,10 @@ def ops(model: ir.Model) -> list[str]:
 
 def apply(current: Pass, model: ir.Model) -> PassResult:
     """Run a pass; hold it to its contract: past, interface, claim, idempotence."""
+    graph.infer_shapes(model)
     before, ports = graph.digest(model), graph.interface(model)
     result = current.run(model, NO_MODULES)
+    graph.infer_shapes(result.model)
     after = graph.digest(result.model)
     assert (after != before) == bool(result.changes)
     assert provenance.missing(result.model) == []

@@ -7,7 +7,6 @@ from typing import ClassVar
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress import graph as graphs
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant import sharing
 from me2e_compress.passes.eliminate_redundant.branches import inline_branch
@@ -42,7 +41,6 @@ class EliminateRedundant(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Apply the rules until none applies, then drop what nothing reads."""
-        graphs.infer_shapes(model)
         tally: Counter[str] = Counter()
         tally["unread"] += remove_dead(model.graph)
         for _ in range(ROUNDS):

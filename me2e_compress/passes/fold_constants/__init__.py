@@ -57,7 +57,6 @@ class FoldConstants(Pass):
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
         tally = _Tally(lifted=constants.lift(model))
-        graphs.infer_shapes(model)
         for body in graphs_of(model.graph):
             tally.seated += seat_ranges(body, model.opset_imports, self.name)
         before = -1

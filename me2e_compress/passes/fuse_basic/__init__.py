@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress import graph as graphs
 from me2e_compress.graph import array_of
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_basic import activations, clip, linear
@@ -55,7 +54,6 @@ class FuseBasic(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every rule on every node until none applies."""
-        graphs.infer_shapes(model)
         opsets = model.opset_imports
         opset = opsets.get("", opsets.get("ai.onnx", 0))
         done: Counter[str] = Counter()
