@@ -124,6 +124,24 @@ def test_a_cast_that_loses_digits_is_not_skipped() -> None:
     assert ops(model) == ["Abs", "Cast", "Cast", "Neg"]
 
 
+def test_merged_casts_say_what_happens_beyond_the_range() -> None:
+    """To float8, 10000 is NaN where the Cast does not saturate, and else 448."""
+    model = read(
+        """
+        <ir_version: 9, opset_import: ["" : 19]>
+        g (float16[1] x) => (float[1] y) {
+            a = Cast<to = 1>(x)
+            b = Cast<to = 17, saturate = 0>(a)
+            y = Cast<to = 1>(b)
+        }
+        """
+    )
+    apply(EliminateRedundant(), model)
+    assert ops(model) == ["Cast", "Cast"]
+    [found] = compute(model, {"x": np.array([10000], np.float16)})
+    np.testing.assert_array_equal(found, [np.nan])
+
+
 def test_slices_of_different_axes_become_one() -> None:
     text = (
         HEAD

@@ -172,14 +172,13 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
         return None
     if sole_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
         return None
-    attributes = {"to": node.attributes.get_int("to", 0)}
     return put(
         node,
         "Cast",
         inner.inputs[:1],
         by=site.by,
         sources=[inner],
-        attributes=attributes,
+        attributes={name: attr.value for name, attr in node.attributes.items()},
     )
 
 
