@@ -10,6 +10,7 @@ from time import process_time
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import (
     GraphError,
     Me2eError,
@@ -37,11 +38,14 @@ class PassManager:
             nodes do not say yet where they come from.
         verify_frames: how many frames exact passes are checked on; 0 turns it off.
         reproducers: the folder that a failing pass leaves its reproducer in.
+        samples: recorded frames that exact passes are checked on where the context has
+            none; None makes seeded inputs up then.
     """
 
     passes: tuple[Pass, ...]
     verify_frames: int = 2
     reproducers: Path | None = None
+    samples: CalibrationSet | None = None
 
     def run(
         self, model: ir.Model, context: Context, progress: Progress | None = None
@@ -169,13 +173,12 @@ class _Books:
     ) -> tuple[Verification, Stretch, equivalence.Probe | None]:
         """Compare with the earliest graph that runs (import may make it runnable)."""
         context, count = self.context, self.manager.verify_frames
+        frames = context.frames or self.manager.samples
         reason = ""
         for first, (_, before) in enumerate(stretch):
             names = tuple(current.name for current, _ in stretch[first:])
             try:
-                probe = equivalence.Probe.of(
-                    before, context.frames, context.seed, count
-                )
+                probe = equivalence.Probe.of(before, frames, context.seed, count)
                 found = equivalence.verify(names, before, model, probe)
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)

@@ -125,6 +125,29 @@ def checkpoint(name: str, folder: Path | None = None) -> Path:
     return _same(folder / f"{name}.pt", expected)
 
 
+def sample_frames(model: Path, folder: Path | None = None) -> Path | None:
+    """Find the recorded frames that come with the model that a file is a copy of.
+
+    They are two frames of a drive: enough to verify exact passes on what the model was
+    made to see, and none to calibrate on.
+
+    Args:
+        model: an ONNX file.
+        folder: as in `shipped`.
+
+    Returns:
+        A folder of frames; None where the file is no copy of a shipped model.
+    """
+    folder = folder or WEIGHTS
+    for name in SHIPPED:
+        known, frames = card(name, folder), folder / f"{name}-frames"
+        if not frames.is_dir() or model.stat().st_size != known.bytes:
+            continue
+        if hashlib.sha256(model.read_bytes()).hexdigest() == known.sha256:
+            return frames
+    return None
+
+
 @functools.cache
 def _checked(name: str, folder: Path) -> Path:
     return _same(folder / f"{name}.onnx", card(name, folder).sha256)

@@ -5,9 +5,18 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
 from me2e_compress.zoo import shipped as room
-from me2e_compress.zoo.shipped import ModelCard, card, checkpoint, copy, shipped
+from me2e_compress.zoo.shipped import (
+    ModelCard,
+    card,
+    checkpoint,
+    copy,
+    sample_frames,
+    shipped,
+)
 from tests.stand_in import write_shipped
 
 
@@ -166,3 +175,15 @@ def test_the_card_says_where_its_training_is_told() -> None:
 def test_a_card_without_a_checkpoint_says_so(weights: Path) -> None:
     with pytest.raises(GraphError, match="highway: its card knows no checkpoint"):
         checkpoint("highway", weights)
+
+
+def test_a_copy_of_the_driver_has_frames_to_verify_it_on(tmp_path: Path) -> None:
+    copied = copy("highway", tmp_path / "mine.onnx")
+    other = tmp_path / "other.onnx"
+    other.write_bytes(copied.read_bytes()[:-1] + b"?")
+
+    found = sample_frames(copied)
+
+    assert found is not None
+    CalibrationSet(found).check(graph.load(copied))
+    assert sample_frames(other) is None
