@@ -1,4 +1,4 @@
-"""The arrays of a file that users give, or one line that says why not."""
+"""Read the arrays of a file of the user's, or one line that tells why not."""
 
 import zipfile
 import zlib
@@ -41,5 +41,5 @@ def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
         raise FramesError(f"{path}: not {what} ({line})") from error
     for name, value in found.items():
         if not isinstance(value, np.ndarray):
-            raise FramesError(f"{path}: not {what} ({name} is no array)")
+            raise FramesError(f"{path}: not {what} ({name} is not an array)")
     return found

@@ -1,4 +1,4 @@
-"""One streaming pass over the frames: many tensors in the memory of inference."""
+"""Calibration: one streaming pass over the frames, in the memory of inference."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -10,11 +10,16 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.observers import OBSERVERS
-from me2e_compress.calibration.probes import Counts, Extremes, Gauge
+from me2e_compress.calibration.probes import Counts, Extremes, Probe
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.resume import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.statistics import BINS, Statistics, no_element
-from me2e_compress.calibration.stream import FrameSource, Readings, gauged, stream
+from me2e_compress.calibration.stream import (
+    FrameSource,
+    Readings,
+    probed_session,
+    stream,
+)
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
 
@@ -31,8 +36,8 @@ class Calibrator:
         threads: within an operator; 0 for every core.
         optimize: False runs the nodes as they stand: the ranges are then those of
             tools that switch onnxruntime's optimizations off, to the bit.
-        checkpoint: a file that says how far a calibration is; where it is there, the
-            calibration goes on from it. It is removed at the end. None keeps nothing.
+        checkpoint: a file that holds the progress of a calibration; where it exists,
+            the calibration resumes from it. It is removed at the end. None keeps none.
         every: frames between two checkpoints.
     """
 
@@ -90,12 +95,12 @@ class Calibrator:
         )
         if not tensors:
             nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
-            return dataclasses.replace(blank, gauges=nothing)
+            return dataclasses.replace(blank, measured=nothing)
         job = _Job(self, model, blank, frames, progress, 2 if counting else 1)
         job.extremes()
         if counting:
             job.counts()
-        job.book.clear()
+        job.checkpoint.clear()
         return job.seen
 
 
@@ -122,26 +127,28 @@ class _Job:
             "choice of frames": list(blank.frames),
             "list of tensors": list(blank.tensors),
             "optimization level": settings.optimize,
-            "kind of method": "counts" if passes == 2 else "extremes",
+            "kind of statistics": "counts" if passes == 2 else "extremes",
         }
-        self.book = CalibrationCheckpoint(settings.checkpoint, key, settings.every)
-        self.begun = self.book.read()
-        gauges = self.begun.results.get("gauges", blank.gauges)
+        self.checkpoint = CalibrationCheckpoint(
+            settings.checkpoint, key, settings.every
+        )
+        self.begun = self.checkpoint.read()
+        measured = self.begun.results.get("measured", blank.measured)
         counts = self.begun.results.get("counts")
         self.seen = dataclasses.replace(
             blank,
-            gauges=np.asarray(gauges, np.float32),
+            measured=np.asarray(measured, np.float32),
             counts=None if counts is None else np.array(counts, np.int64),
         )
 
     def extremes(self) -> None:
-        """Take smallest, largest and mean square of every tensor, frame by frame."""
-        rows = list(self.seen.gauges)
+        """Measure smallest, largest and mean square of every tensor, by frame."""
+        rows = list(self.seen.measured)
 
         def take(readings: Readings, place: int) -> None:
-            _refuse_what_is_no_number(readings, self.seen.tensors, place)
+            _check_finite(readings, self.seen.tensors, place)
             rows.append(readings)
-            self.seen = dataclasses.replace(self.seen, gauges=np.stack(rows))
+            self.seen = dataclasses.replace(self.seen, measured=np.stack(rows))
 
         self._pass(Extremes(), 0, take)
 
@@ -157,40 +164,38 @@ class _Job:
         self._pass(Counts(self.seen.exponents), len(self.frames), take)
 
     def _pass(
-        self, gauge: Gauge, before: int, take: Callable[[Readings, int], None]
+        self, probe: Probe, before: int, take: Callable[[Readings, int], None]
     ) -> None:
         """Run what is left of a pass; ``before`` frames were run by earlier passes."""
         begin = max(self.begun.done - before, 0)
         if begin >= len(self.frames):
             return
-        session = gauged(
+        session = probed_session(
             self.model,
             self.seen.tensors,
-            gauge,
+            probe,
             threads=self.settings.threads,
             optimize=self.settings.optimize,
         )
         state = self.begun.state if begin else None
-        readings = stream(session, self.frames, gauge.width, begin, state)
+        readings = stream(session, self.frames, probe.width, begin, state)
         for at, (numbers, after) in enumerate(readings, begin):
             take(numbers, self.seen.frames[at])
             done = before + at + 1
-            if self.book.due(done, self.total):
-                self.book.write(CalibrationState(done, self._results(), after))
+            if self.checkpoint.due(done, self.total):
+                self.checkpoint.write(CalibrationState(done, self._results(), after))
             if self.progress:
                 self.progress(done, self.total)
 
     def _results(self) -> dict[str, Array]:
-        results: dict[str, Array] = {"gauges": self.seen.gauges}
+        results: dict[str, Array] = {"measured": self.seen.measured}
         if self.seen.counts is not None:
             results["counts"] = self.seen.counts
         return results
 
 
-def _refuse_what_is_no_number(
-    readings: Readings, tensors: Sequence[str], place: int
-) -> None:
-    """Stop at a NaN or infinite element; a mean square may overflow, that is no harm.
+def _check_finite(readings: Readings, tensors: Sequence[str], place: int) -> None:
+    """Refuse a NaN or infinite element; a mean square may overflow without harm.
 
     Raises:
         FramesError: names the first such tensors and the frame.

@@ -16,7 +16,6 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.calibration.arrays import load_arrays
-from me2e_compress.calibration.check import check_frame
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
@@ -68,7 +67,7 @@ class CalibrationSet:
 
     @property
     def fingerprint(self) -> str:
-        """A number that changes with the content, the order or the scenes.
+        """A digest that changes with the content, the order or the scenes.
 
         Read from the checksums that every .npz carries (CRC-32 and size of each
         array), so that hundreds of frames take a moment, not the time to read them.
@@ -88,9 +87,9 @@ class CalibrationSet:
         return seal.hexdigest()
 
     def check(self, model: ir.Model) -> None:
-        """Read every frame once and hold it against a model's inputs.
+        """Read every frame once and check it against a model's inputs.
 
-        Recurrent inputs may be absent; names that the model has not are an error.
+        Recurrent inputs may be absent; names that the model lacks are an error.
 
         Raises:
             FramesError: on the first array that is missing, unknown, of another
@@ -98,11 +97,59 @@ class CalibrationSet:
                 what is expected.
         """
         for path, frame in zip(self.files, self, strict=True):
-            check_frame(frame, model, str(path))
+            _check_frame(frame, model, str(path))
+
+
+def _check_frame(frame: Frame, model: ir.Model, source: str) -> None:
+    """Check names, dtypes, shapes, and that every number is finite.
+
+    Args:
+        frame: what was recorded.
+        model: whose inputs it must fit; recurrent inputs may be absent.
+        source: what the message calls the frame, e.g. its file.
+
+    Raises:
+        FramesError: names the frame and the input, what was found, what is expected.
+    """
+    ports = {str(value.name): value for value in model.graph.inputs}
+    optional = recurrent_inputs(model)
+    for name, value in ports.items():
+        array = frame.arrays.get(name)
+        if array is not None:
+            _check_array(array, value, f"{source}: {name}")
+        elif name not in optional:
+            raise FramesError(
+                f"{source}: {name} is missing; there is {', '.join(frame.arrays)}"
+            )
+    if unknown := [name for name in frame.arrays if name not in ports]:
+        raise FramesError(
+            f"{source}: {unknown[0]} is not an input of the model;"
+            f" it takes {', '.join(ports)}"
+        )
+
+
+def _check_array(array: Array, value: ir.Value, where: str) -> None:
+    if value.dtype is not None and array.dtype != value.dtype.numpy():
+        raise FramesError(f"{where} is {array.dtype}, expected {value.dtype.numpy()}")
+    if value.shape is not None and not _fits(array.shape, value.shape):
+        raise FramesError(
+            f"{where} has shape {list(array.shape)}, expected {value.shape}"
+        )
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        kind = "NaN" if np.isnan(array).any() else "infinite"
+        at = np.argwhere(~np.isfinite(array))[0].tolist()
+        raise FramesError(f"{where} is {kind} at {at}, expected finite numbers")
+
+
+def _fits(found: tuple[int, ...], expected: ir.Shape) -> bool:
+    return len(found) == len(expected) and all(
+        not isinstance(want, int) or have == want
+        for have, want in zip(found, expected, strict=True)
+    )
 
 
 def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
-    """Make seeded inputs where there is no recording: one scene of ``count`` frames.
+    """Draw seeded inputs where there is no recording: one scene of ``count`` frames.
 
     Floats are standard normal, integers 0 or 1, booleans either. They prove that two
     graphs compute the same; they are not what a model sees, so nothing is calibrated

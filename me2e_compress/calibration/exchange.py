@@ -1,4 +1,4 @@
-"""Ranges for other tools, and from them: TensorRT's cache, onnxruntime's table.
+"""Ranges of other tools, written and read: TensorRT's cache, onnxruntime's table.
 
 Both know one number a tensor, so what comes back is symmetric: [-reach, reach].
 """
@@ -40,8 +40,8 @@ def write_tensorrt_cache(ranges: Ranges, path: Path) -> None:
     kind = ranges.calibrator or (_MIN_MAX if extremes else _ENTROPY)
     lines = [f"{_VERSION}-{kind}"]
     lines += [
-        f"{name}: {struct.pack('!f', float(scale_of(*ends))).hex()}"
-        for name, ends in ranges.tensors.items()
+        f"{name}: {struct.pack('!f', float(scale_of(*bounds))).hex()}"
+        for name, bounds in ranges.tensors.items()
     ]
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
@@ -52,7 +52,7 @@ def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
     That is ``calibration.flatbuffers``, which its TensorRT provider reads, and the
     same as ``calibration.json`` and, a line ``name reach`` each, ``calibration.cache``.
     """
-    table = {name: _entry(*ends) for name, ends in ranges.tensors.items()}
+    table = {name: _entry(*bounds) for name, bounds in ranges.tensors.items()}
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".table-") as draft:
         write_calibration_table(table, draft)
@@ -85,8 +85,8 @@ def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:
         reach = _parse(path, lines, 1, ": ", _hexadecimal)
     else:
         reach = _parse(path, lines, 0, " ", float)
-    ends = _needed(path, reach, tensors)
-    return Ranges(ends, IMPORTED, 0, model, "", calibrator=head[1] if head else "")
+    bounds = _needed(path, reach, tensors)
+    return Ranges(bounds, IMPORTED, 0, model, "", calibrator=head[1] if head else "")
 
 
 def _parse(
@@ -99,10 +99,10 @@ def _parse(
             found[name] = read(text)
         except (ValueError, struct.error) as error:
             raise FramesError(
-                f"{path}: line {number} is no name and number: {line[:60]!r}"
+                f"{path}: line {number} is not a name and a number: {line[:60]!r}"
             ) from error
         if not parted or not 0 <= found[name] <= LARGEST:
-            raise FramesError(f"{path}: line {number} is no range: {line[:60]!r}")
+            raise FramesError(f"{path}: line {number} is not a range: {line[:60]!r}")
     return found
 
 
@@ -123,6 +123,6 @@ def _needed(
 
 
 def _entry(low: float, high: float) -> TensorData:
-    """Give both ends alike: the table keeps the larger number, not the magnitude."""
+    """Return symmetric bounds: the table keeps the larger number, not the magnitude."""
     reach = np.array(max(abs(low), abs(high)), np.float32)
     return TensorData(lowest=-reach, highest=reach)

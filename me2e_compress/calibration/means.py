@@ -1,4 +1,4 @@
-"""What a value is on average: the constant that stands in for a module that is gone."""
+"""Mean values over a recording: the constants that substitute an ablated module."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ def load_means(path: Path, values: Sequence[str]) -> dict[str, Array]:
 
 
 def _exposed(model: ir.Model, values: Sequence[str]) -> ir.Model:
-    """Copy a graph, with further values as its outputs."""
+    """Return a copy of a graph with further values as outputs."""
     copy = model.clone()
     made = {value.name: value for node in copy.graph for value in node.outputs}
     if missing := [name for name in values if name not in made]:
@@ -117,7 +117,7 @@ class _Average:
 
 
 def _most_frequent(stack: Array) -> Array:
-    """[frames, ...] integers to what each element mostly was."""
+    """Return the most frequent value of each element of [frames, ...] integers."""
     columns = stack.reshape(len(stack), -1).T
     picked = [_mode(column) for column in columns]
     return np.array(picked, stack.dtype).reshape(stack.shape[1:])

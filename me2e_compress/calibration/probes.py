@@ -1,4 +1,4 @@
-"""What is measured of a tensor, as nodes of its own graph."""
+"""Probes: what is measured of a tensor, as nodes of its own graph."""
 
 import dataclasses
 from typing import Protocol, TypeAlias
@@ -14,7 +14,7 @@ Reading: TypeAlias = tuple[list[ir.Node], list[ir.Value]]
 """Nodes that measure a tensor, in order, and the 1-D values that they end in."""
 
 
-class Gauge(Protocol):
+class Probe(Protocol):
     """Measures tensors by nodes that stand behind them."""
 
     @property
@@ -23,7 +23,7 @@ class Gauge(Protocol):
         ...
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
-        """Measure a float32 value, the ``at``-th of those that are watched."""
+        """Return the nodes that measure a float32 value, the ``at``-th watched one."""
         ...
 
 
@@ -104,7 +104,7 @@ def _cast(value: ir.Value, to: ir.DataType) -> ir.Node:
 
 
 def _shared(where: ir.Graph, array: npt.NDArray[np.generic], name: str) -> ir.Value:
-    """Give a constant of the gauges, made where it is first asked for."""
-    name = f"me2e_gauge_{name}"
+    """Return a constant of the probes, made where it is first asked for."""
+    name = f"me2e_probe_{name}"
     known = where.initializers.get(name)
     return known if known is not None else rewrite.add_constant(where, array, name)

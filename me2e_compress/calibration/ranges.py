@@ -18,7 +18,7 @@ reported: its int8 step then exceeds half its root mean square, so that most ele
 round to 0, 1 or 2 steps."""
 
 LARGEST = float(np.finfo(np.float32).max)
-"""The largest end of a range: elements are float32."""
+"""The largest bound of a range: elements are float32."""
 
 IMPORTED = "imported"
 """Method of ranges that another tool measured; on which frames, is not known."""
@@ -29,7 +29,7 @@ class Ranges:
     """The range of every calibrated tensor.
 
     Attributes:
-        tensors: (low end, high end) of the range, by tensor name.
+        tensors: (low, high) bounds of the range, by tensor name.
         method: how statistics became ranges, e.g. ``max-min`` or ``percentile:99.9``.
         frames: how many frames were seen.
         model: digest of the graph they were measured on.
@@ -56,9 +56,9 @@ class Ranges:
             FramesError: the method needs histograms, and none were collected.
         """
         lows, highs = method.ranges(seen)
-        ends = zip(lows.tolist(), highs.tolist(), strict=True)
+        bounds = zip(lows.tolist(), highs.tolist(), strict=True)
         return cls(
-            dict(zip(seen.tensors, ends, strict=True)),
+            dict(zip(seen.tensors, bounds, strict=True)),
             OBSERVERS.text(method, defaults=True),
             len(seen.frames),
             seen.model,
@@ -69,7 +69,7 @@ class Ranges:
     @property
     def dead(self) -> tuple[str, ...]:
         """Name the tensors that were zero in every frame."""
-        return tuple(name for name, ends in self.tensors.items() if ends == (0.0, 0.0))
+        return tuple(name for name, each in self.tensors.items() if each == (0.0, 0.0))
 
     def save(self, path: Path) -> None:
         """Write JSON, all or nothing."""
@@ -80,8 +80,8 @@ class Ranges:
         """Read what :meth:`save` wrote.
 
         Raises:
-            FramesError: no such file, or not saved ranges: an end that is no float32
-                number, or a low end above the high one.
+            FramesError: no such file, or not saved ranges: a bound that is not a
+                float32 number, or a low one above the high one.
         """
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
@@ -95,7 +95,7 @@ class Ranges:
             if not -LARGEST <= low <= high <= LARGEST:  # NaN too
                 raise FramesError(
                     f"{path}: not ranges: {name} has {low:g} to {high:g}; a range is"
-                    " two float32 numbers, the lower one first"
+                    " two float32 bounds, the lower one first"
                 )
         return found
 
@@ -107,7 +107,7 @@ class Ranges:
         method: str,
         source: str | None = None,
     ) -> None:
-        """Refuse ranges of another graph, tensor list, method or recording.
+        """Check that ranges are of this graph, tensor list, method and recording.
 
         Args:
             model: digest of the graph that is to be quantized.
@@ -117,7 +117,7 @@ class Ranges:
                 Imported ranges fit any method and frames.
 
         Raises:
-            FramesError: says what is stale, and what to do.
+            FramesError: names what is stale, and what to do.
             RecipeError: no such method.
         """
         again = "calibrate the graph that is being quantized again"
@@ -145,7 +145,7 @@ class Ranges:
 
 
 def _outliers(seen: Statistics) -> dict[str, float]:
-    """Give the crest factors that are too large, each to three digits."""
+    """Return the crest factors that are too large, each to three digits."""
     if not seen.tensors:
         return {}
     root = np.sqrt(seen.mean_squares.astype(np.float64).mean(axis=0))

@@ -1,4 +1,4 @@
-"""Where a long calibration stands, on disk, so that a kill costs a few frames."""
+"""The progress of a long calibration, on disk, so that a kill costs a few frames."""
 
 import dataclasses
 import io
@@ -34,11 +34,11 @@ class CalibrationState:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationCheckpoint:
-    """One file that holds the standing of a calibration.
+    """One file that holds the progress of a calibration.
 
     Attributes:
         path: the file; None keeps nothing.
-        key: what the standing is of: digest of the graph, tensors, frames, ...
+        key: what it is the progress of: digest of the graph, tensors, frames, ...
         every: frames between two writes.
     """
 
@@ -47,7 +47,7 @@ class CalibrationCheckpoint:
     every: int = 8
 
     def read(self) -> CalibrationState:
-        """Give the standing; nothing done where there is no file.
+        """Read the progress; nothing is done where there is no file.
 
         Raises:
             FramesError: the file is of another calibration, or cannot be read.
@@ -71,17 +71,17 @@ class CalibrationCheckpoint:
             },
         )
 
-    def write(self, standing: CalibrationState) -> None:
-        """Keep a standing, all or nothing."""
+    def write(self, progress: CalibrationState) -> None:
+        """Write the progress, all or nothing."""
         if self.path is None:
             return
-        state = {_STATE + name: array for name, array in standing.state.items()}
+        state = {_STATE + name: array for name, array in progress.state.items()}
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w") as archive:
             for name, array in {
                 "key": np.array(json.dumps(self.key)),
-                "done": np.array(standing.done),
-                **standing.results,
+                "done": np.array(progress.done),
+                **progress.results,
                 **state,
             }.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
@@ -89,7 +89,7 @@ class CalibrationCheckpoint:
         write_bytes(self.path, content.getvalue())
 
     def due(self, done: int, total: int) -> bool:
-        """Say whether it is time to write."""
+        """Return whether it is time to write."""
         return self.path is not None and (done % self.every == 0 or done == total)
 
     def clear(self) -> None:

@@ -19,7 +19,7 @@ class Part:
     Attributes:
         whole: the recording.
         places: which of its frames.
-        share: of what it is a shard; None if it is none.
+        share: which shard of what it is; None if it is not a shard.
     """
 
     whole: CalibrationSet
@@ -28,7 +28,7 @@ class Part:
 
     @property
     def fingerprint(self) -> str:
-        """Of the whole recording: what its frames may be held against later."""
+        """That of the whole recording, against which later frames are checked."""
         return self.whole.fingerprint
 
     def __len__(self) -> int:
@@ -68,10 +68,10 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> Part:
 
 
 def shard(part: Part, number: int, count: int) -> Part:
-    """Give one of ``count`` parts with about as many scenes each.
+    """Return one of ``count`` parts with about as many scenes each.
 
     Args:
-        part: the frames to share out.
+        part: the frames to divide.
         number: which, from 1.
         count: how many there are.
 

@@ -1,4 +1,4 @@
-"""Which share of a draw a shard is, and whether shards are a whole."""
+"""Which shard of a draw statistics are, and whether shards are complete."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ class Share:
 
 
 def check_whole(shares: Sequence[Share | None]) -> None:
-    """Refuse shards that are not all of one draw.
+    """Check that shards are all those of one draw.
 
     Args:
-        shares: of the shards; None of statistics that are no shard of ours, about
-            which nothing is said if none is.
+        shares: of the shards; None for statistics that are not a shard; all None is
+            accepted.
 
     Raises:
         FramesError: only some are shards, they are of different draws or of another

@@ -1,4 +1,4 @@
-"""What was seen of every tensor on every frame: enough for any range, in a few MB."""
+"""What was measured of every tensor on every frame: enough for any range, in MB."""
 
 import dataclasses
 import functools
@@ -24,7 +24,7 @@ magnitude itself, onnxruntime's percentile as many on both sides of zero.)"""
 _SMALLEST = -100
 """Least exponent of a histogram: below, float32 cannot hold bins per unit."""
 
-_KEPT = ("model", "source", "tensors", "frames", "gauges", "counts", "share")
+_KEPT = ("model", "source", "tensors", "frames", "measured", "counts", "share")
 """What a file of statistics holds."""
 
 Floats: TypeAlias = npt.NDArray[np.float32]
@@ -39,34 +39,34 @@ class Statistics:
         source: fingerprint of the recording.
         tensors: their names.
         frames: places in the recording of the frames that were seen.
-        gauges: float32 [frames, tensors, 3]: smallest and largest element, mean square;
-            infinity, minus infinity and 0 where a tensor had no element.
+        measured: float32 [frames, tensors, 3]: smallest and largest element, mean
+            square; infinity, minus infinity and 0 where a tensor had no element.
         counts: int64 [tensors, bins] over all frames: how many magnitudes lie in each
             bin of [0, 2^exponent); None where no histogram was asked for.
-        share: of what it is a shard; None if it is none.
+        share: which shard of what it is; None if it is not a shard.
     """
 
     model: str
     source: str
     tensors: tuple[str, ...]
     frames: tuple[int, ...]
-    gauges: Floats
+    measured: Floats
     counts: npt.NDArray[np.int64] | None = None
     share: Share | None = None
 
     @functools.cached_property
     def readings(self) -> Floats:
-        """The gauges, where a tensor had no element those of the frame before.
+        """What was measured; where a tensor had no element, that of the frame before.
 
-        Before its first element those of the first frame that had one; 0 if none had.
+        Before its first element that of the first frame that had one; 0 if none had.
         """
-        empty = no_element(self.gauges)
+        empty = no_element(self.measured)
         if not empty.any():
-            return self.gauges
+            return self.measured
         rows = np.arange(len(self.frames))[:, None]
         last = np.maximum.accumulate(np.where(empty, -1, rows), axis=0)
         taken = np.where(last < 0, np.argmin(empty, axis=0), last)
-        filled = self.gauges[taken, np.arange(len(self.tensors))]
+        filled = self.measured[taken, np.arange(len(self.tensors))]
         return np.where(empty.all(axis=0, keepdims=True).T, np.float32(0), filled)
 
     @property
@@ -87,8 +87,8 @@ class Statistics:
     @property
     def reach(self) -> Floats:
         """The largest magnitudes over all frames: float32 [tensors]."""
-        ends = np.abs(self.readings[:, :, :2])
-        return np.asarray(ends.max(axis=(0, 2), initial=0), np.float32)
+        magnitudes = np.abs(self.readings[:, :, :2])
+        return np.asarray(magnitudes.max(axis=(0, 2), initial=0), np.float32)
 
     @property
     def exponents(self) -> npt.NDArray[np.int64]:
@@ -96,7 +96,7 @@ class Statistics:
         return np.maximum(np.frexp(self.reach)[1], _SMALLEST).astype(np.int64)
 
     def counted(self) -> npt.NDArray[np.int64]:
-        """Give the histograms.
+        """Return the histograms.
 
         Raises:
             FramesError: none were collected.
@@ -117,7 +117,7 @@ class Statistics:
             source=np.array(self.source),
             tensors=np.array(self.tensors, np.str_),
             frames=np.array(self.frames, np.int64),
-            gauges=self.gauges,
+            measured=self.measured,
             counts=np.empty(0, np.int64) if self.counts is None else self.counts,
             share=np.array(_listed(self.share), np.int64),
         )
@@ -137,33 +137,34 @@ class Statistics:
             raise FramesError(f"{path}: not saved statistics (no {missing[0]})")
         counts, names, frames = (held[name] for name in ("counts", "tensors", "frames"))
         fits = counts.size == 0 or counts.shape == (names.size, BINS)
-        if held["gauges"].shape != (*frames.shape, *names.shape, 3) or not fits:
+        measured = held["measured"]
+        if measured.shape != (*frames.shape, *names.shape, 3) or not fits:
             raise FramesError(f"{path}: not saved statistics (their shapes differ)")
-        ends = np.isfinite(held["gauges"][..., :2]).all(-1)
-        if not (ends | no_element(held["gauges"])).all():
-            raise FramesError(f"{path}: not saved statistics (an end is no number)")
+        finite = np.isfinite(measured[..., :2]).all(-1)
+        if not (finite | no_element(measured)).all():
+            raise FramesError(f"{path}: not saved statistics (a bound is not finite)")
         return cls(
             str(held["model"]),
             str(held["source"]),
             tuple(names.tolist()),
             tuple(frames.tolist()),
-            held["gauges"],
+            measured,
             counts if counts.size else None,
             _share(held["share"].tolist()),
         )
 
 
-def no_element(gauges: Floats) -> npt.NDArray[np.bool_]:
-    """Say of which tensors there was no element to measure.
+def no_element(measured: Floats) -> npt.NDArray[np.bool_]:
+    """Return which tensors had no element to measure: bool [...].
 
     Args:
-        gauges: float32 [..., 3], as :class:`Statistics` keeps them.
+        measured: float32 [..., 3], as :class:`Statistics` keeps it.
     """
-    return np.asarray((gauges[..., 0] == np.inf) & (gauges[..., 1] == -np.inf))
+    return np.asarray((measured[..., 0] == np.inf) & (measured[..., 1] == -np.inf))
 
 
 def merge(parts: Sequence[Statistics]) -> Statistics:
-    """Join the shards of one calibration: what one run over all frames would give.
+    """Merge the shards of one calibration: equal to one run over all frames.
 
     Bit for bit, histograms too: their bins are powers of two wide, so that those of a
     shard of smaller reach fall whole into those of the joint one.
@@ -183,16 +184,16 @@ def merge(parts: Sequence[Statistics]) -> Statistics:
                     f" {_span(each)} is not that of frames {_span(first)}"
                 )
         if (each.counts is None) != (first.counts is None):
-            raise FramesError("some of the shards have histograms and some have not")
+            raise FramesError("only some of the shards have histograms")
     check_whole([each.share for each in parts])
     places = [(place, part, row) for part in parts for row, place in _rows(part)]
     places.sort(key=lambda each: each[0])
     frames = tuple(place for place, _, _ in places)
     if doubles := [a for a, b in itertools.pairwise(frames) if a == b]:
         raise FramesError(f"frame {doubles[0]} is in two of the shards")
-    gauges = np.stack([part.gauges[row] for _, part, row in places])
+    measured = np.stack([part.measured[row] for _, part, row in places])
     joint = dataclasses.replace(
-        first, frames=frames, gauges=gauges, counts=None, share=None
+        first, frames=frames, measured=measured, counts=None, share=None
     )
     if first.counts is None:
         return joint
@@ -221,7 +222,7 @@ def _span(part: Statistics) -> str:
 def _widened(
     part: Statistics, exponents: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.int64]:
-    """Give the histograms over wider bins: 2^k of the old fall into one new."""
+    """Return the histograms over wider bins: 2^k of the old fall into one new."""
     wide = np.zeros_like(part.counted())
     steps = np.minimum(exponents - part.exponents, BINS.bit_length() - 1).tolist()
     for at, step in enumerate(steps):

@@ -1,4 +1,4 @@
-"""One pass over the frames with a gauge on every watched tensor."""
+"""One pass over the frames with a probe on every watched tensor."""
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,13 +9,16 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.calibration.insert_probes import GAUGES, arrange, tap
-from me2e_compress.calibration.probes import Gauge
+from me2e_compress.calibration.probes import Probe
+from me2e_compress.errors import GraphError
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, replay
 
+READINGS = "me2e_readings"
+"""Name of the output that the probes write: float32 [tensors x width of the probe]."""
+
 Readings: TypeAlias = npt.NDArray[np.float32]
-"""What the gauges said of one frame: float32 [tensors, width of the gauge]."""
+"""What the probes read in one frame: float32 [tensors, width of the probe]."""
 
 
 class FrameSource(Protocol):
@@ -47,52 +50,188 @@ def stream(
     begin: int = 0,
     state: Mapping[str, Array] | None = None,
 ) -> Iterator[tuple[Readings, dict[str, Array]]]:
-    """Run a gauged model over frames, its own recurrent state fed forward.
+    """Run a model with probes over frames, its own recurrent state fed forward.
 
     Args:
-        session: of :func:`gauged`.
+        session: of :func:`probed_session`.
         frames: the recording.
-        width: of the gauge.
+        width: of the probe.
         begin: the first frame to run.
         state: what recurrent inputs hold there, if it is not the first of a scene.
 
     Yields:
-        For every frame what the gauges say, and the state for the next frame.
+        For every frame what the probes read, and the state for the next frame.
     """
     rest = (frames[index] for index in range(begin, len(frames)))
-    wanted = [GAUGES, *session.recurrent.values()]
+    wanted = [READINGS, *session.recurrent.values()]
     for values in replay(session, rest, wanted, state):
-        gauges = values[GAUGES].astype(np.float32).reshape(-1, width)
+        readings = values[READINGS].astype(np.float32).reshape(-1, width)
         yield (
-            gauges,
+            readings,
             {name: values[answer] for name, answer in session.recurrent.items()},
         )
 
 
-def gauged(
+def probed_session(
     model: ir.Model,
     tensors: Sequence[str],
-    gauge: Gauge,
+    probe: Probe,
     *,
     threads: int,
     optimize: bool,
 ) -> Session:
-    """Open a model with gauges, in the memory and nearly the time of the model.
+    """Open a model with probes, in the memory and nearly the time of the model.
 
-    onnxruntime optimizes the gauged graph; then its nodes are put into an order in
-    which every watched tensor is let go as early as without gauges.
+    onnxruntime optimizes the graph with its probes; then the nodes are put into an
+    order in which every watched tensor is freed as early as without them.
 
     Raises:
         GraphError: no such tensor, or onnxruntime cannot run the graph.
     """
-    tapped = tap(model, tensors, gauge)
+    probed = insert_probes(model, tensors, probe)
     if not optimize:
-        return Session(tapped, threads=threads, optimize=False, frugal=True)
-    with tempfile.TemporaryDirectory(prefix="me2e-gauged-") as folder:
+        return Session(probed, threads=threads, optimize=False, frugal=True)
+    with tempfile.TemporaryDirectory(prefix="me2e-probed-") as folder:
         path = Path(folder) / "optimized.onnx"
-        Session(tapped, threads=1, rewritten=path)
+        Session(probed, threads=1, rewritten=path)
         rewritten = ir.load(path)
-        arrange(rewritten)
-        arranged = path.with_name("arranged.onnx")
-        ir.save(rewritten, arranged)
-        return Session(arranged, threads=threads, optimize=False, frugal=True)
+        schedule_probes(rewritten)
+        scheduled = path.with_name("scheduled.onnx")
+        ir.save(rewritten, scheduled)
+        return Session(scheduled, threads=threads, optimize=False, frugal=True)
+
+
+def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:
+    """Return a copy of a graph with probes, each right behind the tensor's producer.
+
+    Args:
+        model: the graph; it stays as it is.
+        tensors: float tensors to watch, by name.
+        probe: what is measured of each.
+
+    Returns:
+        The copy; its last output is :data:`READINGS`.
+
+    Raises:
+        GraphError: the graph has no such tensor.
+    """
+    copy = model.clone()
+    known = _values(copy)
+    if missing := [name for name in tensors if name not in known]:
+        raise GraphError(f"the graph has no tensor {missing[0]}")
+    readings = [
+        reading
+        for at, name in enumerate(tensors)
+        for reading in _watch(copy.graph, known[name], probe, at)
+    ]
+    joined = ir.node("Concat", readings, {"axis": 0}, name=READINGS)
+    joined.outputs[0].name = READINGS
+    joined.outputs[0].dtype = ir.DataType.FLOAT
+    joined.outputs[0].shape = ir.Shape([len(tensors) * probe.width])
+    copy.graph.append(joined)
+    copy.graph.outputs.append(joined.outputs[0])
+    return copy
+
+
+def schedule_probes(model: ir.Model) -> None:
+    """Move the nodes of every probe to the earliest place, in place.
+
+    onnxruntime runs nodes in the order of the file (``Session(frugal=True)``). Its
+    optimizations append what they write to the end: the change back from a blocked
+    layout that a probe reads would come last, and keep the tensors of a whole backbone
+    in memory until then.
+    """
+    # What the model's own outputs need keeps its order; the rest waits for its inputs.
+    nodes = list(model.graph)
+    own = _needed([v for v in model.graph.outputs if v.name != READINGS])
+    waiting = {node: _sources(node) for node in nodes if node not in own}
+    order: list[ir.Node] = []
+
+    def ready(value: ir.Value) -> Iterator[ir.Node]:
+        for node in dict.fromkeys(value.consumers()):
+            if node in waiting and value in waiting[node]:
+                waiting[node].discard(value)
+                if not waiting[node]:
+                    yield node
+
+    def place(first: Sequence[ir.Node]) -> None:
+        pending = list(reversed(first))
+        while pending:
+            node = pending.pop()
+            order.append(node)
+            pending += [each for out in node.outputs for each in ready(out)]
+
+    place([node for node in waiting if not waiting[node]])
+    for value in model.graph.inputs:
+        place(list(ready(value)))
+    for node in nodes:
+        if node in own:
+            place([node])
+    placed = set(order)
+    order += [node for node in nodes if node not in placed]
+    model.graph.remove(nodes)
+    model.graph.extend(order)
+
+
+def _values(model: ir.Model) -> dict[str, ir.Value]:
+    made = (value for node in model.graph for value in node.outputs)
+    return {str(value.name): value for value in (*model.graph.inputs, *made)}
+
+
+def _watch(
+    where: ir.Graph, value: ir.Value, probe: Probe, at: int
+) -> Sequence[ir.Value]:
+    nodes: list[ir.Node] = []
+    seen = value
+    if value.dtype not in (None, ir.DataType.FLOAT):
+        nodes.append(ir.node("Cast", [value], {"to": ir.DataType.FLOAT.value}))
+        seen = nodes[0].outputs[0]
+    measuring, readings = probe.read(where, seen, at)
+    nodes += measuring
+    for order, node in enumerate(nodes):
+        node.name = f"{READINGS}/{value.name}/{order}_{node.op_type}"
+        node.outputs[0].name = node.name
+    producer = value.producer()
+    if producer is not None:
+        where.insert_after(producer, nodes)
+    elif len(where):
+        where.insert_before(where[0], nodes)
+    return readings
+
+
+def _needed(values: Sequence[ir.Value]) -> set[ir.Node]:
+    """Return the nodes that some values are computed by."""
+    found: set[ir.Node] = set()
+    pending = [node for value in values if (node := value.producer()) is not None]
+    while pending:
+        node = pending.pop()
+        if node not in found:
+            found.add(node)
+            pending += [p for v in _reads(node) if (p := v.producer()) is not None]
+    return found
+
+
+def _sources(node: ir.Node) -> set[ir.Value]:
+    """Return what must be computed before a node can run."""
+    return {v for v in _reads(node) if v.producer() is not None or v.is_graph_input()}
+
+
+def _reads(node: ir.Node) -> Iterator[ir.Value]:
+    """Yield the inputs of a node and those that its bodies read."""
+    for value in node.inputs:
+        if value is not None:
+            yield value
+    for attribute in node.attributes.values():
+        for body in _bodies(attribute):
+            for inner in body.all_nodes():
+                for value in inner.inputs:
+                    if value is not None and value.graph is node.graph:
+                        yield value
+
+
+def _bodies(attribute: ir.Attr) -> Sequence[ir.Graph]:
+    if attribute.type == ir.AttributeType.GRAPH:
+        return (attribute.as_graph(),)
+    if attribute.type == ir.AttributeType.GRAPHS:
+        return tuple(attribute.as_graphs())
+    return ()

@@ -42,7 +42,10 @@ def test_frames_that_fit_pass_the_check(tmp_path: Path, model: ir.Model) -> None
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"y": np.zeros(1, np.float32)}, "000001.npz: y is no input; .*x, command"),
+        (
+            {"y": np.zeros(1, np.float32)},
+            "000001.npz: y is not an input of the model; .*x, command",
+        ),
         (
             {"x": np.zeros((1, 3), np.float32)},
             r"x has shape \[1, 3\], expected \[1,2\]",

@@ -92,13 +92,13 @@ def test_the_table_of_onnxruntime_holds_the_magnitudes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("TRT-8501-X\nimage: zz", "line 2 is no name and number: 'image: zz'"),
-        ("TRT-8501-X\nimage: 3c0a", "line 2 is no name and number"),
-        ("TRT-8501-X\nimage: 7fc00000", "line 2 is no range"),
-        ("image", "line 1 is no name"),
-        ("image -2", "line 1 is no range"),
-        ("image inf", "line 1 is no range"),
-        ("image 1e39", "line 1 is no range"),
+        ("TRT-8501-X\nimage: zz", "line 2 is not a name and a number: 'image: zz'"),
+        ("TRT-8501-X\nimage: 3c0a", "line 2 is not a name and a number"),
+        ("TRT-8501-X\nimage: 7fc00000", "line 2 is not a range"),
+        ("image", "line 1 is not a name"),
+        ("image -2", "line 1 is not a range"),
+        ("image inf", "line 1 is not a range"),
+        ("image 1e39", "line 1 is not a range"),
         ("other 2", "a cache of another model: it lacks image and 0 more of 1"),
     ],
 )

@@ -57,9 +57,9 @@ def test_what_never_has_an_element_is_dead(tmp_path: Path) -> None:
 
 def test_gaps_are_filled_from_before_or_else_from_behind() -> None:
     gap = (np.inf, -np.inf, 0.0)
-    gauges = np.array([[gap], [(1, 2, 3)], [gap], [gap], [(4, 5, 6)]], np.float32)
+    measured = np.array([[gap], [(1, 2, 3)], [gap], [gap], [(4, 5, 6)]], np.float32)
 
-    seen = Statistics("", "", ("t",), (0, 1, 2, 3, 4), gauges)
+    seen = Statistics("", "", ("t",), (0, 1, 2, 3, 4), measured)
 
     assert seen.lows[:, 0].tolist() == [1, 1, 1, 1, 4]
     assert seen.highs[:, 0].tolist() == [2, 2, 2, 2, 5]

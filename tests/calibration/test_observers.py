@@ -24,21 +24,21 @@ Values = npt.NDArray[np.float64]
 
 def seen(*tensors: Values) -> Statistics:
     """Statistics of one frame, computed the plain way."""
-    gauges = np.array(
+    measured = np.array(
         [[(x.min(), x.max(), np.mean(x * x)) for x in tensors]], np.float32
     )
     names = tuple(f"t{at}" for at in range(len(tensors)))
-    bare = Statistics("m", "s", names, (0,), gauges)
+    bare = Statistics("m", "s", names, (0,), measured)
     counts = [
         np.histogram(np.abs(x), BINS, (0, 2.0**e))[0]
         for x, e in zip(tensors, bare.exponents, strict=True)
     ]
-    return Statistics("m", "s", names, (0,), gauges, np.array(counts))
+    return Statistics("m", "s", names, (0,), measured, np.array(counts))
 
 
 def extremes(*frames: tuple[float, float]) -> Statistics:
-    gauges = np.array([[(low, high, 1)] for low, high in frames], np.float32)
-    return Statistics("m", "s", ("t",), tuple(range(len(frames))), gauges)
+    measured = np.array([[(low, high, 1)] for low, high in frames], np.float32)
+    return Statistics("m", "s", ("t",), tuple(range(len(frames))), measured)
 
 
 def reach(method: object, x: Values) -> float:

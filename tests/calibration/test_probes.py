@@ -7,10 +7,14 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.insert_probes import GAUGES, arrange, tap
 from me2e_compress.calibration.probes import Extremes
 from me2e_compress.calibration.statistics import BINS
-from me2e_compress.calibration.stream import gauged
+from me2e_compress.calibration.stream import (
+    READINGS,
+    insert_probes,
+    probed_session,
+    schedule_probes,
+)
 from me2e_compress.runtime.session import Session
 from tests.frames import record
 from tests.nets import conv_attention, image
@@ -18,8 +22,11 @@ from tests.nets import conv_attention, image
 TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
 
 
-def test_gauges_stand_right_behind_what_they_watch() -> None:
-    ops = [node.op_type for node in tap(conv_attention(), ["a"], Extremes()).graph]
+def test_probes_stand_right_behind_what_they_watch() -> None:
+    ops = [
+        node.op_type
+        for node in insert_probes(conv_attention(), ["a"], Extremes()).graph
+    ]
 
     assert ops[:4] == ["Conv", "ReduceMin", "ReduceMax", "ReduceSumSquare"]
 
@@ -32,9 +39,11 @@ def test_readings_are_those_of_numpy(optimize: bool) -> None:
     made = {value.name: value for node in bare.graph for value in node.outputs}
     bare.graph.outputs.extend(made[name] for name in TENSORS[1:-1])
     values = {**Session(bare, threads=1, optimize=False).run(feeds), **feeds}
-    session = gauged(model, TENSORS[:-1], Extremes(), threads=1, optimize=optimize)
+    session = probed_session(
+        model, TENSORS[:-1], Extremes(), threads=1, optimize=optimize
+    )
 
-    readings = session.run(feeds, [GAUGES])[GAUGES].reshape(-1, 3)
+    readings = session.run(feeds, [READINGS])[READINGS].reshape(-1, 3)
 
     for name, (low, high, square) in zip(TENSORS, readings, strict=False):
         x = values[name].astype(np.float64)
@@ -42,11 +51,11 @@ def test_readings_are_those_of_numpy(optimize: bool) -> None:
         assert (low, high, square) == pytest.approx(expected, rel=1e-4), name
 
 
-def test_gauged_models_still_answer_and_keep_their_metadata() -> None:
+def test_models_with_probes_still_answer_and_keep_their_metadata() -> None:
     model = conv_attention()
     model.metadata_props["me2e.recurrent"] = '{"memory": "memory_out"}'
     feeds = {**image(3), "memory": np.zeros((1, 8, 64), np.float32)}
-    session = gauged(model, TENSORS, Extremes(), threads=1, optimize=True)
+    session = probed_session(model, TENSORS, Extremes(), threads=1, optimize=True)
     other = Session(model)
 
     assert session.recurrent == {"memory": "memory_out"}
@@ -54,18 +63,18 @@ def test_gauged_models_still_answer_and_keep_their_metadata() -> None:
     np.testing.assert_allclose(ours, plain, rtol=1e-5, atol=1e-5)
 
 
-def test_arranging_lets_gauges_run_as_soon_as_they_can() -> None:
-    model = tap(conv_attention(), TENSORS, Extremes())
-    late = [node for node in model.graph if (node.name or "").startswith(GAUGES)]
+def test_scheduling_lets_probes_run_as_soon_as_they_can() -> None:
+    model = insert_probes(conv_attention(), TENSORS, Extremes())
+    late = [node for node in model.graph if (node.name or "").startswith(READINGS)]
     model.graph.remove(late)
     model.graph.extend(late)
 
-    arrange(model)
+    schedule_probes(model)
 
     nodes = list(model.graph)
     assert {node.name for node in nodes} >= {node.name for node in late}
     made = {value: at for at, node in enumerate(nodes) for value in node.outputs}
-    driving = [at for at, n in enumerate(nodes) if not str(n.name).startswith(GAUGES)]
+    driving = [at for at, n in enumerate(nodes) if not str(n.name).startswith(READINGS)]
     for at, node in enumerate(nodes):
         sources = [made[value] for value in node.inputs if value in made]
         assert all(source < at for source in sources)
@@ -73,7 +82,7 @@ def test_arranging_lets_gauges_run_as_soon_as_they_can() -> None:
             assert not [other for other in driving if max(sources) < other < at]
 
 
-def test_nodes_that_lead_nowhere_survive_the_arranging() -> None:
+def test_nodes_that_lead_nowhere_survive_the_scheduling() -> None:
     model = ir.from_onnx_text(
         '<ir_version: 9, opset_import: ["" : 17]>\n'
         "m (float[2] x, bool c) => (float[2] y) { y = Relu(x)"
@@ -81,7 +90,7 @@ def test_nodes_that_lead_nowhere_survive_the_arranging() -> None:
         " else_branch = e () => (float[2] b) { b = Neg(y) }> }"
     )
 
-    arrange(model)
+    schedule_probes(model)
 
     assert [node.op_type for node in model.graph] == ["Relu", "If"]
 

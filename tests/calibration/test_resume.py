@@ -46,7 +46,7 @@ def test_a_killed_calibration_goes_on_where_it_was(
     seen = calibrator.collect(model, TENSORS, rest)
 
     whole = Calibrator("mse", threads=1).collect(model, TENSORS, CalibrationSet(folder))
-    np.testing.assert_array_equal(seen.gauges, whole.gauges)
+    np.testing.assert_array_equal(seen.measured, whole.measured)
     np.testing.assert_array_equal(seen.counted(), whole.counted())
     assert rest.left == 0
     assert not path.exists()
@@ -56,7 +56,7 @@ def test_a_killed_calibration_goes_on_where_it_was(
     ("tensors", "method", "seed", "message"),
     [
         (TENSORS[:1], "mse", 0, "another list of tensors"),
-        (TENSORS, "max-min", 0, "another kind of method"),
+        (TENSORS, "max-min", 0, "another kind of statistics"),
         (TENSORS, "mse", 1, "another model"),
     ],
 )

@@ -28,7 +28,7 @@ def same(a: Statistics, b: Statistics) -> bool:
     return (
         (a.model, a.source, a.tensors, a.frames)
         == (b.model, b.source, b.tensors, b.frames)
-        and np.array_equal(a.gauges, b.gauges)
+        and np.array_equal(a.measured, b.measured)
         and np.array_equal(a.counted(), b.counted())
     )
 

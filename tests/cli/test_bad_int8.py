@@ -267,7 +267,7 @@ def without_a_tensor(path: Path) -> None:
 
 def without_a_number(path: Path) -> None:
     arrays = dict(np.load(path))
-    np.savez(path, **{**arrays, "gauges": arrays["gauges"] * np.float32(np.nan)})
+    np.savez(path, **{**arrays, "measured": arrays["measured"] * np.float32(np.nan)})
 
 
 @pytest.mark.parametrize(
