@@ -1,0 +1,22 @@
+"""The weights that ship, in closed loop; five CPU seconds."""
+
+from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
+from me2e_compress.evaluators.highway.runner import Conditions, drive
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.simulator.routes import load_routes, pick_routes
+from me2e_compress.zoo.shipped import shipped
+
+
+def test_the_shipped_driver_passes_a_parked_car() -> None:
+    """A route that nobody passes blindly, and one of the shortest.
+
+    So says benchmarks/driver/baselines/routes.csv.
+    """
+    (route,) = pick_routes(load_routes(), "ParkedObstacle_0")
+    policy = Driver(str(shipped("highway"))).open()
+
+    episode = drive(route, policy, Conditions(image_size=image_size_of(policy)))
+
+    assert (episode.ending, episode.infractions) == (Ending.COMPLETED, ())
+    assert route_score(episode).composed == 100.0
