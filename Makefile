@@ -4,13 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: demo test check fix clean
+.PHONY: demo test test-slow check fix clean
 
 demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
 	$(BIN)/me2e-compress demo --out out
 
 test: check  ## lint, types, layers, tests
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup
+
+test-slow: $(VENV)/.test  ## what takes minutes: TensorRT-RTX builds of whole stacks, training killed and resumed, 2 GB
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup -m slow
 
 check: $(VENV)/.test
 	$(BIN)/ruff check .
