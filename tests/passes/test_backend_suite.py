@@ -7,7 +7,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import recipe
-from me2e_compress.graph import provenance
+from me2e_compress.graph import infer_shapes, provenance
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.fold_constants import FoldConstants
@@ -54,8 +54,11 @@ class Form:
         after = ir.from_proto(case.model)
         for node in after.graph.all_nodes():
             provenance.stamp(node, provenance.Provenance("all", (node.name or "",)))
+        infer_shapes(after)
         for current in PASSES:
             result = current.run(after, NO_MODULES)
+            if result.changes:
+                infer_shapes(result.model)
             self.folded += bool(result.changes and current.name == "fold-constants")
             after = result.model
         try:
