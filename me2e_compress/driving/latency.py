@@ -1,48 +1,88 @@
-"""How long a decision takes on the vehicle, and who says so."""
+"""How long a decision takes on the vehicle, and who says so.
 
+To add a latency source: write its class, then add it to this table.
+"""
+
+import abc
+import functools
 import hashlib
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.registry import Registry
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
 Charge = Callable[[int], int]
 """From the microseconds a decision took here to those it takes on the vehicle."""
 
 
-class LatencySource(Protocol):
-    """Says what each decision of a route costs."""
+@dataclass(frozen=True)
+class LatencySource(abc.ABC):
+    """Says what each decision of a route costs; its fields are its options.
 
-    @property
-    def measures(self) -> bool:
-        """Whether it depends on this machine, now: such routes must run alone."""
-        ...
+    Class attributes:
+        name: What the command line and studies call it.
+        measures: True if it depends on this machine, now: such routes must run alone.
+    """
 
+    name: ClassVar[str]
+    measures: ClassVar[bool] = False
+
+    @abc.abstractmethod
     def on_route(self, route: str) -> Charge:
         """Return the clock of one route; it depends on nothing but its identity."""
-        ...
 
+    @abc.abstractmethod
     def to_json(self) -> dict[str, Any]:
         """Return what decides the latencies, for the fingerprint of the results."""
-        ...
+
+
+_HERE = "me2e_compress.driving.latency"
+
+LATENCY_SOURCES: Registry[LatencySource] = Registry(
+    "latency source",
+    "me2e_compress.latency_sources",
+    EvaluationError,
+    {
+        "none": f"{_HERE}:NoLatency",
+        "fps": f"{_HERE}:FrameRate",
+        "fixed": f"{_HERE}:FixedLatency",
+        "trace": f"{_HERE}:TraceLatency",
+        "measured": f"{_HERE}:MeasuredLatency",
+    },
+)
 
 
 @dataclass(frozen=True)
-class FixedLatency:
-    """Every decision takes the same time: a frame rate, or zero for the ideal."""
+class FixedLatency(LatencySource):
+    """The same time for every decision.
 
+    Attributes:
+        latency_us: Microseconds.
+
+    Raises:
+        EvaluationError: A negative latency.
+    """
+
+    name: ClassVar[str] = "fixed"
     latency_us: int = 0
-    measures: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        """Check the latency."""
+        if self.latency_us < 0:
+            raise EvaluationError(
+                f"latency fixed: {self.latency_us} us: must be 0 or more"
+            )
 
     def on_route(self, route: str) -> Charge:
-        """Charge the same for every decision of every route."""
+        """Charge the same on every route."""
         return lambda _: self.latency_us
 
     def to_json(self) -> dict[str, Any]:
@@ -51,30 +91,85 @@ class FixedLatency:
 
 
 @dataclass(frozen=True)
-class TraceLatency:
+class NoLatency(LatencySource):
+    """No time at all: the ideal."""
+
+    name: ClassVar[str] = "none"
+
+    def on_route(self, route: str) -> Charge:
+        """Charge nothing."""
+        return lambda _: 0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the microseconds, none."""
+        return {"fixed_us": 0}
+
+
+@dataclass(frozen=True)
+class FrameRate(LatencySource):
+    """The period of a frame rate for every decision: at 10 fps, 100 ms.
+
+    Attributes:
+        fps: Decisions a second.
+
+    Raises:
+        EvaluationError: A rate that is not positive.
+    """
+
+    name: ClassVar[str] = "fps"
+    fps: float
+
+    def __post_init__(self) -> None:
+        """Check the rate."""
+        _check_positive("fps", self.fps)
+
+    def on_route(self, route: str) -> Charge:
+        """Charge the period on every route."""
+        period_us = round(1e6 / self.fps)
+        return lambda _: period_us
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the microseconds."""
+        return {"fixed_us": round(1e6 / self.fps)}
+
+
+@dataclass(frozen=True)
+class TraceLatency(LatencySource):
     """Latencies recorded before, often on another device.
 
-    Args:
-        samples_us: Microseconds, in the order of the recording.
+    Attributes:
+        trace: File that `profile` wrote; or the samples themselves, microseconds in
+            the order of the recording.
         in_order: Replay them in order from the first on every route, which keeps the
             bursts, and start over at the end; else draw them with replacement.
         scale: Speed ratio between the recording device and the one imagined.
         seed: Of the draws; each route has its own stream, whatever drives before it.
 
     Raises:
-        EvaluationError: A negative seed.
+        EvaluationError: No such file, not a trace, a negative seed, or a scale that is
+            not positive.
     """
 
-    samples_us: tuple[int, ...]
+    name: ClassVar[str] = "trace"
+    trace: Path | tuple[int, ...]
     in_order: bool = False
     scale: float = 1.0
     seed: int = 0
-    measures: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        """Refuse a seed that nothing can be drawn with, before anything drives."""
+        """Refuse what nothing can be drawn from, before anything drives."""
+        _check_positive("trace: scale", self.scale)
         if self.seed < 0:
             raise EvaluationError(f"latency: seed {self.seed}: must be 0 or more")
+        if not self.samples_us:
+            raise EvaluationError("latency trace: there are no samples")
+
+    @functools.cached_property
+    def samples_us(self) -> tuple[int, ...]:
+        """Microseconds, read once: other processes are sent them with the source."""
+        if isinstance(self.trace, Path):
+            return LatencyTrace.load(self.trace).samples_us
+        return self.trace
 
     def on_route(self, route: str) -> Charge:
         """Charge what the trace says next."""
@@ -97,11 +192,23 @@ class TraceLatency:
 
 
 @dataclass(frozen=True)
-class MeasuredLatency:
-    """What the decision takes on this machine, now. Not reproducible."""
+class MeasuredLatency(LatencySource):
+    """What the decision takes on this machine, now. Not reproducible.
 
+    Attributes:
+        scale: Speed ratio between this machine and the one imagined.
+
+    Raises:
+        EvaluationError: A scale that is not positive.
+    """
+
+    name: ClassVar[str] = "measured"
+    measures: ClassVar[bool] = True
     scale: float = 1.0
-    measures: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        """Check the scale."""
+        _check_positive("measured: scale", self.scale)
 
     def on_route(self, route: str) -> Charge:
         """Charge what was measured."""
@@ -115,40 +222,30 @@ class MeasuredLatency:
 def parse_latency(
     text: str, *, in_order: bool = False, scale: float = 1.0, seed: int = 0
 ) -> LatencySource:
-    """Read ``none``, ``fps:F``, ``trace:FILE`` or ``measured``.
+    """Build the latency source of a text, e.g. ``fps:10`` or ``trace:FILE``.
 
     Args:
-        text: Which source; ``fps:10`` charges 100 ms a decision.
-        in_order: For a trace, see `TraceLatency`.
-        scale: For a trace or a measurement.
-        seed: For a trace.
+        text: Name and options, see `LATENCY_SOURCES`.
+        in_order: These three where the source has such an option; one at its default
+            leaves what the text says.
+        scale: Positive, whatever the source.
+        seed: 0 or more.
 
     Raises:
-        EvaluationError: Another word, a frame rate or a scale that is not positive, a
-            negative seed, or a file that is no trace.
+        EvaluationError: No such source, or an option that it refuses.
     """
-    if not 0.0 < scale < float("inf"):
-        raise EvaluationError(f"latency scale {scale}: must be a positive number")
-    kind, _, value = text.partition(":")
-    if text == "none":
-        return FixedLatency()
-    if text == "measured":
-        return MeasuredLatency(scale)
-    if kind == "fps" and value:
-        return FixedLatency(_period_us(value))
-    if kind == "trace" and value:
-        samples = LatencyTrace.load(Path(value)).samples_us
-        return TraceLatency(samples, in_order, scale, seed)
-    raise EvaluationError(
-        f"latency {text!r}: there are none, fps:F, trace:FILE and measured"
-    )
+    _check_positive("scale", scale)
+    source = LATENCY_SOURCES.parse(text)
+    given = {"in_order": in_order, "scale": scale, "seed": seed}
+    default = {"in_order": False, "scale": 1.0, "seed": 0}
+    options: dict[str, object] = {
+        option: value
+        for option, value in given.items()
+        if option in type(source).__dataclass_fields__ and value != default[option]
+    }
+    return LATENCY_SOURCES.with_options(source, options) if options else source
 
 
-def _period_us(text: str) -> int:
-    try:
-        fps = float(text)
-    except ValueError:
-        fps = float("nan")
-    if not 0.0 < fps < float("inf"):
-        raise EvaluationError(f"latency fps:{text}: {text} is not a positive number")
-    return round(1e6 / fps)
+def _check_positive(what: str, value: float) -> None:
+    if not 0.0 < value < float("inf"):
+        raise EvaluationError(f"latency {what} {value:g} is not a positive number")

@@ -22,6 +22,7 @@ from me2e_compress.registry.describe import (
 from me2e_compress.registry.text import (
     ParsedItem,
     TextError,
+    name_in,
     read_all,
     read_one,
     write_item,
@@ -79,8 +80,7 @@ class Registry(Generic[T]):
         """
         claims = self._claims(name)
         if not claims:
-            there = ", ".join(self.names()) or "none"
-            raise self.error(f"no {self.kind} {name!r}; there are {there}")
+            raise self._unknown(name)
         if len(claims) > 1:
             packages = " and ".join(_source(entry) for entry in claims)
             raise self.error(
@@ -134,6 +134,8 @@ class Registry(Generic[T]):
         try:
             item = read_one(text)
         except TextError as error:
+            if not name_in(text):
+                raise self._unknown(text) from error
             raise self.error(f"{self.kind}: {error}") from error
         return self._built(item)
 
@@ -184,6 +186,10 @@ class Registry(Generic[T]):
         except Me2eError as error:
             return Entry(name, source, error=str(error))
         return Entry(name, source, first_line(cls), options_of(cls))
+
+    def _unknown(self, name: str) -> Me2eError:
+        there = ", ".join(self.names()) or "none"
+        return self.error(f"no {self.kind} {name!r}; there are {there}")
 
     def _built(self, item: ParsedItem) -> T:
         cls = self.get(item.name)

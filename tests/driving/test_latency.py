@@ -4,9 +4,9 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.driving.latency import (
-    FixedLatency,
     LatencySource,
     MeasuredLatency,
+    NoLatency,
     TraceLatency,
     parse_latency,
 )
@@ -34,7 +34,7 @@ def test_a_frame_rate_charges_its_period() -> None:
 
 
 def test_none_charges_nothing() -> None:
-    assert parse_latency("none") == FixedLatency(0)
+    assert parse_latency("none") == NoLatency()
 
 
 def test_a_trace_in_order_starts_over_on_every_route(trace: Path) -> None:
@@ -85,10 +85,10 @@ def test_a_measurement_is_scaled_and_says_so() -> None:
     [
         ("fps:0", "not a positive number"),
         ("fps:-3", "not a positive number"),
-        ("fps:ten", "not a positive number"),
+        ("fps:ten", "fps: fps: Input should be a valid number"),
         ("fps:nan", "not a positive number"),
-        ("fps:", "there are none, fps:F"),
-        ("10", "there are none, fps:F"),
+        ("fps:", "a value is expected behind fps:"),
+        ("10", "no latency source '10'; there are none, fps"),
         ("trace:/no/such/file", "No such file"),
     ],
 )

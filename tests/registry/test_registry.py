@@ -223,8 +223,9 @@ def test_defaults_are_written_where_they_are_asked_for() -> None:
         ("square{count=1, count=2}", "option count is given twice"),
         ("square{3}", "from '3}' on: option=value is expected"),
         (r'square{label="\x"}', "is not a JSON string"),
-        ("square, point", "from ', point' on: a comma or the end is expected"),
-        ("", "a name is expected"),
+        ("square{}, point", "from ', point' on: a comma or the end is expected"),
+        ("3", "no shape '3'; there are square"),
+        ("", "no shape ''; there are square"),
     ],
 )
 def test_bad_text_names_the_culprit_on_one_line(text: str, message: str) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.latency import FixedLatency, TraceLatency
+from me2e_compress.driving.latency import NoLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.interleaved import machine_in_turn
@@ -78,7 +78,7 @@ def test_each_scheme_pays_its_own_latency(ours: Study, tmp_path: Path) -> None:
     clock = clock_of(ours, tmp_path)
     blind, _, fast = ours.schemes
 
-    assert clock.source(fast, IDEAL, 7) == FixedLatency()
+    assert clock.source(fast, IDEAL, 7) == NoLatency()
     assert clock.source(fast, DEVICE, 7) == TraceLatency(
         SAMPLES, scale=clock.scale, seed=7
     )
