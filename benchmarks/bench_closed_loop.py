@@ -18,6 +18,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +26,7 @@ import onnx
 
 from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
-from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
@@ -68,10 +69,13 @@ class Shadow:
 
 @dataclass(frozen=True)
 class ShadowDriver(Driver):
-    """Opens a shadow of the model that it is named after."""
+    """Opens a shadow of a model."""
+
+    name: ClassVar[str] = "shadow"
+    path: Path
 
     def open(self) -> Shadow:
-        return Shadow(OnnxPolicy.open(Path(self.name)), Expert())
+        return Shadow(OnnxPolicy.open(self.path), Expert())
 
 
 def model_of(products: int, path: Path) -> Path:
@@ -155,7 +159,8 @@ def bench_drivers(out: Path, workers: int) -> None:
     print("| driver | " + " | ".join(columns) + " |")
     print("|---" * (len(columns) + 1) + "|")
     for name in ("expert", "blind:4", "blind:8", "blind:12"):
-        found, _ = evaluate(out / name.replace(":", "-"), Driver(name), routes, workers)
+        folder = out / name.replace(":", "-")
+        found, _ = evaluate(folder, driver_named(name), routes, workers)
         each = [found.each_ability[ability] for ability in ABILITIES]
         shown = [found.driving_score, found.success_rate, *each, found.efficiency]
         last = [
@@ -177,7 +182,7 @@ def bench_latency(out: Path, workers: int) -> None:
     for seconds in LATENCIES_S:
         folder = out / (f"expert-{seconds:g}s" if seconds else "expert")
         scores, _ = evaluate(
-            folder, Driver("expert"), load_routes(), workers, round(seconds * 1e6)
+            folder, driver_named("expert"), load_routes(), workers, round(seconds * 1e6)
         )
         rate, driving = scores.success_rate, scores.driving_score.value
         print(
@@ -191,7 +196,7 @@ def bench_bytes(out: Path, workers: int) -> None:
     folders = [out / f"bytes-{count}" for count in (1, max(2, workers))]
     for folder, count in zip(folders, (1, max(2, workers)), strict=True):
         shutil.rmtree(folder, ignore_errors=True)
-        evaluate(folder, Driver("expert"), routes, count, 150_000)
+        evaluate(folder, driver_named("expert"), routes, count, 150_000)
     one, other = (
         {p.relative_to(f): p.read_bytes() for p in f.rglob("*.json")} for f in folders
     )
@@ -204,9 +209,9 @@ def bench_throughput(out: Path, _: int) -> None:
     routes = pick_routes(load_routes(), "22")
     light = model_of(1, out / "light.onnx")
     drivers = {
-        "blind:8, no cameras": Driver("blind:8"),
-        "expert, no cameras": Driver("expert"),
-        "expert and six cameras 96x160": ShadowDriver(str(light)),
+        "blind:8, no cameras": driver_named("blind:8"),
+        "expert, no cameras": driver_named("expert"),
+        "expert and six cameras 96x160": ShadowDriver(light),
     }
     print("| driver | frames/s on one core | MB a worker |\n|---|---|---|")
     for name, driver in drivers.items():
@@ -227,7 +232,7 @@ def bench_slow(out: Path, workers: int) -> None:
     folder = out / "slow"
     shutil.rmtree(folder, ignore_errors=True)
     folder.with_name("slow.log").unlink(missing_ok=True)
-    scores, seconds = evaluate(folder, ShadowDriver(str(path)), load_routes(), workers)
+    scores, seconds = evaluate(folder, ShadowDriver(path), load_routes(), workers)
     frames = sum(row["frames"] for row in log_of(folder))
     print(
         f"{scores.routes} routes, {frames:.0f} frames with six cameras, expert and "
@@ -247,8 +252,8 @@ def bench_resume(out: Path, workers: int) -> None:
         os.killpg(running.pid, signal.SIGKILL)
     before = len(list(folder.glob("routes/*.json")))
     routes = pick_routes(load_routes(), "44")
-    evaluate(folder, Driver("blind"), routes, workers)
-    evaluate(whole, Driver("blind"), routes, 1)
+    evaluate(folder, driver_named("blind"), routes, workers)
+    evaluate(whole, driver_named("blind"), routes, 1)
     driven = [row["route"] for row in log_of(folder)]
     same = all(
         (folder / p.relative_to(whole)).read_bytes() == p.read_bytes()
@@ -280,7 +285,7 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     if given.drive_resume:
         routes = pick_routes(load_routes(), "44")
-        evaluate(given.out / "resume", Driver("blind"), routes, given.workers)
+        evaluate(given.out / "resume", driver_named("blind"), routes, given.workers)
         return
     for name in given.part or PARTS:
         print(f"\n## {name}\n")

@@ -4,24 +4,26 @@ from dataclasses import replace
 from pathlib import Path
 
 from me2e_compress.cli.models import model_path
+from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.evaluators.highway.drivers import BLIND, EXPERT, Driver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 
 
 def driver_of(text: str, adapter: Path | None = None) -> Driver:
-    """Give the driver that a word of the command line means, its model found.
+    """Return the driver that a word of the command line means, its model found.
 
     Args:
-        text: ``expert``, ``blind``, ``blind:S``, a path, or a shipped model's name.
+        text: a policy by name, a path, or a shipped model's name.
         adapter: TOML file that adapts the model to the policy contract.
 
     Raises:
         EvaluationError: none of them.
     """
-    driver = Driver(text, adapter)
-    if not driver.is_model:
+    driver = driver_named(text, adapter)
+    if not isinstance(driver, OnnxDriver):
         return driver
     try:
-        return replace(driver, name=str(model_path(text)))
+        return replace(driver, path=model_path(str(driver.path)))
     except GraphError as error:
-        raise EvaluationError(f"{error}; or {EXPERT}, {BLIND}") from error
+        policies = ", ".join(POLICIES.names())
+        raise EvaluationError(f"{error}; policies: {policies}") from error

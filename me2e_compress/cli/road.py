@@ -35,7 +35,7 @@ def on_routes(
     """
     need_closed_loop("what driving a variant needs")
     from me2e_compress.cli.commands.evaluate import routes_named
-    from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
+    from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
     from me2e_compress.evaluators.highway.engine import LocalEngine
     from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
     from me2e_compress.evaluators.highway.runner import Conditions
@@ -43,14 +43,14 @@ def on_routes(
     from me2e_compress.metrics.scores import score
 
     picked, set_size = routes_named(routes)
-    size = image_size_of(Driver(str(model), adapter).open())
+    size = image_size_of(OnnxDriver(model, adapter).open())
 
     def drive(choice: Int8Choice, variant: ir.Model) -> float:
         results = folder / name_of(choice, variant)
         with TemporaryDirectory() as scratch:
             path = Path(scratch) / "variant.onnx"
             graph.save(variant, path)
-            job = Job(Driver(str(path), adapter), Conditions(image_size=size))
+            job = Job(OnnxDriver(path, adapter), Conditions(image_size=size))
             engine = LocalEngine(workers)
             evaluator = HighwayEvaluator(job, picked, results, set_size, engine)
             found = score(tuple(evaluator.episodes()), set_size).driving_score

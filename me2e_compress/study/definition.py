@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from me2e_compress.driving.latency import parse_latency
+from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -26,7 +27,7 @@ class Scheme:
 
     Args:
         name: Letters, digits, ``_``, ``+`` and ``-``; names its folder of results.
-        policy: ``expert``, ``blind``, ``blind:MPS`` or the path of an ONNX file.
+        policy: A policy by name, ``blind:8``, or the path of an ONNX file.
         passes: What is applied to the file; none leaves it as it is.
         module_map: Preset or TOML file for the passes; None finds the preset.
         adapter: TOML file that adapts the model to the policy contract.
@@ -56,7 +57,7 @@ class Scheme:
     @property
     def is_model(self) -> bool:
         """Whether an ONNX file drives."""
-        return Driver(self.policy).is_model
+        return isinstance(driver_named(self.policy), OnnxDriver)
 
 
 @dataclass(frozen=True)

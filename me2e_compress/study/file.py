@@ -7,8 +7,9 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress import recipe
+from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study.check_frames import check_recordings
@@ -130,15 +131,18 @@ class _Reader:
         )
 
     def _scheme(self, table: _Scheme) -> Scheme:
-        policy = table.policy
-        if Driver(policy).is_model:
-            policy = str(self._model(policy))
+        policy, adapter = table.policy, table.adapter
+        driver = driver_named(policy)
+        if isinstance(driver, OnnxDriver):
+            policy = str(self._model(str(driver.path)))
+            if adapter is None and driver.adapter is not None:
+                adapter = str(driver.adapter)
         return Scheme(
             table.name,
             policy,
             self._passes(table),
             self._map(table.map),
-            self._file(table.adapter),
+            self._file(adapter),
             self._file(table.trace),
         )
 

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
@@ -10,8 +10,9 @@ from pydantic import BaseModel, ValidationError
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.passes import Context, Pass
@@ -55,16 +56,16 @@ def prepare_scheme(
         EvaluationError: It cannot drive.
         Me2eError: A pass refused the graph or broke.
     """
-    if not scheme.is_model:
-        driver = Driver(scheme.policy)
+    driver = driver_named(scheme.policy, scheme.adapter)
+    if not isinstance(driver, OnnxDriver):
         driver.open()
         return PreparedScheme(scheme, driver)
-    model = source = Path(scheme.policy)
+    model = source = driver.path
     if not source.is_file():
         raise StudyError(f"scheme {scheme.name}: {source}: no such model")
     if scheme.passes:
         model = _compressed(study, scheme, workplace, listener)
-    driver = Driver(str(model), scheme.adapter)
+    driver = replace(driver, path=model)
     driver.open()
     sha256 = graph.sha256_of(model)
     origin = source.name, to_text(scheme.passes)

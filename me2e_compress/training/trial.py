@@ -6,7 +6,7 @@ from typing import Any
 
 from me2e_compress.driving.latency import LatencySource
 from me2e_compress.errors import TrainingError
-from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
+from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.generate import generate
 from me2e_compress.evaluators.highway.jobs import DrivingProgress, HighwayEvaluator
@@ -88,7 +88,7 @@ def drive(
     def tell(progress: DrivingProgress) -> None:
         on_done(progress.done, progress.total)
 
-    who = Driver(str(driver))
+    who = OnnxDriver(driver)
     evaluator = HighwayEvaluator(
         Job(who, Conditions(latency, image_size=image_size_of(who.open()))),
         routes,

@@ -82,7 +82,7 @@ def test_a_route_is_drawn(run: Run, manifest: Path, tmp_path: Path) -> None:
         (("--engine", "local", "--address", "a:1"), "engine 'local' with address a:1"),
         (("--weather", "snow=1"), "weather option 'snow'"),
         (("--weather", "night=dark"), "weather option night"),
-        (("--latency", "fast"), "latency 'fast'"),
+        (("--latency", "fast"), "no latency source 'fast'"),
         (("--dt-ms", "30"), "a step of 30 ms"),
     ],
 )

@@ -134,7 +134,10 @@ def test_evaluate_names_everything_that_could_drive(
     assert command("evaluate", "nobody", "-o", tmp_path / "results") == 1
 
     line = capsys.readouterr().err.strip()
-    assert "nobody: no such file; models that ship: highway; or expert, blind" in line
+    assert (
+        "nobody: no such file; models that ship: highway; policies: expert, blind"
+        in line
+    )
     assert "\n" not in line
 
 

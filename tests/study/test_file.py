@@ -124,7 +124,12 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
         ("fold-constants", "fold-constant", RecipeError, "no pass 'fold-constant'"),
         ("passes", 'recipe = "full"\npasses', StudyError, "a recipe or passes, not"),
         ('"slow.onnx"\nrecipe', '"quick"\nrecipe', GraphError, "quick: no such file"),
-        ('latency = "none"', 'latency = "quick"', EvaluationError, "latency 'quick'"),
+        (
+            'latency = "none"',
+            'latency = "quick"',
+            EvaluationError,
+            "source 'quick'",
+        ),
         ("[latency]", "[latency", StudyError, "not TOML"),
         ('"frames"', '"gone"', StudyError, r"^held_out: \S+/gone: no such folder"),
         (

@@ -1,10 +1,12 @@
-"""Who drives: ``expert``, ``blind``, or the path of an ONNX file."""
+"""The drivers of this evaluator: the expert, the blind one, an ONNX file."""
 
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from me2e_compress.driving.contract import Policy
+from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.adapter import Adapter
 from me2e_compress.evaluators.highway.blind import Blind
@@ -13,74 +15,83 @@ from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.graph import sha256_of
 
-EXPERT = "expert"
-BLIND = "blind"
+
+@dataclass(frozen=True)
+class ExpertDriver(Driver):
+    """The privileged expert, who sees the world itself."""
+
+    name: ClassVar[str] = "expert"
+
+    def open(self) -> Policy:
+        """Return the expert."""
+        return Expert()
 
 
 @dataclass(frozen=True)
-class Driver:
-    """A policy by name, which any process can open for itself.
+class BlindDriver(Driver):
+    """Follows the centre of the route at one speed, whatever stands there.
 
-    Args:
-        name: ``expert``, ``blind``, ``blind:S`` for S metres per second, or the path
-            of an ONNX file.
-        adapter: TOML file that adapts the model to the policy contract.
+    Attributes:
+        speed_mps: The speed in m/s; None for 8.
+
+    Raises:
+        EvaluationError: A speed that is not positive.
     """
 
-    name: str
+    name: ClassVar[str] = "blind"
+    speed_mps: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the speed."""
+        if self.speed_mps is not None and not 0.0 < self.speed_mps < float("inf"):
+            raise EvaluationError(f"blind: {self.speed_mps:g} is not a speed in m/s")
+
+    def open(self) -> Policy:
+        """Return the blind driver."""
+        return Blind() if self.speed_mps is None else Blind(self.speed_mps)
+
+
+@dataclass(frozen=True)
+class OnnxDriver(Driver):
+    """An ONNX file that keeps the policy contract.
+
+    Attributes:
+        path: The file.
+        adapter: TOML file that adapts the model to the contract; None where it keeps
+            it as it is.
+    """
+
+    name: ClassVar[str] = "onnx"
+    path: Path
     adapter: Path | None = None
 
     def open(self) -> Policy:
         """Return the policy.
 
         Raises:
-            EvaluationError: No such file or name, or a model that cannot drive.
+            EvaluationError: No such file, or a model that cannot drive.
         """
-        if self.name == EXPERT:
-            return Expert()
-        if self._is_blind:
-            return Blind(self._speed_mps)
-        if not Path(self.name).is_file():
+        if not self.path.is_file():
             raise EvaluationError(
-                f"policy {self.name}: no such file, and neither {EXPERT} nor {BLIND}"
+                f"policy {self.path}: no such file, and no policy of that name; there"
+                f" are {', '.join(POLICIES.names())}"
             )
         adapter = None if self.adapter is None else Adapter.load(self.adapter)
-        return OnnxPolicy.open(Path(self.name), adapter)
+        return OnnxPolicy.open(self.path, adapter)
+
+    @property
+    def label(self) -> str:
+        """The name of the file."""
+        return self.path.stem
 
     def fingerprint(self) -> str:
-        """Return what identifies the policy: its name, or digests of its files."""
-        if self.name == EXPERT or self._is_blind:
-            return self.name
-        digests = [sha256_of(Path(self.name))]
+        """Return digests of its files, wherever they lie."""
+        digests = [sha256_of(self.path)]
         if self.adapter is not None:
             digests.append(hashlib.sha256(self.adapter.read_bytes()).hexdigest())
         return "+".join(digests)
 
-    @property
-    def is_model(self) -> bool:
-        """Whether it is an ONNX file, not one of the drivers that are built in."""
-        return self.name != EXPERT and not self._is_blind
-
-    @property
-    def _is_blind(self) -> bool:
-        return self.name == BLIND or self.name.startswith(f"{BLIND}:")
-
-    @property
-    def _speed_mps(self) -> float:
-        _, _, text = self.name.partition(":")
-        if not text:
-            return Blind().speed_mps
-        try:
-            speed = float(text)
-        except ValueError:
-            speed = float("nan")
-        if not 0.0 < speed < float("inf"):
-            raise EvaluationError(f"policy {self.name}: {text} is not a speed in m/s")
-        return speed
-
 
 def image_size_of(policy: Policy) -> tuple[int, int]:
     """Return rows and columns of the images that a policy wants."""
-    if isinstance(policy, OnnxPolicy):
-        return policy.image_size
-    return DEFAULT_IMAGE_SIZE
+    return policy.image_size if isinstance(policy, SizedPolicy) else DEFAULT_IMAGE_SIZE

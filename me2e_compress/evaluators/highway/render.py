@@ -58,7 +58,7 @@ def render(job: Job, route: Route, folder: Path) -> tuple[Path, Path]:
     drive(route, job.driver.open(), job.conditions, Listeners(moment=film.see))
     world = World(route)
     texture = paint_texture(world.roadmap, world.path.points)
-    title = f"{route.scenario} {route.id} {Path(job.driver.name).stem}"
+    title = f"{route.scenario} {route.id} {job.driver.label}"
     moments = film.moments
     picture = RoutePicture(title, texture, world.path.points, moments)
     gif, png = folder / f"{route.id}.gif", folder / f"{route.id}.png"

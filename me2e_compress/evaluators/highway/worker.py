@@ -14,8 +14,8 @@ from typing import TypeAlias
 
 import psutil
 
+from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError, Me2eError
-from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.evaluators.highway.record import completion_percent, unrecorded
 from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
 from me2e_compress.metrics.episode import Episode

@@ -5,14 +5,15 @@ import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import onnx
 
 from me2e_compress.driving.contract import Observation, Policy, RouteInfo
+from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.drivers import Driver
 from me2e_compress.simulator.routes import Route
 
 CROSSING = Route("crossing", "DynamicObjectCrossing", "Emergency_Brake", 1)
@@ -61,11 +62,11 @@ class Misbehaving:
 class MisbehavingDriver(Driver):
     """Opens the above in any process."""
 
-    def open(self) -> Policy:
-        return Misbehaving(self.name)
+    name: ClassVar[str] = "misbehaving"
+    way: str
 
-    def fingerprint(self) -> str:
-        return self.name
+    def open(self) -> Policy:
+        return Misbehaving(self.way)
 
 
 def straight_on(

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.drivers import BlindDriver
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
 from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
 from me2e_compress.evaluators.highway.runner import Conditions
@@ -15,7 +15,7 @@ pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 
 @pytest.mark.filterwarnings("ignore")
 def test_a_local_ray_writes_the_same_bytes(tmp_path: Path) -> None:
-    job = Job(Driver("blind"), Conditions())
+    job = Job(BlindDriver(), Conditions())
     routes = (CROSSING, PARKED)
     local = HighwayEvaluator(job, routes, tmp_path / "local", 220)
     cluster = HighwayEvaluator(job, routes, tmp_path / "ray", 220, RayEngine(2))
@@ -28,7 +28,7 @@ def test_a_local_ray_writes_the_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore")
 def test_no_cluster_is_one_line(tmp_path: Path) -> None:
-    job = Job(Driver("blind"), Conditions())
+    job = Job(BlindDriver(), Conditions())
     nowhere = RayEngine(1, "127.0.0.1:1")
     one = HighwayEvaluator(job, (PARKED,), tmp_path / "r", 220, nowhere)
 

@@ -13,7 +13,7 @@ import pytest
 from me2e_compress.driving.contract import Evaluator
 from me2e_compress.driving.latency import FixedLatency, MeasuredLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.drivers import Driver
+from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
 from me2e_compress.evaluators.highway.durations import EXPERT_S, longest_first
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.jobs import (
@@ -36,8 +36,8 @@ from tests.evaluators.highway.drivers import (
 )
 
 TWO = (CROSSING, PARKED)
-BLIND = Job(Driver("blind"), Conditions(TraceLatency((30_000, 170_000, 320_000))))
-FASTER = Job(Driver("blind:9"), BLIND.conditions)
+BLIND = Job(BlindDriver(), Conditions(TraceLatency((30_000, 170_000, 320_000))))
+FASTER = Job(BlindDriver(9.0), BLIND.conditions)
 
 
 def evaluator(
@@ -154,8 +154,8 @@ def test_a_file_of_another_evaluation_is_driven_again(
     ("job", "routes", "key"),
     [
         (FASTER, TWO, "policy"),
-        (Job(Driver("blind"), Conditions(FixedLatency(1))), TWO, "latency"),
-        (Job(Driver("blind"), BLIND.conditions, 5.0), TWO, "frame_limit_s"),
+        (Job(BlindDriver(), Conditions(FixedLatency(1))), TWO, "latency"),
+        (Job(BlindDriver(), BLIND.conditions, 5.0), TWO, "frame_limit_s"),
         (BLIND, (PARKED, EXIT), "routes"),
         (BLIND, (Route("crossing", "HighwayExit", "Merging", 1), PARKED), "routes_sh"),
     ],
@@ -179,11 +179,11 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
         "from me2e_compress.simulator.routes import load_routes;"
         "from me2e_compress.evaluators.highway.jobs import HighwayEvaluator;"
         "from me2e_compress.evaluators.highway.engine import LocalEngine;"
-        "from me2e_compress.evaluators.highway.drivers import Driver;"
+        "from me2e_compress.evaluators.highway.drivers import BlindDriver;"
         "from me2e_compress.evaluators.highway.runner import Conditions;"
         "from me2e_compress.evaluators.highway.worker import Job;"
         "routes = load_routes(Path(sys.argv[1]));"
-        "job = Job(Driver('blind:5'), Conditions());"
+        "job = Job(BlindDriver(5.0), Conditions());"
         "list(HighwayEvaluator(job, routes, Path(sys.argv[2]), 6).episodes())"
     )
     command = [sys.executable, "-c", program, str(manifest), str(folder)]
@@ -196,7 +196,7 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     finished = {path.name: path.read_bytes() for path in written.glob("*.json")}
     assert 2 <= len(finished) < len(routes)
 
-    job = Job(Driver("blind:5"), Conditions())
+    job = Job(BlindDriver(5.0), Conditions())
     going_on = HighwayEvaluator(job, routes, folder, 6)
     episodes = tuple(going_on.episodes())
     log = (tmp_path / "results.log").read_text().splitlines()
@@ -275,7 +275,7 @@ def test_a_failed_route_is_a_result_like_any_other(tmp_path: Path) -> None:
 
 def test_measured_latency_drives_alone_and_warns(tmp_path: Path) -> None:
     warnings = list[str]()
-    job = Job(Driver("blind"), Conditions(MeasuredLatency(1000.0)))
+    job = Job(BlindDriver(), Conditions(MeasuredLatency(1000.0)))
     measured = HighwayEvaluator(
         job,
         (PARKED, EXIT),
@@ -298,7 +298,7 @@ def test_unknown_policies_are_refused_before_driving(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match=r"policy missing.onnx: no such file"):
         list(
             evaluator(
-                tmp_path / "r", Job(Driver("missing.onnx"), Conditions())
+                tmp_path / "r", Job(OnnxDriver(Path("missing.onnx")), Conditions())
             ).episodes()
         )
     assert not (tmp_path / "r").exists()

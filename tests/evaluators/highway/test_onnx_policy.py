@@ -1,23 +1,28 @@
 import dataclasses
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from me2e_compress.driving.contract import Observation, Plan, RouteInfo
+from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
+from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.adapter import (
     Adapter,
     Axes,
     ImageNormalization,
 )
-from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
+from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.runner import Conditions, drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.cameras import CameraRig
 from tests.evaluators.highway.drivers import EXIT, PARKED, straight_on
+from tests.installed import install
 
 NORM = {"input": "img", "mean": [10, 20, 30], "std": [2, 4, 5], "order": "bgr"}
 IMAGE = {"me2e.image": json.dumps(NORM)}
@@ -190,7 +195,7 @@ def test_an_adapter_sums_steps_picks_the_mode_and_turns_the_axes(
     )
     toml = tmp_path / "vad.toml"
     toml.write_text(VAD)
-    policy = Driver(str(model), toml).open()
+    policy = OnnxDriver(model, toml).open()
     policy.reset(EXIT)
 
     plan = policy.plan(observation(command=2))
@@ -251,7 +256,7 @@ def test_a_model_that_breaks_the_contract_never_drives(
     path = straight_on(tmp_path / "m.onnx", **model)  # type: ignore[arg-type]
 
     with pytest.raises(EvaluationError) as caught:
-        Driver(str(path)).open()
+        OnnxDriver(path).open()
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert words in message
@@ -274,7 +279,7 @@ def test_a_wrong_adapter_is_one_line(tmp_path: Path, text: str, words: str) -> N
     toml.write_text(text)
 
     with pytest.raises(EvaluationError) as caught:
-        Driver(str(path), toml).open()
+        OnnxDriver(path, toml).open()
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -283,7 +288,7 @@ def test_no_model_at_all(tmp_path: Path) -> None:
     (tmp_path / "m.onnx").write_bytes(b"not a model")
 
     with pytest.raises(EvaluationError, match=r"m.onnx: onnxruntime cannot run"):
-        Driver(str(tmp_path / "m.onnx")).open()
+        OnnxDriver(tmp_path / "m.onnx").open()
 
 
 def test_not_a_number_at_work_fails_the_route(tmp_path: Path) -> None:
@@ -309,15 +314,66 @@ def test_not_a_number_at_work_fails_the_route(tmp_path: Path) -> None:
 
 
 def test_drivers_by_name() -> None:
-    assert Driver("blind:6.5").fingerprint() == "blind:6.5"
-    with pytest.raises(EvaluationError, match="fast is not a speed"):
-        Driver("blind:fast").open()
+    assert driver_named("blind").open() == Blind(8.0)
+    assert driver_named("blind:6.5").open() == Blind(6.5)
+    assert driver_named("onnx:a/m.onnx") == OnnxDriver(Path("a/m.onnx"))
+    assert driver_named("expert.onnx") == OnnxDriver(Path("expert.onnx"))
+
+
+@pytest.mark.parametrize("text", ["expert", "blind", "blind:6.5", "blind:8"])
+def test_results_know_a_driver_by_its_text(text: str) -> None:
+    assert driver_named(text).fingerprint() == text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("blind:fast", "blind: speed_mps: Input should be a valid number"),
+        ("blind:0", "blind: 0 is not a speed in m/s"),
+        ("blind{speed=3}", "blind has no option 'speed'; it has speed_mps"),
+        ("expert:3", "expert takes no value, found '3'"),
+    ],
+)
+def test_a_wrong_option_of_a_driver_is_named(text: str, message: str) -> None:
+    with pytest.raises(EvaluationError, match=message):
+        driver_named(text)
+
+
+@dataclass(frozen=True)
+class StillDriver(Driver):
+    """Stands still.
+
+    Attributes:
+        weights: Read by nobody.
+    """
+
+    name: ClassVar[str] = "still"
+    weights: Path
+
+    def open(self) -> Policy:
+        return Blind(0.0)
+
+
+def test_a_policy_of_another_package_drives_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = {"still": f"{__name__}:StillDriver"}
+    install(monkeypatch, tmp_path, "a-policy", "me2e_compress.policies", entry)
+    weights = tmp_path / "w"
+    weights.write_bytes(b"1")
+    driver = driver_named(f"still:{weights}")
+    before = driver.fingerprint()
+    weights.write_bytes(b"2")
+
+    assert driver == StillDriver(weights)
+    assert before != driver.fingerprint()
+    assert image_size_of(driver.open()) == (96, 160)
 
 
 def test_the_fingerprint_follows_the_files(tmp_path: Path) -> None:
     path, toml = straight_on(tmp_path / "m.onnx"), tmp_path / "a.toml"
     toml.write_text("axes = 'forward-left'")
-    plain, adapted = Driver(str(path)).fingerprint(), Driver(str(path), toml)
+    plain, adapted = OnnxDriver(path).fingerprint(), OnnxDriver(path, toml)
 
     assert adapted.fingerprint() != plain
     before = adapted.fingerprint()

@@ -1,0 +1,100 @@
+"""Who drives, by name: data that any process can open a policy from.
+
+To add a policy: write its class, then add it to this table.
+"""
+
+import abc
+import hashlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import ClassVar, Protocol, runtime_checkable
+
+from me2e_compress.driving.contract import Policy
+from me2e_compress.errors import EvaluationError
+from me2e_compress.registry import Registry, name_in
+
+
+@runtime_checkable
+class SizedPolicy(Policy, Protocol):
+    """A policy that wants its images in a size of its own."""
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of each camera."""
+        ...
+
+
+@dataclass(frozen=True)
+class Driver(abc.ABC):
+    """What opens a policy: derive a frozen dataclass, its fields are options.
+
+    Class attributes:
+        name: What the command line and studies call it.
+    """
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def open(self) -> Policy:
+        """Return the policy, ready to be reset.
+
+        Raises:
+            EvaluationError: It cannot drive.
+        """
+
+    @property
+    def label(self) -> str:
+        """What tables and pictures call it."""
+        return POLICIES.text(self)
+
+    def fingerprint(self) -> str:
+        """Return what identifies the policy in results.
+
+        That is its text and digests of the files that its options name; where more
+        decides what it does, its own method says so.
+        """
+        values = (getattr(self, field.name) for field in fields(self))
+        files = [value for value in values if isinstance(value, Path)]
+        return "+".join([POLICIES.text(self), *map(_sha256, files)])
+
+
+_HIGHWAY = "me2e_compress.evaluators.highway.drivers"
+
+POLICIES: Registry[Driver] = Registry(
+    "policy",
+    "me2e_compress.policies",
+    EvaluationError,
+    {
+        "expert": f"{_HIGHWAY}:ExpertDriver",
+        "blind": f"{_HIGHWAY}:BlindDriver",
+        "onnx": f"{_HIGHWAY}:OnnxDriver",
+    },
+)
+
+MODEL = "onnx"
+"""The policy that a path means."""
+
+
+def driver_named(text: str, adapter: Path | None = None) -> Driver:
+    """Build the driver of a text: a policy with its options, or an ONNX file's path.
+
+    Args:
+        text: ``expert``, ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``, the name
+            of another package's policy, or else a path.
+        adapter: TOML file that adapts a model; a policy without models ignores it.
+
+    Raises:
+        EvaluationError: An option that the policy has not, or refuses.
+        MissingExtraError: The package that it needs is not installed.
+    """
+    if name_in(text) in POLICIES.names():
+        driver = POLICIES.parse(text)
+    else:
+        driver = POLICIES.build(MODEL, {"path": text})
+    if adapter is None or "adapter" not in type(driver).__dataclass_fields__:
+        return driver
+    return POLICIES.with_options(driver, {"adapter": adapter})
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
