@@ -1,6 +1,6 @@
 """The weights that ship, in closed loop; five CPU seconds."""
 
-from me2e_compress.evaluators.highway.drivers import Driver, image_size_of
+from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.runner import Conditions, drive
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Ending
@@ -14,7 +14,7 @@ def test_the_shipped_driver_passes_a_parked_car() -> None:
     So says benchmarks/driver/baselines/routes.csv.
     """
     (route,) = pick_routes(load_routes(), "ParkedObstacle_0")
-    policy = Driver(str(shipped("highway"))).open()
+    policy = OnnxDriver(shipped("highway")).open()
 
     episode = drive(route, policy, Conditions(image_size=image_size_of(policy)))
 
