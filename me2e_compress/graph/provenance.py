@@ -6,7 +6,7 @@ keeps metadata. The manager refuses a pass that loses it.
 
 import dataclasses
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import onnx_ir as ir
 
@@ -92,7 +92,7 @@ def missing(model: ir.Model) -> list[str]:
     """Name the nodes of the main graph that have lost their past."""
     return [
         node.name or node.op_type
-        for node in model.graph.all_nodes()
+        for node in _nodes_of(model.graph)
         if MODULE not in node.metadata_props or ORIGINS not in node.metadata_props
     ]
 
@@ -124,26 +124,38 @@ def foreign(before: ir.Model, after: ir.Model) -> list[str]:
     """
     if missing(before):
         return []
-    texts = {node.metadata_props[ORIGINS] for node in before.graph.all_nodes()}
-    names = {
-        name for node in before.graph.all_nodes() for name in _names(node, ORIGINS)
-    }
+    texts = {node.metadata_props[ORIGINS] for node in _nodes_of(before.graph)}
+    names = {name for node in _nodes_of(before.graph) for name in _names(node, ORIGINS)}
     return [
         node.name or node.op_type
-        for node in after.graph.all_nodes()
+        for node in _nodes_of(after.graph)
         if node.metadata_props[ORIGINS] not in texts
         and not names.issuperset(_names(node, ORIGINS))
     ]
 
 
 def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
-    known = {node.name: node for node in before.graph.all_nodes()}
+    known = {node.name: node for node in _nodes_of(before.graph)}
     return [
         node
-        for node in after.graph.all_nodes()
+        for node in _nodes_of(after.graph)
         if f'"{by}"' not in node.metadata_props.get(PASSES, "")
         and not _same(known.get(node.name), node)
     ]
+
+
+def _nodes_of(graph: ir.Graph) -> Iterator[ir.Node]:
+    """Walk all nodes, those of bodies too; few operators of ONNX have a body."""
+    for node in graph:
+        yield node
+        if node.domain in ("", "ai.onnx") and node.op_type not in _WITH_BODIES:
+            continue
+        for attribute in node.attributes.values():
+            if attribute.type == ir.AttributeType.GRAPH:
+                yield from _nodes_of(attribute.as_graph())
+            elif attribute.type == ir.AttributeType.GRAPHS:
+                for body in attribute.as_graphs():
+                    yield from _nodes_of(body)
 
 
 def _same(old: ir.Node | None, new: ir.Node) -> bool:
@@ -160,5 +172,6 @@ def _same(old: ir.Node | None, new: ir.Node) -> bool:
     )
 
 
+_WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
 _BODIES = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
 """Kinds of attributes whose nodes are looked at one by one."""
