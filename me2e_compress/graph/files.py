@@ -1,6 +1,7 @@
 """Read and write ONNX files: weights mapped, outputs atomic, sources untouched."""
 
 import hashlib
+import mmap
 import os
 import tempfile
 from collections.abc import Iterator
@@ -94,17 +95,33 @@ def file_bytes(path: Path) -> int:
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
     seal = hashlib.sha256()
-    files = [path]
-    model = onnx.load(path, load_external_data=False)
-    for tensor in model.graph.initializer:
-        for entry in tensor.external_data:
-            if entry.key == "location" and path.parent / entry.value not in files:
-                files.append(path.parent / entry.value)
+    files = [path, *_external_files(path)]
     for file in files:
         with file.open("rb") as stream:
             for block in iter(lambda: stream.read(1 << 22), b""):
                 seal.update(block)
     return seal.hexdigest()
+
+
+def _external_files(path: Path) -> list[Path]:
+    """List the data files that a model names, in the order of its weights."""
+    if path.stat().st_size == 0:
+        return []
+    with (
+        path.open("rb") as stream,
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
+    ):
+        # Parsing hundreds of MB takes as long as hashing them: look first.
+        if content.find(b"location") < 0:
+            return []
+    model = onnx.load(path, load_external_data=False)
+    found = [
+        path.parent / entry.value
+        for tensor in model.graph.initializer
+        for entry in tensor.external_data
+        if entry.key == "location"
+    ]
+    return list(dict.fromkeys(file for file in found if file != path))
 
 
 def _external(model: ir.Model) -> Iterator[ir.ExternalTensor]:
