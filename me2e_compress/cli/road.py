@@ -37,7 +37,7 @@ def on_routes(
     from me2e_compress.cli.commands.evaluate import routes_named
     from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
     from me2e_compress.evaluators.highway.engine import LocalEngine
-    from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
+    from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
     from me2e_compress.evaluators.highway.runner import Conditions
     from me2e_compress.evaluators.highway.worker import Job
     from me2e_compress.metrics.scores import score

@@ -6,7 +6,7 @@ from typing import Any
 
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine
-from me2e_compress.evaluators.highway.jobs import DrivingProgress, HighwayEvaluator
+from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.differences import PairedDifference, difference

@@ -12,7 +12,7 @@ from me2e_compress.metrics.scores import Scores
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.training import trial
 from me2e_compress.training.checkpoint import Start, fit
-from me2e_compress.training.curriculum import Course, Round, held_out_of
+from me2e_compress.training.curriculum import Course, Round, held_out_files
 from me2e_compress.training.episodes import Collection, collect
 from me2e_compress.training.log import Log
 from me2e_compress.training.loop import train
@@ -28,7 +28,7 @@ NO_LATENCY = FixedLatency()
 
 
 @dataclass(frozen=True)
-class News:
+class CourseProgress:
     """What a course is at.
 
     Attributes:
@@ -43,7 +43,7 @@ class News:
 
 
 @dataclass(frozen=True)
-class Trained:
+class RoundResult:
     """What came of a round.
 
     Attributes:
@@ -57,7 +57,7 @@ class Trained:
     log: Path
 
 
-Listener = Callable[[News], None]
+Listener = Callable[[CourseProgress], None]
 
 
 def run(
@@ -66,7 +66,7 @@ def run(
     workers: int,
     on_news: Listener = lambda news: None,
     latency: LatencySource = NO_LATENCY,
-) -> tuple[Trained, ...]:
+) -> tuple[RoundResult, ...]:
     """Go the whole way, or what is left of it after an interruption.
 
     The same course comes to the same bytes with as many workers, however often it was
@@ -111,12 +111,12 @@ class _Way:
         self.start: Path | None = None
         self.driver: Path | None = None
 
-    def go(self, number: int, each: Round) -> Trained:
+    def go(self, number: int, each: Round) -> RoundResult:
         """One round."""
         place, label = self.folder / f"round-{number}", f"round {number}"
         files = self._collect(each, place / "episodes", label)
         if number == 0:
-            self.held_out = held_out_of(files)
+            self.held_out = held_out_files(files)
         fresh = [file for file in files if file not in self.held_out]
         self.learned += fresh * each.repeat
         self.start, log = self._train(each, place, label)
@@ -126,7 +126,7 @@ class _Way:
         scores = self._try(self.driver, place / "trial", label)
         row = {"learned_frames": frames_in(self.learned), **trial.row_of(scores)}
         log.add("closed_loop", each.trainings[-1].steps, row)
-        return Trained(self.driver, scores, log.path)
+        return RoundResult(self.driver, scores, log.path)
 
     def _collect(self, each: Round, folder: Path, label: str) -> list[Path]:
         student = None if each.expert_share == 1.0 else self.driver
@@ -163,7 +163,7 @@ class _Way:
         return trial.drive(driver, routes, folder, self.workers, tell, self.latency)
 
     def _teller(self, what: str) -> Callable[[int, int], None]:
-        return lambda done, total: self.on_news(News(what, done, total))
+        return lambda done, total: self.on_news(CourseProgress(what, done, total))
 
 
 def load(checkpoint: Path, config: HighwayConfig) -> Highway:

@@ -1,11 +1,13 @@
-"""What a driver goes through: rounds of driving and learning."""
+"""Courses of training: rounds of driving and learning, in full and in small."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
+from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import TrainingError
+from me2e_compress.training.data import Sequences
 from me2e_compress.training.process import Training
 from me2e_compress.zoo.highway.config import HighwayConfig
 
@@ -97,7 +99,7 @@ class Course:
         return replace(self, rounds=rounds)
 
 
-def held_out_of(files: Sequence[Path]) -> list[Path]:
+def held_out_files(files: Sequence[Path]) -> list[Path]:
     """Those of the expert's episodes that are only looked at, at least one."""
     return list(files[HELD_OUT_FIRST::HELD_OUT_EVERY] or files[:1])
 
@@ -113,3 +115,29 @@ FULL = Course(
     )
 )
 """A straight way to a driver such as the one that ships; hours on four cores."""
+
+
+_FEW = ("ControlLoss", "DynamicObjectCrossing", "HighwayCutIn")
+_BRIEF = Training(
+    steps=4,
+    batch=1,
+    workers=2,
+    save_every=2,
+    check_every=2,
+    check_count=2,
+    sequences=Sequences(length=2),
+)
+_AGAIN = replace(_BRIEF, steps=2, seed=1)
+_BRIEF_PLANNER = replace(_BRIEF, steps=2, seed=2, modules=("planner",))
+SMALL = Course(
+    (
+        Round(100, 1, 1.0, (_BRIEF,), _FEW),
+        Round(200, 1, 0.8, (_AGAIN, _BRIEF_PLANNER), _FEW[2:], repeat=2),
+    ),
+    Trial(routes=2, scenarios=_FEW[:2]),
+    HighwayConfig(stages=(8, 8, 16, 16), anchors=16),
+)
+"""A minute on two cores. Who has learned nothing stands or creeps until the rules end
+the route, after 60 to 200 s: hence the expert drives most of the second round."""
+SMALL_LATENCY = FixedLatency(1_000_000)
+"""Of a decision in its trials, for the same reason: 200 are enough to get nowhere."""

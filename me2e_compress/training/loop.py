@@ -18,12 +18,12 @@ from me2e_compress.training.process import (
     Training,
     TrainingProcess,
 )
-from me2e_compress.training.together import Together
+from me2e_compress.training.process_group import ProcessGroup
 from me2e_compress.zoo.highway.config import HighwayConfig
 
 __all__ = ["Training", "train"]
 
-LOOK_S = 0.5
+POLL_S = 0.5
 """Between two looks at how far the processes are."""
 MAY_CHANGE = ("steps", "save_every", "check_every", "check_count")
 """Of a stage that goes on: the rest decides what its checkpoint means."""
@@ -70,21 +70,21 @@ def train(
     if last.exists() and _steps(last, what) >= what.steps:
         return last
     task = StageTask(what, config, tuple(files), tuple(held_out), start, folder)
-    together = Together.of(what.workers, config)
+    group = ProcessGroup.of(what.workers, config)
     try:
-        running = spawn(_process, (task, together), what.workers, join=False)
-        while running is not None and not running.join(LOOK_S):
-            on_step(together.told(), what.steps)
+        running = spawn(_process, (task, group), what.workers, join=False)
+        while running is not None and not running.join(POLL_S):
+            on_step(group.steps_done(), what.steps)
     except ProcessException as error:
         raise TrainingError(f"{folder}: training failed: {_told(error)}") from error
     on_step(what.steps, what.steps)
     return last
 
 
-def _process(rank: int, task: StageTask, together: Together) -> None:
+def _process(rank: int, task: StageTask, group: ProcessGroup) -> None:
     end_with_parent()
     torch.set_num_threads(1)
-    TrainingProcess(rank, together, task).run()
+    TrainingProcess(rank, group, task).run()
 
 
 def _told(error: ProcessException) -> str:

@@ -14,13 +14,13 @@ from torch import Tensor
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.training.checkpoint import Start, TrainingCheckpoint, fit
 from me2e_compress.training.data import Episodes, Sequences
-from me2e_compress.training.descent import Descent, Mean
 from me2e_compress.training.frenet import anchors_of
-from me2e_compress.training.lessons import Lessons
 from me2e_compress.training.log import Log
 from me2e_compress.training.losses import LampHead
+from me2e_compress.training.optimizer import AveragedAdamW, WeightAverage
+from me2e_compress.training.process_group import ProcessGroup
+from me2e_compress.training.sampled_losses import SampledLosses
 from me2e_compress.training.step import Augmentation, total
-from me2e_compress.training.together import Together
 from me2e_compress.training.validation import validate
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.stack import Highway
@@ -92,18 +92,18 @@ class StageTask:
 class TrainingProcess:
     """What one process holds while it trains."""
 
-    def __init__(self, rank: int, together: Together, task: StageTask) -> None:
+    def __init__(self, rank: int, group: ProcessGroup, task: StageTask) -> None:
         """Read the episodes and begin, or go on where the checkpoint is.
 
         Args:
             rank: of this process; the first one checks, saves and logs.
-            together: all processes.
+            group: all processes.
             task: the same in every process.
 
         Raises:
             TrainingError: a file is not what it should be.
         """
-        self.rank, self.together, self.task = rank, together, task
+        self.rank, self.group, self.task = rank, group, task
         what, size = task.what, task.config.image_size
         torch.manual_seed(what.seed)
         self.model, self.lamps = Highway(task.config), LampHead(task.config.channels)
@@ -111,18 +111,18 @@ class TrainingProcess:
         episodes = Episodes([file for file in task.files if file in mine], size)
         self.held_out = Episodes(task.held_out, size) if rank == 0 else None
         self.lidar2img = torch.from_numpy(CameraRig(*size).lidar2img)
-        self.lessons = Lessons(
+        self.sampled = SampledLosses(
             episodes, self.lidar2img, what.batch, what.sequences, what.augmentation
         )
         self._begin(episodes)
         # torch's stubs leave this form of `to` out
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.descent = Descent(self._learning(), what.rate, together)
-        self.mean, self.step = Mean(self.model), 0
+        self.optimizer = AveragedAdamW(self._learning(), what.rate, group)
+        self.average, self.step = WeightAverage(self.model), 0
         self.log, self.running = Log(task.folder / LOG), dict[str, float]()
         self._resume()
         if what.modules == PLANNER_ALONE and self.step < what.steps:
-            self.lessons.freeze(self.model)
+            self.sampled.freeze(self.model)
         self.begun = time.monotonic() - self._spent_s()
 
     def _begin(self, episodes: Episodes) -> None:
@@ -135,7 +135,7 @@ class TrainingProcess:
         mine = torch.zeros_like(anchors)
         if self.rank == 0:
             mine = torch.from_numpy(anchors_of(episodes.departures(), len(anchors)))
-        everybody = self.together.mean(self.rank, mine.flatten())
+        everybody = self.group.average(self.rank, mine.flatten())
         anchors.copy_(everybody.view_as(anchors) * self.task.what.workers)
 
     def _learning(self) -> list[torch.nn.Parameter]:
@@ -152,8 +152,8 @@ class TrainingProcess:
             fit(self.model, found.mean, path)
             fit(self.model, found.model, path)
             fit(self.lamps, found.lamps, path)
-            self.descent.optimizer.load_state_dict(found.optimizer)
-            self.mean.weights, self.step = dict(found.mean), found.step
+            self.optimizer.adamw.load_state_dict(found.optimizer)
+            self.average.weights, self.step = dict(found.mean), found.step
         if self.rank == 0:
             self.log.rewind(self.step)
 
@@ -167,11 +167,11 @@ class TrainingProcess:
         what = self.task.what
         while self.step < what.steps:
             rng = np.random.default_rng([what.seed, self.step, self.rank])
-            losses = self.lessons.losses(self.model, self.lamps, rng)
-            self.descent.step(total(losses), rate_at(what, self.step), self.rank)
+            losses = self.sampled.draw(self.model, self.lamps, rng)
+            self.optimizer.step(total(losses), rate_at(what, self.step), self.rank)
             self._note(losses)
             if self.rank == 0:
-                self.mean.follow(self.model, self.step)
+                self.average.update(self.model, self.step)
             self.step += 1
             last = self.step == what.steps
             if self.step % what.check_every == 0 or last:
@@ -179,7 +179,7 @@ class TrainingProcess:
             if self.step % what.save_every == 0 or last:
                 self._save()
             if self.rank == 0:
-                self.together.tell(self.step)
+                self.group.report(self.step)
 
     def _note(self, losses: Mapping[str, Tensor]) -> None:
         for name, loss in losses.items():
@@ -192,7 +192,7 @@ class TrainingProcess:
         if self.held_out is None:
             return
         mine = {k: v.clone() for k, v in self.model.state_dict().items()}
-        self.model.load_state_dict(self.mean.weights)
+        self.model.load_state_dict(self.average.weights)
         self.model.eval()
         count = self.task.what.check_count
         found = validate(
@@ -210,9 +210,9 @@ class TrainingProcess:
         if self.rank == 0:
             TrainingCheckpoint(
                 self.model.state_dict(),
-                self.mean.weights,
+                self.average.weights,
                 self.lamps.state_dict(),
-                self.descent.optimizer.state_dict(),
+                self.optimizer.adamw.state_dict(),
                 self.step,
                 json.dumps(asdict(self.task.what)),
             ).save(self.task.folder / CHECKPOINT)

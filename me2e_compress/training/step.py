@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from me2e_compress.training.labels import Targets, targets_of
+from me2e_compress.training.label_tensors import Labels, labels_of
 from me2e_compress.training.losses import (
     LampHead,
     map_losses,
@@ -16,7 +16,7 @@ from me2e_compress.training.losses import (
     plan_losses,
     track_losses,
 )
-from me2e_compress.training.losses.tracking_loss import match
+from me2e_compress.training.losses.detection_losses import match
 from me2e_compress.training.stored_episode import Array
 from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of
 from me2e_compress.zoo.highway.interfaces import Candidates, EgoState, PlannerInput
@@ -68,7 +68,7 @@ class Augmentation:
     no_occ: float = 0.2
 
 
-NONE = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0)
+NO_AUGMENTATION = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass
@@ -87,7 +87,7 @@ class StepOutcome:
     seen: Seen
     world: PlannerInput
     candidates: Candidates
-    wanted: Targets
+    wanted: Labels
 
 
 def run_planner(
@@ -106,7 +106,7 @@ def run_planner(
         rng: for the augmentation.
         how: what to make harder.
     """
-    wanted = targets_of(batch, model.config.area)
+    wanted = labels_of(batch, model.config.area)
     with torch.autocast("cpu", torch.bfloat16):
         ego = _ego(batch, rng, how)
         damaged = _without_occ(world, rng, how)
@@ -140,7 +140,7 @@ def run(
         how: what to make harder.
     """
     flat = {name: rows.reshape(-1, *rows.shape[2:]) for name, rows in batch.items()}
-    wanted = targets_of(flat, model.config.area)
+    wanted = labels_of(flat, model.config.area)
     count = len(wanted.command)
     calibration = lidar2img.expand(count, -1, -1, -1)
     with torch.autocast("cpu", torch.bfloat16):
@@ -206,7 +206,7 @@ def remember(model: Highway, now: Tensor, batch: dict[str, Array]) -> Tensor:
 
 
 def _hints(
-    wanted: Targets, cells: int, rng: np.random.Generator, how: Augmentation
+    wanted: Labels, cells: int, rng: np.random.Generator, how: Augmentation
 ) -> Tensor | None:
     if not how.hints:
         return None

@@ -8,8 +8,8 @@ from me2e_compress.driving.latency import LatencySource
 from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.generate import generate
-from me2e_compress.evaluators.highway.jobs import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.measure import Estimate
@@ -23,11 +23,11 @@ from me2e_compress.simulator.routes import (
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.training.curriculum import Trial
 
-Told = Callable[[int, int], None]
+OnDone = Callable[[int, int], None]
 
 
 def routes_of(
-    what: Trial, path: Path, workers: int, on_done: Told
+    what: Trial, path: Path, workers: int, on_done: OnDone
 ) -> tuple[Route, ...]:
     """The routes of a trial, from its file once they are found.
 
@@ -67,7 +67,7 @@ def drive(
     routes: tuple[Route, ...],
     folder: Path,
     workers: int,
-    on_done: Told,
+    on_done: OnDone,
     latency: LatencySource,
 ) -> Scores:
     """Drive a trial, or what is left of it.

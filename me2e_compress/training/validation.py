@@ -6,8 +6,8 @@ from torch import Tensor
 
 from me2e_compress.training.data import DECISIVE_M, Episodes, Sequences
 from me2e_compress.training.losses import LampHead
-from me2e_compress.training.losses.planning_loss import displacement
-from me2e_compress.training.step import NONE, run
+from me2e_compress.training.losses.planning_losses import displacement
+from me2e_compress.training.step import NO_AUGMENTATION, run
 from me2e_compress.zoo.highway.stack import Highway
 
 
@@ -38,7 +38,15 @@ def validate(
         picked = episodes.draw(rng, batch, Sequences())
         images = episodes.images(picked.ravel())
         images = images.reshape(*picked.shape, *images.shape[1:])
-        out = run(model, lamps, images, episodes.batch(picked), lidar2img, rng, NONE)
+        out = run(
+            model,
+            lamps,
+            images,
+            episodes.batch(picked),
+            lidar2img,
+            rng,
+            NO_AUGMENTATION,
+        )
         for name, loss in out.losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss)
         rows.append(displacement(out.candidates.best(), out.wanted))

@@ -96,7 +96,7 @@ def build(
         )
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
-    from me2e_compress.zoo.vad.build import build as build_vad
+    from me2e_compress.zoo.vad.initialise import build as build_vad
 
     native = opset >= GRID_SAMPLE_OPSET
     return build_vad(

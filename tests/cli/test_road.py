@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.evaluators.highway.jobs import HighwayEvaluator
+from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import save_routes
 from tests.cli.conftest import Command, strict, write_frames

@@ -5,8 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from me2e_compress.training.course import run
-from me2e_compress.training.curriculum import Course, Round
-from me2e_compress.training.small import LATENCY, SMALL
+from me2e_compress.training.curriculum import SMALL, SMALL_LATENCY, Course, Round
 
 WORKERS = 2
 
@@ -23,4 +22,4 @@ def course_of(rounds: int) -> Course:
 
 if __name__ == "__main__":
     course = course_of(int(sys.argv[2]))
-    run(course, Path(sys.argv[1]), WORKERS, latency=LATENCY)
+    run(course, Path(sys.argv[1]), WORKERS, latency=SMALL_LATENCY)

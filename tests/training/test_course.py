@@ -17,18 +17,19 @@ from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.simulator.routes import load_routes
 from me2e_compress.training.checkpoint import TrainingCheckpoint
-from me2e_compress.training.course import News, claim, frames_in, run
+from me2e_compress.training.course import CourseProgress, claim, frames_in, run
 from me2e_compress.training.curriculum import (
     FULL,
+    SMALL,
+    SMALL_LATENCY,
     Course,
     Round,
     Trial,
-    held_out_of,
+    held_out_files,
 )
 from me2e_compress.training.episodes.collection import Collection, tasks_of
 from me2e_compress.training.log import Log
 from me2e_compress.training.process import Training
-from me2e_compress.training.small import LATENCY, SMALL
 from tests.training.made import arrays_of, write
 from tests.training.small import WORKERS
 
@@ -69,7 +70,7 @@ def test_the_log_tells_how_much_was_learned_from(small: Path) -> None:
         for number in range(2)
         for file in (small / f"round-{number}" / "episodes").glob("*.npz")
     ]
-    held_out = held_out_of(sorted((small / "round-0" / "episodes").glob("*.npz")))
+    held_out = held_out_files(sorted((small / "round-0" / "episodes").glob("*.npz")))
     assert rows[1]["learned_frames"] == frames_in(files) - frames_in(held_out)
 
 
@@ -107,8 +108,8 @@ def test_a_finished_course_is_not_gone_again(small: Path) -> None:
             if file.is_file() and file.name != "log.jsonl"
         }
 
-    before, news = times(), list[News]()
-    rounds = run(SMALL, small, WORKERS, news.append, LATENCY)
+    before, news = times(), list[CourseProgress]()
+    rounds = run(SMALL, small, WORKERS, news.append, SMALL_LATENCY)
     assert [each.driver.parent.name for each in rounds] == ["round-0", "round-1"]
     assert times() == before
     assert all(each.done == each.total for each in news if "training" not in each.what)
@@ -261,5 +262,5 @@ def test_a_course_that_makes_no_sense(
 
 def test_few_episodes_leave_one_to_look_at() -> None:
     files = [Path(f"{number}.npz") for number in range(60)]
-    assert held_out_of(files[:3]) == [Path("0.npz")]
-    assert held_out_of(files) == [Path("7.npz"), Path("35.npz")]
+    assert held_out_files(files[:3]) == [Path("0.npz")]
+    assert held_out_files(files) == [Path("7.npz"), Path("35.npz")]

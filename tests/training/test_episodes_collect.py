@@ -23,8 +23,8 @@ from me2e_compress.training.episodes import (
     Collection,
     CollectionProgress,
     collect,
+    collecting,
     decode,
-    driving,
 )
 from me2e_compress.training.episodes import collection as room
 from tests.evaluators.highway.drivers import straight_on
@@ -149,7 +149,7 @@ def test_the_shipped_routes_are_such_proposals(monkeypatch: pytest.MonkeyPatch) 
 def test_what_is_too_short_is_not_driven_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, two_types: None
 ) -> None:
-    monkeypatch.setattr(driving, "SHORTEST_US", 10**12)
+    monkeypatch.setattr(collecting, "SHORTEST_US", 10**12)
     collect(tmp_path, WHAT, None, 1, nobody)
     heard = list[CollectionProgress]()
 

@@ -22,11 +22,13 @@ from me2e_compress.simulator.cameras import (
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.world import World
 from me2e_compress.training.episodes import GRID, Collection, decode
+from me2e_compress.training.episodes.collecting import episode_of
 from me2e_compress.training.episodes.collection import Task, tasks_of
-from me2e_compress.training.episodes.driving import episode_of
 from me2e_compress.training.episodes.episode_arrays import Arrays
-from me2e_compress.training.episodes.perturb import Perturbation
-from me2e_compress.training.episodes.recording_policy import RecordingPolicy
+from me2e_compress.training.episodes.recording_policy import (
+    Perturbation,
+    RecordingPolicy,
+)
 from tests.evaluators.highway.drivers import straight_on
 
 SIZE = (24, 40)
@@ -240,7 +242,7 @@ def test_what_is_driven_is_the_label_with_noise() -> None:
 
     for frame, answer in zip(policy.frames, policy.answers, strict=True):
         label = frame.decision.waypoints
-        assert np.array_equal(answer, noise.bent(label, frame.scene.time_us))
+        assert np.array_equal(answer, noise.apply(label, frame.scene.time_us))
     labels = [frame.decision.waypoints for frame in policy.frames]
     assert not np.array_equal(labels, policy.answers)
 

@@ -21,9 +21,8 @@ from me2e_compress.simulator.scene import (
 from me2e_compress.simulator.world import Phase
 from me2e_compress.training.episodes import GRID
 from me2e_compress.training.episodes.agents import agents
-from me2e_compress.training.episodes.episode_arrays import Arrays
+from me2e_compress.training.episodes.episode_arrays import Arrays, signals
 from me2e_compress.training.episodes.recording_policy import LabelledFrame
-from me2e_compress.training.episodes.signs import signals
 
 NORTH = Ego(100.0, 50.0, math.pi / 2, 8.0, 0.0, 0.0, 0.0, 0.0, 5.0, 2.0)
 """Looks north: 10 m ahead is (100, 60), 3 m to its left (97, 50)."""

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.training.frenet import anchors_of, project
 from me2e_compress.zoo.highway.bev_grid import route_points
-from me2e_compress.zoo.highway.candidates import along
+from me2e_compress.zoo.highway.planner import along
 
 POINTS = 25
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.simulator.cameras import PixelClass
-from me2e_compress.training.labels import raster_of, signals_of, targets_of
+from me2e_compress.training.label_tensors import labels_of, raster_of, signals_of
 from me2e_compress.zoo.highway.bev_grid import cell_centres
 from me2e_compress.zoo.highway.config import BevArea
 from tests.training.made import Arrays, arrays_of
@@ -67,14 +67,14 @@ def test_occupancy_is_unpacked_onto_its_grid() -> None:
     arrays, taken = batch(1), np.zeros((6, 64, 48), bool)
     taken[2, 27, 19] = True
     arrays["occupancy"] = np.packbits(taken.reshape(1, 6, -1), axis=-1)
-    found = targets_of(arrays, AREA).occupancy
+    found = labels_of(arrays, AREA).occupancy
     assert found.nonzero().tolist() == [[0, 2, 27, 19]]
 
 
 def test_steps_after_the_end_of_the_route_are_unknown() -> None:
     arrays = batch(2)
     arrays["known_steps"] = np.array([0, 4])
-    known = targets_of(arrays, AREA).occupancy_known
+    known = labels_of(arrays, AREA).occupancy_known
     assert known.int().tolist() == [[0] * 6, [1, 1, 1, 1, 0, 0]]
 
 
@@ -83,13 +83,13 @@ def test_steps_after_the_end_of_the_route_are_unknown() -> None:
 def test_an_agent_is_in_the_cell_whose_centre_is_nearest(x: float, y: float) -> None:
     arrays = batch(1)
     arrays["agents"][0, 0, 1:3] = x, y
-    cell = int(targets_of(arrays, AREA).cells[0, 0])
+    cell = int(labels_of(arrays, AREA).cells[0, 0])
     centre = cell_centres(AREA)[cell]
     assert (centre - torch.tensor([x, y])).abs().max() <= AREA.cell_m / 2 + 1e-4
 
 
 def test_travel_is_from_where_the_agent_is_now() -> None:
-    targets = targets_of(batch(), AREA)
+    targets = labels_of(batch(), AREA)
     assert targets.travel[0, 0, :, 0].tolist() == pytest.approx(
         [2.5, 5, 7.5, 10, 12.5, 15]
     )
@@ -99,13 +99,13 @@ def test_travel_is_from_where_the_agent_is_now() -> None:
 def test_travel_that_nobody_saw_is_unknown_and_zero() -> None:
     arrays = batch()
     arrays["futures"][0, 0, 3:] = np.nan
-    targets = targets_of(arrays, AREA)
+    targets = labels_of(arrays, AREA)
     assert targets.travel_known[0, 0].tolist() == [True] * 3 + [False] * 3
     assert targets.travel[0, 0, 3:].abs().max() == 0
 
 
 def test_places_without_an_agent_are_empty() -> None:
-    targets = targets_of(batch(), AREA)
+    targets = labels_of(batch(), AREA)
     assert targets.there[0].tolist() == [True, True] + [False] * 22
     assert not targets.travel_known[0, 2:].any()
 
@@ -113,12 +113,12 @@ def test_places_without_an_agent_are_empty() -> None:
 def test_more_free_road_than_three_lanes_is_as_good() -> None:
     arrays = batch()
     arrays["path_attributes"][0, 0] = (3.0, 30.0, 14.0, 20.0)
-    found = targets_of(arrays, AREA).attributes[0, 0]
+    found = labels_of(arrays, AREA).attributes[0, 0]
     assert found.tolist() == [3, 12, 12, 20]
 
 
 def test_recorded_arrays_stay_as_they_are() -> None:
     arrays = batch()
     before = {name: array.tobytes() for name, array in arrays.items()}
-    targets_of(arrays, AREA).attributes.zero_()
+    labels_of(arrays, AREA).attributes.zero_()
     assert {name: array.tobytes() for name, array in arrays.items()} == before

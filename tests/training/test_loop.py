@@ -12,12 +12,12 @@ import torch
 from me2e_compress.errors import TrainingError
 from me2e_compress.training.checkpoint import TrainingCheckpoint
 from me2e_compress.training.data import Sequences
-from me2e_compress.training.lessons import Lessons
 from me2e_compress.training.log import Log
 from me2e_compress.training.loop import train
 from me2e_compress.training.losses import LampHead
 from me2e_compress.training.process import StageTask, Training, TrainingProcess, rate_at
-from me2e_compress.training.together import Together
+from me2e_compress.training.process_group import ProcessGroup
+from me2e_compress.training.sampled_losses import SampledLosses
 from me2e_compress.zoo.highway.stack import Highway
 from tests.training.made import LITTLE, arrays_of, write
 
@@ -49,7 +49,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
 
 def stage(task: StageTask) -> TrainingProcess:
     """All of a stage in this process."""
-    return TrainingProcess(0, Together.of(1, task.config), task)
+    return TrainingProcess(0, ProcessGroup.of(1, task.config), task)
 
 
 @pytest.fixture
@@ -67,18 +67,18 @@ def weights(folder: Path) -> dict[str, bytes]:
 
 
 class Killed:
-    """Lessons that end with the process, in its fourth step."""
+    """Losses that end with the process, in its fourth step."""
 
-    def __init__(self, lessons: Lessons) -> None:
-        self.lessons, self.asked = lessons, 0
+    def __init__(self, sampled: SampledLosses) -> None:
+        self.sampled, self.asked = sampled, 0
 
-    def losses(
+    def draw(
         self, model: Highway, lamps: LampHead, rng: np.random.Generator
     ) -> dict[str, torch.Tensor]:
         self.asked += 1
         if self.asked == 4:
             raise KeyboardInterrupt
-        return self.lessons.losses(model, lamps, rng)
+        return self.sampled.draw(model, lamps, rng)
 
 
 def test_an_interrupted_stage_comes_to_the_same_weights(
@@ -91,7 +91,7 @@ def test_an_interrupted_stage_comes_to_the_same_weights(
     stage(whole).run()
 
     first = stage(broken)
-    first.lessons = Killed(first.lessons)  # type: ignore[assignment]
+    first.sampled = Killed(first.sampled)  # type: ignore[assignment]
     with pytest.raises(KeyboardInterrupt):
         first.run()
     assert TrainingCheckpoint.load(broken.folder / "last.pt").step == 2
@@ -173,7 +173,7 @@ def test_a_finished_stage_is_not_begun_again(
     task: StageTask, files: tuple[Path, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage(task).run()
-    monkeypatch.setattr(Together, "of", None)  # nobody is started
+    monkeypatch.setattr(ProcessGroup, "of", None)  # nobody is started
     found = train(WHAT, LITTLE, files[1:], files[:1], None, task.folder)
     assert found == task.folder / "last.pt"
 

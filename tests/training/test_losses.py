@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.training.labels import Targets, targets_of
+from me2e_compress.training.label_tensors import Labels, labels_of
 from me2e_compress.training.losses import (
     LampHead,
     map_losses,
@@ -17,9 +17,12 @@ from me2e_compress.training.losses import (
     plan_losses,
     track_losses,
 )
-from me2e_compress.training.losses.focal import focal
-from me2e_compress.training.losses.planning_loss import displacement, doomed, true_harm
-from me2e_compress.training.losses.tracking_loss import match
+from me2e_compress.training.losses.detection_losses import focal_loss, match
+from me2e_compress.training.losses.planning_losses import (
+    displacement,
+    doomed,
+    true_harm,
+)
 from me2e_compress.zoo.highway.config import BevArea
 from me2e_compress.zoo.highway.interfaces import Candidates
 from me2e_compress.zoo.highway.map import GAP_SCALE_M, RoadMap
@@ -33,19 +36,19 @@ SURE = 25.0
 
 
 @pytest.fixture
-def wanted() -> Targets:
+def wanted() -> Labels:
     arrays = arrays_of(2, size=(16, 24))
     arrays["ground"][:] = 3  # road everywhere
     arrays["occupancy"][:] = 0
     arrays["signals"][:, 0, 1] = 2  # green
-    return targets_of({**arrays, "moves": arrays["plan"], "shift_m": np.ones(2)}, AREA)
+    return labels_of({**arrays, "moves": arrays["plan"], "shift_m": np.ones(2)}, AREA)
 
 
 def logits(where: Tensor) -> Tensor:
     return torch.where(where > 0, SURE, -SURE)
 
 
-def perfect_road(wanted: Targets) -> RoadMap:
+def perfect_road(wanted: Labels) -> RoadMap:
     def of_command(rows: Tensor) -> Tensor:
         routes = torch.full((len(rows), 6, *rows.shape[1:]), 99.0)
         routes[torch.arange(len(rows)), wanted.command] = rows
@@ -69,7 +72,7 @@ def perfect_road(wanted: Targets) -> RoadMap:
     )
 
 
-def perfect_tracks(wanted: Targets) -> Tracks:
+def perfect_tracks(wanted: Labels) -> Tracks:
     """The first queries are the agents, the rest is nobody."""
     order = [1, 2, 5, 6, 3, 4, 7, 8]
     boxes = wanted.agents[..., order].clone()
@@ -89,13 +92,13 @@ def perfect_tracks(wanted: Targets) -> Tracks:
     )
 
 
-def perfect_futures(wanted: Targets) -> Futures:
+def perfect_futures(wanted: Labels) -> Futures:
     travel = torch.stack([wanted.travel, wanted.travel + 50], 2)
     modes = torch.tensor([SURE, -SURE]).expand(2, 24, 2)
     return Futures(torch.zeros(2, 24, 64), travel, modes)
 
 
-def candidates(wanted: Targets, away_m: float = 3.0) -> Candidates:
+def candidates(wanted: Labels, away_m: float = 3.0) -> Candidates:
     """The expert's plan, and one that falls short of it."""
     short = torch.tensor([0.0, -away_m])[:, None, None] * torch.tensor([1.0, 0.0])
     moves = wanted.moves[:, None] + short
@@ -109,7 +112,7 @@ def candidates(wanted: Targets, away_m: float = 3.0) -> Candidates:
     )
 
 
-def test_a_perfect_map_costs_nothing(wanted: Targets) -> None:
+def test_a_perfect_map_costs_nothing(wanted: Labels) -> None:
     losses = map_losses(perfect_road(wanted), wanted)
     assert {name: float(loss) for name, loss in losses.items()} == pytest.approx(
         dict.fromkeys(losses, 0.0), abs=1e-5
@@ -129,26 +132,26 @@ def test_a_perfect_map_costs_nothing(wanted: Targets) -> None:
     ],
 )
 def test_a_wrong_map_costs_where_it_is_wrong(
-    wanted: Targets, field: str, shift: float, loss: str
+    wanted: Labels, field: str, shift: float, loss: str
 ) -> None:
     road = perfect_road(wanted)
     wrong = replace(road, **{field: getattr(road, field) + shift})
     assert map_losses(wrong, wanted)[loss] > 0.05
 
 
-def test_a_light_of_another_colour_costs(wanted: Targets) -> None:
+def test_a_light_of_another_colour_costs(wanted: Labels) -> None:
     road = perfect_road(wanted)
     road.signals[:, 0, 2:] = torch.tensor([SURE, -SURE, -SURE])
     assert map_losses(road, wanted)["colour"] > 1
 
 
-def test_routes_of_other_commands_do_not_matter(wanted: Targets) -> None:
+def test_routes_of_other_commands_do_not_matter(wanted: Labels) -> None:
     road = perfect_road(wanted)
     road.paths[:, 0] += 5
     assert map_losses(road, wanted)["path"] == pytest.approx(0, abs=1e-5)
 
 
-def test_perfect_tracks_cost_nothing(wanted: Targets) -> None:
+def test_perfect_tracks_cost_nothing(wanted: Labels) -> None:
     tracks = perfect_tracks(wanted)
     owner, mine = match(tracks, wanted)
     losses = track_losses(tracks, wanted, AREA, owner, mine)
@@ -157,7 +160,7 @@ def test_perfect_tracks_cost_nothing(wanted: Targets) -> None:
     )
 
 
-def test_every_agent_gets_the_nearest_query(wanted: Targets) -> None:
+def test_every_agent_gets_the_nearest_query(wanted: Labels) -> None:
     tracks = perfect_tracks(wanted)
     shuffled = torch.randperm(24, generator=torch.Generator().manual_seed(0))
     tracks.boxes = tracks.boxes[:, shuffled]
@@ -166,7 +169,7 @@ def test_every_agent_gets_the_nearest_query(wanted: Targets) -> None:
     assert found == {0: 0, 1: 1}
 
 
-def test_a_query_far_from_everybody_is_nobodys(wanted: Targets) -> None:
+def test_a_query_far_from_everybody_is_nobodys(wanted: Labels) -> None:
     tracks = perfect_tracks(wanted)
     tracks.boxes[0, 0, 0] += 4.5
     _, mine = match(tracks, wanted)
@@ -181,23 +184,21 @@ def test_a_query_far_from_everybody_is_nobodys(wanted: Targets) -> None:
         ("boxes", 1.0, "box"),
     ],
 )
-def test_wrong_tracks_cost(
-    wanted: Targets, field: str, shift: float, loss: str
-) -> None:
+def test_wrong_tracks_cost(wanted: Labels, field: str, shift: float, loss: str) -> None:
     tracks = perfect_tracks(wanted)
     owner, mine = match(tracks, wanted)
     wrong = replace(tracks, **{field: getattr(tracks, field) + shift})
     assert track_losses(wrong, wanted, AREA, owner, mine)[loss] > 0.2
 
 
-def test_perfect_futures_cost_nothing(wanted: Targets) -> None:
+def test_perfect_futures_cost_nothing(wanted: Labels) -> None:
     owner, mine = match(perfect_tracks(wanted), wanted)
     losses = motion_losses(perfect_futures(wanted), wanted, owner, mine)
     assert losses["travel"] == pytest.approx(0, abs=1e-6)
     assert losses["mode"] == pytest.approx(0, abs=1e-6)
 
 
-def test_only_the_best_mode_must_be_right(wanted: Targets) -> None:
+def test_only_the_best_mode_must_be_right(wanted: Labels) -> None:
     owner, mine = match(perfect_tracks(wanted), wanted)
     futures = perfect_futures(wanted)
     futures.logits = -futures.logits
@@ -206,7 +207,7 @@ def test_only_the_best_mode_must_be_right(wanted: Targets) -> None:
     assert losses["mode"] > 1
 
 
-def test_unknown_futures_cost_nothing(wanted: Targets) -> None:
+def test_unknown_futures_cost_nothing(wanted: Labels) -> None:
     owner, mine = match(perfect_tracks(wanted), wanted)
     wanted.travel_known[:] = False
     futures = perfect_futures(wanted)
@@ -214,58 +215,58 @@ def test_unknown_futures_cost_nothing(wanted: Targets) -> None:
     assert motion_losses(futures, wanted, owner, mine)["travel"] == 0
 
 
-def test_perfect_occupancy_costs_nothing(wanted: Targets) -> None:
+def test_perfect_occupancy_costs_nothing(wanted: Labels) -> None:
     assert occ_losses(logits(wanted.occupancy), wanted)["occ"] < 1e-6
 
 
-def test_occupancy_of_unknown_steps_costs_nothing(wanted: Targets) -> None:
+def test_occupancy_of_unknown_steps_costs_nothing(wanted: Labels) -> None:
     wanted.occupancy_known[:] = False
     assert occ_losses(torch.zeros(wanted.occupancy.shape), wanted)["occ"] == 0
 
 
-def test_the_right_plan_costs_nothing(wanted: Targets) -> None:
+def test_the_right_plan_costs_nothing(wanted: Labels) -> None:
     losses = plan_losses(candidates(wanted), wanted, AREA)
     assert {name: float(loss) for name, loss in losses.items()} == pytest.approx(
         dict.fromkeys(losses, 0.0), abs=1e-4
     )
 
 
-def test_the_wrong_choice_costs(wanted: Targets) -> None:
+def test_the_wrong_choice_costs(wanted: Labels) -> None:
     chosen = candidates(wanted)
     chosen.logits = -chosen.logits
     assert plan_losses(chosen, wanted, AREA)["choice"] > 1
 
 
-def test_choosing_a_crash_costs(wanted: Targets) -> None:
+def test_choosing_a_crash_costs(wanted: Labels) -> None:
     chosen = candidates(wanted, away_m=-18.0)  # into the car 20 m ahead
     chosen.logits = -chosen.logits
     assert plan_losses(chosen, wanted, AREA)["safe"] > 0.3
 
 
-def test_harm_is_what_really_was_there(wanted: Targets) -> None:
+def test_harm_is_what_really_was_there(wanted: Labels) -> None:
     harm = true_harm(candidates(wanted, away_m=-18.0), wanted, AREA)
     assert harm[0].tolist() == pytest.approx([0, 1], abs=0.1)
 
 
-def test_a_plan_into_the_car_ahead_is_no_example(wanted: Targets) -> None:
+def test_a_plan_into_the_car_ahead_is_no_example(wanted: Labels) -> None:
     assert doomed(wanted).tolist() == [False, False]
     ahead = wanted.plan[0] + torch.tensor([18.0, 0.0])  # into the car 20 m ahead
     into = replace(wanted, plan=torch.stack([ahead, wanted.plan[1]]))
     assert doomed(into).tolist() == [True, False]
 
 
-def test_a_red_light_is_harm_beyond_its_line(wanted: Targets) -> None:
+def test_a_red_light_is_harm_beyond_its_line(wanted: Labels) -> None:
     wanted.signals[:, 0] = torch.tensor([1.0, 10.0, 0.0])
     harm = true_harm(candidates(wanted, away_m=12.0), wanted, AREA)
     assert harm[0].tolist() == pytest.approx([1, 0], abs=0.1)
 
 
-def test_ground_that_is_no_road_is_harm(wanted: Targets) -> None:
+def test_ground_that_is_no_road_is_harm(wanted: Labels) -> None:
     wanted.raster[:] = 0
     assert (true_harm(candidates(wanted), wanted, AREA) >= 1).all()
 
 
-def test_displacement_is_in_metres(wanted: Targets) -> None:
+def test_displacement_is_in_metres(wanted: Labels) -> None:
     away = displacement(wanted.plan + torch.tensor([3.0, 4.0]), wanted)
     assert away.tolist() == pytest.approx([5, 5])
 
@@ -281,7 +282,7 @@ class Fixed(nn.Module):
         return self.said
 
 
-def lamp_loss(wanted: Targets, said: Tensor) -> Tensor:
+def lamp_loss(wanted: Labels, said: Tensor) -> Tensor:
     head = LampHead(4)
     head.head = Fixed(said)  # type: ignore[assignment]
     lidar2img = torch.from_numpy(CameraRig(96, 160).lidar2img).expand(2, -1, -1, -1)
@@ -289,7 +290,7 @@ def lamp_loss(wanted: Targets, said: Tensor) -> Tensor:
     return found
 
 
-def test_the_lamp_is_where_the_camera_sees_it(wanted: Targets) -> None:
+def test_the_lamp_is_where_the_camera_sees_it(wanted: Labels) -> None:
     nothing = torch.full((12, 5, 24, 40), -SURE)
     right = list[tuple[int, ...]]()
     for cell in np.ndindex(24, 40):
@@ -303,7 +304,7 @@ def test_the_lamp_is_where_the_camera_sees_it(wanted: Targets) -> None:
     assert 14 < column < 20
 
 
-def test_a_lamp_seen_from_behind_shows_nothing(wanted: Targets) -> None:
+def test_a_lamp_seen_from_behind_shows_nothing(wanted: Labels) -> None:
     nothing = torch.full((12, 5, 24, 40), -SURE)
     assert lamp_loss(wanted, nothing) > 1
     wanted.lamps[..., 4] = -1
@@ -311,7 +312,7 @@ def test_a_lamp_seen_from_behind_shows_nothing(wanted: Targets) -> None:
 
 
 def test_focal_loss_by_hand() -> None:
-    found = focal(
+    found = focal_loss(
         torch.tensor([0.0, 0.0, 0.0]),
         torch.tensor([1.0, 0.0, 0.0]),
         torch.tensor([1.0, 0.5, 0.0]),

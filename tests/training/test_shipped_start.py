@@ -14,7 +14,7 @@ from me2e_compress.training.course import load
 from me2e_compress.training.data import Sequences
 from me2e_compress.training.losses import LampHead
 from me2e_compress.training.process import StageTask, Training, TrainingProcess
-from me2e_compress.training.together import Together
+from me2e_compress.training.process_group import ProcessGroup
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.stack import Highway
 from me2e_compress.zoo.shipped import checkpoint, shipped
@@ -47,7 +47,7 @@ def test_a_step_goes_on_from_it(tmp_path: Path) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        TrainingProcess(0, Together.of(1, config), task).run()
+        TrainingProcess(0, ProcessGroup.of(1, config), task).run()
     finally:
         torch.set_num_threads(threads)
     before, after = Start.load(start), TrainingCheckpoint.load(task.folder / "last.pt")

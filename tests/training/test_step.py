@@ -8,12 +8,12 @@ import torch
 from torch import nn
 
 from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.training.cache import Cache
 from me2e_compress.training.data import Episodes, Sequences
 from me2e_compress.training.losses import LampHead
+from me2e_compress.training.sampled_losses import PlannerInputCache
 from me2e_compress.training.step import (
     MEAN,
-    NONE,
+    NO_AUGMENTATION,
     STD,
     WEIGHTS,
     Augmentation,
@@ -117,7 +117,7 @@ def test_only_what_cannot_learn_is_idle(stepped: StepOutcome, model: Highway) ->
 def test_the_plan_does_not_bend_the_map(
     model: Highway, lamps: LampHead, episodes: Episodes, module: str, learns: bool
 ) -> None:
-    found = outcome(model, lamps, episodes, NONE, 1)
+    found = outcome(model, lamps, episodes, NO_AUGMENTATION, 1)
     model.zero_grad()
     total({name: found.losses[name] for name in PLAN}).backward()
     assert (gradients(model.get_submodule(module)) > 0) is learns
@@ -133,7 +133,7 @@ def test_the_same_seed_gives_the_same_losses(
 
 def test_without_augmentation_pixels_are_those_of_the_contract() -> None:
     images = np.random.default_rng(0).integers(0, 256, (1, 1, 6, 4, 5, 3), np.uint8)
-    found = pixels_of(images, np.random.default_rng(0), NONE)[0].numpy()
+    found = pixels_of(images, np.random.default_rng(0), NO_AUGMENTATION)[0].numpy()
     mean, std = np.array(HIGHWAY.image.mean), np.array(HIGHWAY.image.std)
     wanted = (images[0, 0] - mean) / std
     assert found == pytest.approx(wanted.transpose(0, 3, 1, 2), abs=1e-6)
@@ -141,7 +141,7 @@ def test_without_augmentation_pixels_are_those_of_the_contract() -> None:
 
 def test_light_changes_every_camera_for_itself() -> None:
     images = np.full((1, 1, 6, 4, 5, 3), 200, np.uint8)
-    how = replace(NONE, light=0.12)
+    how = replace(NO_AUGMENTATION, light=0.12)
     found = pixels_of(images, np.random.default_rng(0), how)[0]
     levels = found.flatten(1).unique(dim=1)
     assert levels.shape == (6, 1)
@@ -153,15 +153,17 @@ def test_the_planner_alone_reads_what_the_others_said(
     model: Highway, lamps: LampHead, episodes: Episodes
 ) -> None:
     model.eval()
-    cache = Cache.of(model, episodes, LIDAR2IMG)
+    cache = PlannerInputCache.of(model, episodes, LIDAR2IMG)
     picked = np.arange(len(episodes))
     rows = episodes.rows(picked)
     rng = np.random.default_rng(0)
     with torch.no_grad():
-        found = run_planner(model, cache.world(picked), rows, rng, NONE)
+        found = run_planner(model, cache.world(picked), rows, rng, NO_AUGMENTATION)
         images = episodes.images(picked)[None]
         batch = episodes.batch(picked[None])
-        wanted = run(model, lamps, images, batch, LIDAR2IMG, rng, NONE).losses
+        wanted = run(
+            model, lamps, images, batch, LIDAR2IMG, rng, NO_AUGMENTATION
+        ).losses
     assert {k: float(v) for k, v in found.items()} == pytest.approx(
         {k: float(wanted[k]) for k in PLAN}, rel=0.05, abs=0.02
     )
@@ -175,7 +177,7 @@ def test_the_driver_remembers_as_it_learned_to(
     encoder, picked = model.eval().bev_encoder, np.arange(len(episodes))
     batch = episodes.batch(picked[None])
     rng = np.random.default_rng(0)
-    fine, _ = model.look(pixels_of(episodes.images(picked)[None], rng, NONE))
+    fine, _ = model.look(pixels_of(episodes.images(picked)[None], rng, NO_AUGMENTATION))
     calibration = LIDAR2IMG.expand(len(picked), -1, -1, -1)
     wanted = encoder.fuse(remember(model, encoder.look(fine, calibration), batch))
     memory = torch.zeros(1, encoder.area.cells, LITTLE.channels + RECORD)

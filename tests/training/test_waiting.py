@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from me2e_compress.training.waiting import BRAKE_MPS2, creeps, stopping
+from me2e_compress.training.data import BRAKE_MPS2, is_creeping, shortened_to_stop
 from me2e_compress.zoo.highway.config import STEP_S
 
 TIMES = STEP_S * np.arange(1, 7)
@@ -34,7 +34,9 @@ def _tables(speed_mps: float, command: int) -> dict[str, np.ndarray]:
 def test_only_waiting_in_a_junction_is_creeping(
     now_mps: float, plan_mps: float, alone_mps: float, command: int, expected: bool
 ) -> None:
-    found = creeps(_rolling(plan_mps), _tables(now_mps, command), _rolling(alone_mps))
+    found = is_creeping(
+        _rolling(plan_mps), _tables(now_mps, command), _rolling(alone_mps)
+    )
     assert found.tolist() == [expected]
 
 
@@ -44,7 +46,7 @@ def test_a_stop_brakes_comfortably_and_stays() -> None:
     turn = rng.uniform(-0.5, 0.5, 20)
     way = speed[:, None, None] * TIMES[:, None]
     plans = way * np.stack([np.cos(turn), np.sin(turn)], -1)[:, None]
-    stop = stopping(plans, speed)
+    stop = shortened_to_stop(plans, speed)
     length = np.linalg.norm(stop, axis=-1)
     np.testing.assert_allclose(length[:, -1], speed**2 / (2 * BRAKE_MPS2), atol=1e-9)
     assert (np.diff(length, axis=1) > -1e-9).all()
@@ -55,4 +57,4 @@ def test_a_stop_brakes_comfortably_and_stays() -> None:
 
 def test_a_stop_is_never_longer_than_the_plan() -> None:
     plans = _rolling(0.05)
-    assert (stopping(plans, np.array([2.0]))[..., 0] <= plans[..., 0]).all()
+    assert (shortened_to_stop(plans, np.array([2.0]))[..., 0] <= plans[..., 0]).all()

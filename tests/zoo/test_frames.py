@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import FramesError
-from me2e_compress.zoo.cameras import HEIGHT, WIDTH, rig
 from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.synthetic_cameras import HEIGHT, WIDTH, rig
 from me2e_compress.zoo.synthetic_frames import Frame, frames
 from me2e_compress.zoo.synthetic_world import FRAME_S, EgoPose
 

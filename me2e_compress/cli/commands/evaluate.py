@@ -17,7 +17,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
-from me2e_compress.evaluators.highway.jobs import DrivingProgress, HighwayEvaluator
+from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.render import render
 from me2e_compress.evaluators.highway.results import MANIFEST
 from me2e_compress.evaluators.highway.runner import Conditions

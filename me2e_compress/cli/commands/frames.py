@@ -91,8 +91,8 @@ def record(
 
 def _driven(model: Path, count: int, seed: int, length: int) -> Iterator[Frame]:
     need_closed_loop("what frames of a driver need")
+    from me2e_compress.evaluators.highway.driven_frames import driven_frames
     from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
-    from me2e_compress.evaluators.highway.recorder import driven_frames
 
     policy = OnnxPolicy.open(model)
     return driven_frames(policy, count, seed=seed, scene_length=length)

@@ -10,7 +10,7 @@ from me2e_compress.cli.console import console, errors, print_json, progress
 from me2e_compress.cli.output import check_output
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.admission import Admission, examine
-from me2e_compress.evaluators.highway.generate import VARIANTS, Harvest, generate
+from me2e_compress.evaluators.highway.generate import VARIANTS, ScenarioRoutes, generate
 from me2e_compress.simulator.routes import (
     load_routes,
     pick_routes,
@@ -42,7 +42,7 @@ def routes(
         raise typer.BadParameter("a new set needs -o ROUTES.json", param_hint="-o")
     check_output([output], ())
     names = _names(scenarios)
-    harvests = list[Harvest]()
+    harvests = list[ScenarioRoutes]()
     with progress("admitting") as advance:
         for harvest in generate(seed, names, variants, workers):
             harvests.append(harvest)
@@ -62,7 +62,7 @@ def _names(scenarios: str) -> tuple[str, ...]:
     return names
 
 
-def _report(harvests: list[Harvest], output: Path, as_json: bool) -> None:
+def _report(harvests: list[ScenarioRoutes], output: Path, as_json: bool) -> None:
     admitted = sum(len(one.routes) for one in harvests)
     tried = sum(one.tried for one in harvests)
     if as_json:

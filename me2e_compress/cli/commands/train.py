@@ -11,7 +11,7 @@ from me2e_compress.cli.output import check_folder
 from me2e_compress.metrics.measure import Estimate
 
 if TYPE_CHECKING:
-    from me2e_compress.training.course import News
+    from me2e_compress.training.course import CourseProgress
 
 
 def train(
@@ -27,21 +27,20 @@ def train(
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
     # takes torch seconds to import
     from me2e_compress.training.course import NO_LATENCY, run
-    from me2e_compress.training.curriculum import FULL
-    from me2e_compress.training.small import LATENCY, SMALL
+    from me2e_compress.training.curriculum import FULL, SMALL, SMALL_LATENCY
 
     check_folder(output, ())
     told = ""
     with progress("train") as advance:
 
-        def tell(news: "News") -> None:
+        def tell(news: "CourseProgress") -> None:
             nonlocal told
             if news.what != told and not errors.is_terminal:
                 errors.print(news.what)  # a log wants lines, not a bar
             told = news.what
             advance(news.done, news.total, news.what)
 
-        course, latency = (SMALL, LATENCY) if small else (FULL, NO_LATENCY)
+        course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, NO_LATENCY)
         rounds = run(course, output, workers, tell, latency)
     columns = ("round", "routes", "driving score, %", "success rate, %")
     shown = table("driven on fresh routes after every round", *columns)

@@ -15,7 +15,7 @@ from me2e_compress.driving.contract import (
     RouteInfo,
 )
 from me2e_compress.evaluators.highway.observe import scene_and_world
-from me2e_compress.evaluators.highway.reference import (
+from me2e_compress.evaluators.highway.reentry import (
     beyond,
     in_ego_frame,
     reentry,

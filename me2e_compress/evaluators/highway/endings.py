@@ -15,7 +15,7 @@ ASTRAY_SHARE = 0.3
 
 
 @dataclass
-class Rules:
+class EndingRules:
     """Watches one route; constants of Bench2Drive's atomic_criteria.py.
 
     * the goal is reached, or the ego collides: the world itself ends there. CARLA

@@ -9,7 +9,7 @@ from me2e_compress.errors import EvaluationError, MissingExtraError
 from me2e_compress.evaluators.highway.worker import Driven, Job, RouteWorker
 from me2e_compress.simulator.routes import Route
 
-KNOCK_S = 5.0
+CONNECT_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class RayEngine:
             )
             return
         try:
-            _knock(self.address)
+            _check_reachable(self.address)
             ray.init(address=self.address, log_to_driver=False)
         except OSError as error:
             raise EvaluationError(f"ray: no cluster at {self.address}") from error
 
 
-def _knock(address: str) -> None:
+def _check_reachable(address: str) -> None:
     """Find out in seconds that nobody is there: Ray itself tries for minutes.
 
     Raises:
@@ -66,7 +66,7 @@ def _knock(address: str) -> None:
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
-        socket.create_connection((host, int(port)), timeout=KNOCK_S).close()
+        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
 
 
 def _ray() -> Any:

@@ -13,8 +13,8 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.admission import examine
 from me2e_compress.runtime.parent import end_with_parent
 from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
-from me2e_compress.simulator.scenarios.registry import stage_of
 
 VARIANTS = 5
 """Routes of each type, as in Bench2Drive's 220."""
@@ -23,7 +23,7 @@ MOST_TRIES = 8
 
 
 @dataclass(frozen=True)
-class Harvest:
+class ScenarioRoutes:
     """What one scenario type gave.
 
     Attributes:
@@ -67,7 +67,9 @@ def seed_of(seed: int, scenario: str, attempt: int) -> int:
     return int(np.random.SeedSequence(words).generate_state(1)[0])
 
 
-def harvest(scenario: str, seed: int, variants: int = VARIANTS) -> Harvest:
+def admitted_routes(
+    scenario: str, seed: int, variants: int = VARIANTS
+) -> ScenarioRoutes:
     """Propose routes of a type until enough are admitted.
 
     Raises:
@@ -82,7 +84,7 @@ def harvest(scenario: str, seed: int, variants: int = VARIANTS) -> Harvest:
         else:
             refusals.append(verdict.refusal)
         if len(routes) == variants:
-            return Harvest(scenario, tuple(routes), tuple(refusals))
+            return ScenarioRoutes(scenario, tuple(routes), tuple(refusals))
     raise EvaluationError(
         f"{scenario}: {len(routes)} of {variants} routes after {len(refusals)} "
         f"refusals with seed {seed}; the last: {refusals[-1] if refusals else 'none'}"
@@ -94,7 +96,7 @@ def generate(
     scenarios: Sequence[str] = tuple(SCENARIO_ABILITIES),
     variants: int = VARIANTS,
     workers: int = 1,
-) -> Iterator[Harvest]:
+) -> Iterator[ScenarioRoutes]:
     """Harvest several types, in their order, whatever the number of workers.
 
     Args:
@@ -103,7 +105,7 @@ def generate(
         variants: Routes of each type.
         workers: Processes; 1 stays in this one.
     """
-    reap = partial(harvest, seed=seed, variants=variants)
+    reap = partial(admitted_routes, seed=seed, variants=variants)
     if workers == 1:
         yield from map(reap, scenarios)
         return

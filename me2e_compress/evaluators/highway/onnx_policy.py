@@ -72,7 +72,7 @@ class OnnxPolicy:
         """
         try:
             policy = cls._of(Session(path, threads=1), adapter or Adapter())
-            policy._rehearse()
+            policy._dry_run()
         except (GraphError, FramesError, EvaluationError) as error:
             words = str(error).removeprefix(f"{path}: ")
             raise EvaluationError(f"{path}: {words}") from error
@@ -144,7 +144,7 @@ class OnnxPolicy:
             if self.names[ours] in ports
         }
 
-    def _rehearse(self) -> None:
+    def _dry_run(self) -> None:
         """Run once on zeros: what does not fit here would not on any route."""
         self.reset(None)
         nothing = Observation(

@@ -125,7 +125,7 @@ class ResultsFolder:
             EvaluationError: The disk is full, or the folder cannot be written.
         """
         episode = driven.episode
-        record = {"fingerprint": self._seal, "episode": episode.to_json()}
+        record = {"fingerprint": self._digest, "episode": episode.to_json()}
         cost = {
             "route": episode.route,
             "frames": len(episode.frames),
@@ -141,7 +141,7 @@ class ResultsFolder:
             raise _unwritable(self._file(episode.route), error) from error
 
     @property
-    def _seal(self) -> str:
+    def _digest(self) -> str:
         text = json.dumps(self.made_by, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -154,7 +154,10 @@ class ResultsFolder:
             return None
         try:
             record = json.loads(path.read_bytes())
-            if not isinstance(record, dict) or record.get("fingerprint") != self._seal:
+            if (
+                not isinstance(record, dict)
+                or record.get("fingerprint") != self._digest
+            ):
                 raise ValueError("of another evaluation")
             return Episode.from_json(record["episode"])
         except (ValueError, KeyError, TypeError) as error:

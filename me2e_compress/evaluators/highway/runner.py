@@ -13,9 +13,9 @@ from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.driving.realtime import DT_US, HeldControl
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
-from me2e_compress.evaluators.highway.endings import Rules
+from me2e_compress.evaluators.highway.endings import EndingRules
+from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
-from me2e_compress.evaluators.highway.record import Recorder
 from me2e_compress.metrics.episode import FRAME_US, Ending, Episode, InferenceRecord
 from me2e_compress.simulator.cameras import (
     CLEAR,
@@ -81,14 +81,14 @@ class Listeners:
     moment: Callable[[Moment], None] | None = None
 
 
-SILENT = Listeners()
+NO_LISTENERS = Listeners()
 
 
 def drive(
     route: Route,
     policy: Policy,
     conditions: Conditions,
-    listeners: Listeners = SILENT,
+    listeners: Listeners = NO_LISTENERS,
 ) -> Episode:
     """Drive a route to its end and return the record.
 
@@ -115,7 +115,7 @@ class _Drive:
     ) -> None:
         self.route, self.policy, self.to = route, policy, to
         self.world = world = World(route, dt_us=conditions.dt_us)
-        self.recorder, self.rules = Recorder(world), Rules()
+        self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
         self.held = HeldControl(Control(0.0, 0.0), conditions.dt_us)
         self.charge = conditions.latency.on_route(route.id)
         self.controller = Controller()

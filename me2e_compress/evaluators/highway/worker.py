@@ -16,7 +16,10 @@ import psutil
 
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError, Me2eError
-from me2e_compress.evaluators.highway.record import completion_percent, unrecorded
+from me2e_compress.evaluators.highway.episode_recorder import (
+    completion_percent,
+    failed_episode,
+)
 from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import Route
@@ -25,7 +28,7 @@ from me2e_compress.simulator.world import World
 POLL_S = 0.05
 FRAME_LIMIT_S = 60.0
 
-Pulse: TypeAlias = "SynchronizedArray[float]"
+Heartbeat: TypeAlias = "SynchronizedArray[float]"
 """[0] number of the question the policy is thinking about, 0 while it is not asked;
 [1] percent of the route passed."""
 
@@ -71,7 +74,7 @@ class RouteWorker:
 
     job: Job
     _process: SpawnProcess | None = field(default=None, init=False)
-    _pulse: Pulse | None = field(default=None, init=False)
+    _pulse: Heartbeat | None = field(default=None, init=False)
     _line: Connection[Route, Driven | Me2eError] | None = field(
         default=None, init=False
     )
@@ -122,7 +125,7 @@ class RouteWorker:
 
     def _started(
         self,
-    ) -> tuple[SpawnProcess, Pulse, Connection[Route, Driven | Me2eError]]:
+    ) -> tuple[SpawnProcess, Heartbeat, Connection[Route, Driven | Me2eError]]:
         if self._process is None or self._pulse is None or self._line is None:
             context = multiprocessing.get_context("spawn")
             pulse = context.Array("d", 2)
@@ -147,7 +150,7 @@ class RouteWorker:
     def _lost(self, route: Route, begun: float, failure: str) -> Driven:
         percent = self._pulse[1] if self._pulse else 0.0
         self.close()
-        episode = unrecorded(route, percent, failure)
+        episode = failed_episode(route, percent, failure)
         return Driven(episode, time.perf_counter() - begun, 0)
 
 
@@ -158,7 +161,9 @@ def _ready(line: Connection[Route, Driven | Me2eError]) -> bool:
         return True
 
 
-def _serve(line: Connection[Driven | Me2eError, Route], pulse: Pulse, job: Job) -> None:
+def _serve(
+    line: Connection[Driven | Me2eError, Route], pulse: Heartbeat, job: Job
+) -> None:
     """Drive what comes down the line until the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     asked = 0

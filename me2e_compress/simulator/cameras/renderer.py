@@ -1,4 +1,4 @@
-"""The six cameras of one route."""
+"""The six cameras of one route: sky, ground and solids, then weather and sensor."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -7,19 +7,100 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.cameras.atmosphere import Atmosphere
 from me2e_compress.simulator.cameras.classes import PixelClass
 from me2e_compress.simulator.cameras.ground import GroundSampler
 from me2e_compress.simulator.cameras.painter import Painter, draw, label
 from me2e_compress.simulator.cameras.rig import CAMERAS, CameraRig
-from me2e_compress.simulator.cameras.sensor import Sensor
-from me2e_compress.simulator.cameras.sky import Sky
 from me2e_compress.simulator.cameras.solids import solids_of
 from me2e_compress.simulator.cameras.texture import GroundTexture
-from me2e_compress.simulator.cameras.weather import CLEAR, Weather
+from me2e_compress.simulator.cameras.weather import CLEAR, Atmosphere, Sensor, Weather
 from me2e_compress.simulator.scene import Scene
 
 Bytes = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float64]
+
+ZENITH, HAZE = (128, 170, 224), (216, 228, 238)
+HILLS, TREES = (122, 146, 142), (66, 94, 60)
+COLUMNS, ROWS = 2880, 64
+"""Panorama: 0.125 degrees a column."""
+TALLEST = 0.1
+"""Tangent of the elevation of the panorama's upper edge; above it the sky is even."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sky:
+    """Fills the rows above the horizon.
+
+    Args:
+        rig: The cameras.
+        seed: Of the skyline, which is the same for all cameras and frames.
+    """
+
+    rig: CameraRig
+    seed: int = 0
+
+    @property
+    def height(self) -> int:
+        """How many rows of an image are sky: those with their centre above it."""
+        return int(np.floor(self.rig.centre_px[1] + 0.5))
+
+    def paint(self, images: Bytes, heading: float) -> None:
+        """Fill the sky rows of uint8 [6, H, W, 3] for an ego heading in radians."""
+        first, texels = self._strip
+        images[:, :first] = self._even[:first]
+        turned = texels + round(heading / (2 * np.pi) * COLUMNS) % COLUMNS
+        seen = self._panorama.take(turned).view(np.uint8)
+        strip = cv2.cvtColor(seen.reshape(-1, self.rig.width, 4), cv2.COLOR_RGBA2RGB)
+        images[:, first : self.height] = strip.reshape(*texels.shape, 3)
+
+    @cached_property
+    def _even(self) -> Bytes:
+        return np.full((self.height, self.rig.width, 3), ZENITH, np.uint8)
+
+    @cached_property
+    def _strip(self) -> tuple[int, npt.NDArray[np.intp]]:
+        """First row, and the panorama's texel of each pixel [6, R, W] at heading 0."""
+        focal = self.rig.focals_px[:, None]
+        centre_column, horizon = self.rig.centre_px
+        tangent = (np.arange(self.rig.width) + 0.5 - centre_column) / focal
+        slant = np.hypot(1.0, tangent)
+        first = max(0, int(horizon - TALLEST * (focal * slant).max()))
+        rise = (horizon - np.arange(first, self.height) - 0.5) / focal
+        elevation = rise[:, :, None] / slant[:, None, :]
+        row = np.clip((1.0 - elevation / TALLEST) * ROWS, 0, ROWS - 1).astype(np.intp)
+        yaw = np.deg2rad([camera.yaw_deg for camera in CAMERAS])[:, None]
+        azimuth = (yaw - np.arctan(tangent)) / (2 * np.pi) % 1.0
+        column = (azimuth * COLUMNS).astype(np.intp)
+        return first, row * (2 * COLUMNS) + column[:, None, :]
+
+    @cached_property
+    def _panorama(self) -> npt.NDArray[np.uint32]:
+        """[ROWS * 2 * COLUMNS] RGBA texels, twice around: no index needs to wrap."""
+        rng = np.random.default_rng(self.seed)
+        elevation = TALLEST * (1.0 - (np.arange(ROWS) + 0.5) / ROWS)[:, None]
+        share = np.sqrt(elevation / TALLEST)[..., None]
+        sky = (1 - share) * np.array(HAZE, float) + share * np.array(ZENITH, float)
+        picture = np.repeat(sky, COLUMNS, axis=1)
+        layers = (
+            (HILLS, 0.045, 0.035, (2, 3, 5, 9)),
+            (TREES, 0.014, 0.012, (7, 23, 61, 137)),
+        )
+        for colour, mean, spread, waves in layers:
+            skyline = mean + spread * _skyline(waves, rng)
+            covered = (skyline - elevation) * ROWS / TALLEST + 0.5
+            alpha = np.clip(covered, 0.0, 1.0)[..., None]
+            picture = (1 - alpha) * picture + alpha * np.array(colour, float)
+        rounded = np.rint(np.concatenate([picture, picture], axis=1)).astype(np.uint8)
+        texels = np.asarray(cv2.cvtColor(rounded, cv2.COLOR_RGB2RGBA), np.uint8)
+        return texels.reshape(-1).view(np.uint32)
+
+
+def _skyline(waves: tuple[int, ...], rng: np.random.Generator) -> Floats:
+    """[COLUMNS] between -1 and 1: waves around the circle with seeded phases."""
+    angle = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    terms = [np.sin(n * angle + p) for n, p in zip(waves, phases, strict=True)]
+    return np.asarray(np.mean(terms, axis=0))
 
 
 @dataclass(frozen=True, eq=False)

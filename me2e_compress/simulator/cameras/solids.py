@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.cameras import signs, street, vehicles
+from me2e_compress.simulator.cameras import actor_shapes, sign_shapes
 from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES, PixelClass
 from me2e_compress.simulator.cameras.template import Slot, Template
 from me2e_compress.simulator.scene import (
@@ -74,21 +74,21 @@ LIT: dict[Slot, Colour] = {
     Slot.LAMP_GREEN: (40, 246, 120),
 }
 TEMPLATES: dict[ActorKind, tuple[Template, ...]] = {
-    ActorKind.CAR: (vehicles.car(),),
-    ActorKind.PARKED: (vehicles.car(),),
-    ActorKind.VAN: (vehicles.van(beacon=False),),
-    ActorKind.EMERGENCY: (vehicles.van(beacon=True),),
-    ActorKind.TRUCK: vehicles.truck(),
-    ActorKind.PEDESTRIAN: (street.pedestrian(),),
-    ActorKind.BICYCLE: (street.bicycle(),),
-    ActorKind.CONE: (street.cone(),),
-    ActorKind.BARRIER: (street.barrier(),),
-    ActorKind.DOOR: (street.door(),),
+    ActorKind.CAR: (actor_shapes.car(),),
+    ActorKind.PARKED: (actor_shapes.car(),),
+    ActorKind.VAN: (actor_shapes.van(beacon=False),),
+    ActorKind.EMERGENCY: (actor_shapes.van(beacon=True),),
+    ActorKind.TRUCK: actor_shapes.truck(),
+    ActorKind.PEDESTRIAN: (actor_shapes.pedestrian(),),
+    ActorKind.BICYCLE: (actor_shapes.bicycle(),),
+    ActorKind.CONE: (actor_shapes.cone(),),
+    ActorKind.BARRIER: (actor_shapes.barrier(),),
+    ActorKind.DOOR: (actor_shapes.door(),),
 }
 SIGNS: dict[SignalKind, tuple[Template, PixelClass]] = {
-    SignalKind.TRAFFIC_LIGHT: (signs.traffic_light(), PixelClass.TRAFFIC_LIGHT),
-    SignalKind.STOP_SIGN: (signs.stop_sign(), PixelClass.TRAFFIC_SIGN),
-    SignalKind.GIVE_WAY: (signs.give_way_sign(), PixelClass.TRAFFIC_SIGN),
+    SignalKind.TRAFFIC_LIGHT: (sign_shapes.traffic_light(), PixelClass.TRAFFIC_LIGHT),
+    SignalKind.STOP_SIGN: (sign_shapes.stop_sign(), PixelClass.TRAFFIC_SIGN),
+    SignalKind.GIVE_WAY: (sign_shapes.give_way_sign(), PixelClass.TRAFFIC_SIGN),
 }
 SIGN_RED: Colour = (204, 24, 34)
 STATE_LAMPS = {

@@ -161,7 +161,7 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         return np.vstack([flip(*self.position), ahead])
 
 
-class Standing(Obstacle):  # type: ignore[misc]  # highway-env is untyped
+class StaticObject(Obstacle):  # type: ignore[misc]  # highway-env is untyped
     """A thing that stands: parked car, door, cone, barrier."""
 
     def __init__(

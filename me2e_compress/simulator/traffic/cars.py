@@ -1,4 +1,4 @@
-"""Cars that follow lanes by highway-env's IDM, with manners of their own.
+"""Cars that follow lanes by highway-env's IDM, with behaviour of their own.
 
 What stock `IDMVehicle` gets wrong and this one does not (highway-env 1.12): its
 parameters are class attributes that one environment changes under another; it reverses
@@ -30,7 +30,7 @@ LOOK_AHEAD_M = 70.0
 
 
 @dataclass(frozen=True, slots=True)
-class Manners:
+class Behaviour:
     """IDM parameters of one car; defaults are highway-env's but for the gaps.
 
     highway-env's jam distance of 10 m is measured between centres; ours between
@@ -59,7 +59,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         speed_mps: At the start.
         target_mps: Wanted speed; the initial one by default.
         kind: Decides its size.
-        manners: Its IDM parameters.
+        behaviour: Its IDM parameters.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         speed_mps: float,
         target_mps: float | None = None,
         kind: ActorKind = ActorKind.CAR,
-        manners: Manners | None = None,
+        behaviour: Behaviour | None = None,
     ) -> None:
         pose = network.pose(lanes[0], s_m)
         super().__init__(
@@ -87,11 +87,11 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
         self.speed: float = speed_mps
         self.position: Floats
-        self.manners = manners or Manners()
-        self.COMFORT_ACC_MAX = self.manners.acceleration_mps2
-        self.COMFORT_ACC_MIN = -self.manners.braking_mps2
-        self.DISTANCE_WANTED = self.manners.jam_gap_m
-        self.TIME_WANTED = self.manners.headway_s
+        self.behaviour = behaviour or Behaviour()
+        self.COMFORT_ACC_MAX = self.behaviour.acceleration_mps2
+        self.COMFORT_ACC_MIN = -self.behaviour.braking_mps2
+        self.DISTANCE_WANTED = self.behaviour.jam_gap_m
+        self.TIME_WANTED = self.behaviour.headway_s
         self.target_speed = speed_mps if target_mps is None else target_mps
         self.lanes, self.leg = list(lanes), 0
         self.target_lane_index = self.lane_index = self.lanes[0]
@@ -152,7 +152,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         if wanted is None:
             lead, gap = self.road.lead(self) or (None, math.inf)
             wanted = self.idm(lead, gap, self.allowed_mps(s))
-        wanted = min(max(wanted, -self.manners.hardest_mps2), self.COMFORT_ACC_MAX)
+        wanted = min(max(wanted, -self.behaviour.hardest_mps2), self.COMFORT_ACC_MAX)
         self.action = {"acceleration": wanted, "steering": self._steering(s, r)}
         self.braking = wanted < -0.7 or self.speed < 0.2
 
@@ -175,7 +175,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         allowed, ahead = float(self.target_speed), -lane_s
         for index in self.lanes[self.leg :]:
             lane = self.network.lane(index)
-            here = float(lane.speed_limit) if self.manners.obeys_limits else math.inf
+            here = float(lane.speed_limit) if self.behaviour.obeys_limits else math.inf
             radius = getattr(lane, "radius", None)
             if radius is not None:
                 here = min(here, math.sqrt(LATERAL_COMFORT_MPS2 * radius))

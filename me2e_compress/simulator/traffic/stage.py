@@ -14,10 +14,10 @@ from me2e_compress.simulator.routes import Parameter, Route
 from me2e_compress.simulator.scene import ActorKind, SignalKind, SignalState
 from me2e_compress.simulator.traffic.bodies import (
     EgoVehicle,
-    Standing,
+    StaticObject,
     Walker,
 )
-from me2e_compress.simulator.traffic.cars import Car, Manners
+from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.events import Event, EventKind
 from me2e_compress.simulator.traffic.legs import Leg, build_path
 from me2e_compress.simulator.traffic.network import (
@@ -53,7 +53,7 @@ class Stage:
         self.script_names: list[str] = []
         self.scripts: list[Script] = []
         self.bodies: list[Car | Walker] = []
-        self.things: list[Standing] = []
+        self.things: list[StaticObject] = []
         self.regulators: list[Regulator] = []
         self.crosswalks: list[tuple[Point, Point, Point, Point]] = []
         self.at_goal: list[Callable[[], Event | None]] = []
@@ -151,11 +151,11 @@ class Stage:
         speed_mps: float,
         target_mps: float | None = None,
         kind: ActorKind = ActorKind.CAR,
-        manners: Manners | None = None,
+        behaviour: Behaviour | None = None,
     ) -> Car:
         """Put a car on a chain of lanes."""
         car = Car(
-            self._id(), self.network, lanes, s_m, speed_mps, target_mps, kind, manners
+            self._id(), self.network, lanes, s_m, speed_mps, target_mps, kind, behaviour
         )
         self.bodies.append(car)
         return car
@@ -171,9 +171,9 @@ class Stage:
         kind: ActorKind,
         pose: Pose,
         size: tuple[float, float, float] | None = None,
-    ) -> Standing:
+    ) -> StaticObject:
         """Put a thing somewhere."""
-        thing = Standing(self._id(), kind, pose, size)
+        thing = StaticObject(self._id(), kind, pose, size)
         self.things.append(thing)
         return thing
 

@@ -67,7 +67,7 @@ def intent_of(body: Car | Walker) -> Intent:
     target = float(body.target_speed)
     if forced is not None:
         target = 0.0 if forced < -1.0 else float(body.speed)
-    return Intent(body.id, _way(body), target, acceleration, body.manners.sees_ego)
+    return Intent(body.id, _way(body), target, acceleration, body.behaviour.sees_ego)
 
 
 def phase_of(regulator: Regulator) -> Phase | None:

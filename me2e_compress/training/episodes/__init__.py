@@ -35,8 +35,8 @@ that sample, x forward and y left.
 """
 
 from me2e_compress.training.episodes.agents import GRID
+from me2e_compress.training.episodes.collecting import CollectionProgress, collect
 from me2e_compress.training.episodes.collection import Collection
-from me2e_compress.training.episodes.driving import CollectionProgress, collect
 from me2e_compress.training.episodes.jpeg import decode
 
 __all__ = ["GRID", "Collection", "CollectionProgress", "collect", "decode"]

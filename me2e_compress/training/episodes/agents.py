@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.evaluators.highway.reference import in_ego_frame
+from me2e_compress.evaluators.highway.reentry import in_ego_frame
 from me2e_compress.simulator.cameras import BevGrid, PixelClass
 from me2e_compress.simulator.cameras.birdseye import covered
 from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES

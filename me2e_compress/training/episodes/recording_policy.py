@@ -1,11 +1,19 @@
 """A policy that remembers every frame and what the expert would do there."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Self
 from zlib import crc32
 
 import numpy as np
 
-from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
+from me2e_compress.driving.contract import (
+    PLAN_SHAPE,
+    Observation,
+    Plan,
+    Policy,
+    RouteInfo,
+)
 from me2e_compress.evaluators.highway.expert import (
     ExpertDecision,
     Memory,
@@ -16,7 +24,98 @@ from me2e_compress.evaluators.highway.observe import scene_and_world
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.world import Phase, World
-from me2e_compress.training.episodes.perturb import Perturbation
+
+BURST_S = (0.4, 1.5)
+PAUSE_S = (0.9, 4.8)
+"""Between two bursts; with `BURST_S` a quarter of the time is noise."""
+DRIFT_M = 1.5
+"""Largest sideways shift of the last waypoint."""
+DRIFT_TRAVEL_M = 6.0
+"""A plan that goes less far than this drifts less: who stands does not creep."""
+TURN_RAD = float(np.deg2rad(8.0))
+SPEED = (0.5, 1.3)
+GROWTH = (1.0 + np.arange(PLAN_SHAPE[0])) / PLAN_SHAPE[0]
+
+
+@dataclass(frozen=True)
+class PlanNoise:
+    """What is done to a plan.
+
+    Attributes:
+        drift_m: Metres to the left at the last waypoint, growing with time.
+        turn_rad: How far the plan is turned to the left.
+        speed: What its length is multiplied by.
+    """
+
+    drift_m: float = 0.0
+    turn_rad: float = 0.0
+    speed: float = 1.0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, strength: float) -> Self:
+        """Drift, turn or change of speed, each as likely, uniform in its range."""
+        kind, side = rng.integers(3), rng.uniform(-1.0, 1.0)
+        if kind == 0:
+            return cls(drift_m=strength * DRIFT_M * side)
+        if kind == 1:
+            return cls(turn_rad=strength * TURN_RAD * side)
+        change = strength * (rng.uniform(*SPEED) - 1.0)
+        return cls(speed=max(1.0 + change, 0.0))
+
+    def apply(self, plan: Plan) -> Plan:
+        """Return the changed plan; [6, 2] metres in the ego frame, as the given one."""
+        cos, sin = np.cos(self.turn_rad), np.sin(self.turn_rad)
+        turned = self.speed * plan @ np.array([[cos, sin], [-sin, cos]])
+        share = min(float(np.hypot(*plan[-1])) / DRIFT_TRAVEL_M, 1.0)
+        turned[:, 1] += self.drift_m * share * GROWTH
+        return np.asarray(turned)
+
+
+@dataclass(frozen=True)
+class Burst:
+    """Noise and when it is in force."""
+
+    begin_us: int
+    end_us: int
+    noise: PlanNoise
+
+
+def bursts(rng: np.random.Generator, strength: float) -> Iterator[Burst]:
+    """Yield bursts in order of time, without end."""
+    at = 0.0
+    while True:
+        begin = at + rng.uniform(*PAUSE_S)
+        at = begin + rng.uniform(*BURST_S)
+        yield Burst(int(begin * 1e6), int(at * 1e6), PlanNoise.draw(rng, strength))
+
+
+@dataclass
+class Perturbation:
+    """The noise of one route.
+
+    Args:
+        rng: Where the noise comes from.
+        strength: Scales it; 0 leaves every plan as it is.
+    """
+
+    rng: np.random.Generator
+    strength: float
+    _coming: Iterator[Burst] = field(init=False, repr=False)
+    _burst: Burst = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Draw the first burst."""
+        self._coming = bursts(self.rng, self.strength)
+        self._burst = next(self._coming)
+
+    def apply(self, plan: Plan, time_us: int) -> Plan:
+        """Return what is driven at a time; times must not decrease."""
+        while time_us >= self._burst.end_us:
+            self._burst = next(self._coming)
+        if self.strength == 0.0 or time_us < self._burst.begin_us:
+            return plan
+        return self._burst.noise.apply(plan)
+
 
 TURN_US = 2_000_000
 """How long the expert or the student drives before it is drawn again who does."""
@@ -100,7 +199,7 @@ class RecordingPolicy:
         if self.student is not None:
             answer = self.student.plan(replace(observation, scene=None, world=None))
             plan = plan if self._expert_drives(scene.time_us) else answer
-        return self._noise.bent(plan, scene.time_us)
+        return self._noise.apply(plan, scene.time_us)
 
     def _expert_drives(self, time_us: int) -> bool:
         while len(self._turns) <= time_us // TURN_US:

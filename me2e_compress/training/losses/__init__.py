@@ -1,9 +1,12 @@
-"""How far each module is from its labels."""
+"""The losses of every module against its labels."""
 
+from me2e_compress.training.losses.detection_losses import (
+    LampHead,
+    motion_losses,
+    track_losses,
+)
 from me2e_compress.training.losses.ground_losses import map_losses, occ_losses
-from me2e_compress.training.losses.lamps import LampHead
-from me2e_compress.training.losses.planning_loss import plan_losses
-from me2e_compress.training.losses.tracking_loss import motion_losses, track_losses
+from me2e_compress.training.losses.planning_losses import plan_losses
 
 __all__ = [
     "LampHead",

@@ -1,10 +1,10 @@
-"""Routes, ground, signals, occupancy."""
+"""Losses of the routes, the ground, the signals and the occupancy."""
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from me2e_compress.training.labels import Targets
+from me2e_compress.training.label_tensors import Labels
 from me2e_compress.zoo.highway.map import GAP_SCALE_M, RoadMap
 
 ATTRIBUTE_SCALE = (4.0, 4.0, 4.0, 5.0)
@@ -20,7 +20,7 @@ RARE = 4.0
 """Weight of occupied cells: few are."""
 
 
-def map_losses(road: RoadMap, wanted: Targets) -> dict[str, Tensor]:
+def map_losses(road: RoadMap, wanted: Labels) -> dict[str, Tensor]:
     """The commanded route, its attributes, the raster, the signals."""
     rows = torch.arange(len(wanted.command))
     near = torch.linspace(NEAR_WEIGHT, FAR_WEIGHT, wanted.path.shape[1])[:, None]
@@ -64,7 +64,7 @@ def _turned(headings: Tensor, path: Tensor) -> Tensor:
     return torch.atan2(away.sin(), away.cos()).abs().mean()
 
 
-def occ_losses(occupancy: Tensor, wanted: Targets) -> dict[str, Tensor]:
+def occ_losses(occupancy: Tensor, wanted: Labels) -> dict[str, Tensor]:
     """Cross-entropy of the steps that are known."""
     weight = 1 + (RARE - 1) * wanted.occupancy
     error = functional.binary_cross_entropy_with_logits(

@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.highway.candidates import along, hats
 from me2e_compress.zoo.highway.config import (
     COMMANDS,
     PATH_STEP_M,
@@ -31,6 +30,37 @@ from me2e_compress.zoo.highway.interfaces import (
 )
 from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
 from me2e_compress.zoo.highway.map import GAP_SCALE_M
+
+
+def hats(arc_m: Tensor, points: int) -> Tensor:
+    """Weights [..., P] that interpolate linearly between the points of a route."""
+    knots = torch.arange(points, device=arc_m.device, dtype=arc_m.dtype)
+    return (1 - (arc_m[..., None] / PATH_STEP_M - knots).abs()).clamp(min=0)
+
+
+def along(
+    arc_m: Tensor, offset_m: Tensor, path: Tensor, headings: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Places beside a route.
+
+    Args:
+        arc_m: [B, K, T] metres along it, 0 to its length.
+        offset_m: [B, K, T] metres to the left of it.
+        path: [B, P, 2].
+        headings: [B, P].
+
+    Returns:
+        ([B, K, T, 2] metres in the ego frame, [B, K, T] headings).
+    """
+    weights = hats(arc_m, path.shape[1])
+    shape = weights.shape[:3]
+    flat = weights.flatten(1, 2)
+    table = torch.cat([path, headings[..., None]], -1)
+    found = torch.matmul(flat, table).unflatten(1, shape[1:])
+    heading = found[..., 2]
+    left = torch.stack([-heading.sin(), heading.cos()], -1)
+    return found[..., :2] + offset_m[..., None] * left, heading
+
 
 LIMITS = 5
 """Too fast, too far left, too far right, left of the oncoming lanes, off the route."""

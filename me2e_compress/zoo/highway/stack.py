@@ -1,19 +1,79 @@
-"""The whole stack."""
+"""The whole stack: backbone, neck and occupancy head, and all modules in order."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.highway.backbone import Backbone, Neck
 from me2e_compress.zoo.highway.bev_encoder import BevEncoder
-from me2e_compress.zoo.highway.config import HighwayConfig
+from me2e_compress.zoo.highway.config import STEPS, HighwayConfig
 from me2e_compress.zoo.highway.interfaces import EgoState, PlannerInput, gather
+from me2e_compress.zoo.highway.layers import Residual, conv_block
 from me2e_compress.zoo.highway.map import Choice, Map, RoadMap
 from me2e_compress.zoo.highway.motion import Futures, Motion
-from me2e_compress.zoo.highway.occ import Occ
 from me2e_compress.zoo.highway.planner import Planner
 from me2e_compress.zoo.highway.track import Track, Tracks
+
+
+class Backbone(nn.Module):
+    """A small residual network."""
+
+    def __init__(self, config: HighwayConfig) -> None:
+        super().__init__()
+        first, second, third, fourth = config.stages
+        self.stem = conv_block(3, first, 3, 2)
+        self.stage1 = Residual(first, second, 2)
+        self.stage2 = nn.Sequential(Residual(second, third, 2), Residual(third, third))
+        self.stage3 = nn.Sequential(
+            Residual(third, fourth, 2), Residual(fourth, fourth)
+        )
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """[B, 3, H, W] to features of strides 4, 8 and 16."""
+        fine = self.stage1(self.stem(images))
+        middle = self.stage2(fine)
+        return fine, middle, self.stage3(middle)
+
+
+class Neck(nn.Module):
+    """Brings the strides together (Lin et al., 2017, without the smoothing)."""
+
+    def __init__(self, config: HighwayConfig) -> None:
+        super().__init__()
+        _, *widths = config.stages
+        self.laterals = nn.ModuleList(
+            [nn.Conv2d(width, config.channels, 1) for width in widths]
+        )
+        self.grow = nn.Upsample(scale_factor=2, mode="nearest")
+
+    def forward(self, features: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Features to [B, C, H / 4, W / 4] and [B, C, H / 8, W / 8]."""
+        fine, middle, coarse = (
+            lateral(x) for lateral, x in zip(self.laterals, features, strict=True)
+        )
+        middle = middle + self.grow(coarse)
+        return fine + self.grow(middle), middle
+
+
+class Occ(nn.Module):
+    """Occupancy 0.5 to 3 s from now; never of now, which boxes already say."""
+
+    def __init__(self, config: HighwayConfig) -> None:
+        super().__init__()
+        channels = config.channels
+        self.body = nn.Sequential(
+            Residual(channels, channels),
+            conv_block(channels, channels // 2, 1),
+            nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False),
+            conv_block(channels // 2, channels // 2),
+            nn.Conv2d(channels // 2, STEPS, 1),
+        )
+
+    def forward(self, bev: Tensor) -> Tensor:
+        """[B, C, rows, columns] to logits [B, 6, 2 * rows, 2 * columns]."""
+        taken: Tensor = self.body(bev).float()
+        return taken
+
 
 STANDING_MPS = 0.1
 STOOD_S = 5.0

@@ -1,6 +1,8 @@
-"""ResNet-50, whose last stage is all that VAD-tiny uses."""
+"""ResNet-50, of which VAD-tiny uses the last stage, and its one-level pyramid."""
 
 from torch import Tensor, nn
+
+from me2e_compress.zoo.vad.config import EMBED
 
 STAGES = ((64, 3, 1), (128, 4, 2), (256, 6, 2), (512, 3, 2))
 """Width, blocks and stride of the four stages (He et al. 2016, table 1)."""
@@ -61,4 +63,31 @@ class ResNet50(nn.Module):
         for number in range(1, len(STAGES) + 1):
             x = self.get_submodule(f"layer{number}")(x)
         out: Tensor = x
+        return out
+
+
+class ConvModule(nn.Module):
+    """A convolution under the name that the published weights use."""
+
+    def __init__(self, channels: int, out: int, kernel: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, out, kernel, padding=kernel // 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, C, H, W] -> [N, out, H, W]."""
+        out: Tensor = self.conv(x)
+        return out
+
+
+class FeaturePyramid(nn.Module):
+    """C5 to 256 channels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lateral_convs = nn.ModuleList([ConvModule(OUT_CHANNELS, EMBED, 1)])
+        self.fpn_convs = nn.ModuleList([ConvModule(EMBED, EMBED, 3)])
+
+    def forward(self, features: Tensor) -> Tensor:
+        """[N, 2048, h, w] -> [N, 256, h, w]."""
+        out: Tensor = self.fpn_convs[0](self.lateral_convs[0](features))
         return out

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from me2e_compress.errors import GraphError
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import frames
-from me2e_compress.zoo.vad.config import ATTENTION_HEADS
+from me2e_compress.zoo.vad.config import ATTENTION_HEADS, HEADS, HeadsName, Sampling
 from me2e_compress.zoo.vad.stack import VadTiny
 
 GAINS = (
@@ -154,3 +155,18 @@ def _one_thread() -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(threads)
+
+
+def build(
+    *, seed: int = 0, heads: HeadsName = "nuscenes", sampling: Sampling = "operator"
+) -> VadTiny:
+    """Build and initialise; the same seed gives the same bytes.
+
+    Raises:
+        GraphError: There are no heads of that name.
+    """
+    if heads not in HEADS:
+        raise GraphError(f"no heads {heads!r}: there is {', '.join(HEADS)}")
+    model = VadTiny(heads, sampling).requires_grad_(False).eval()
+    initialise(model, seed)
+    return model

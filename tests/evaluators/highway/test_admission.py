@@ -3,12 +3,11 @@ from dataclasses import replace
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.admission import Admission, examine
-from me2e_compress.evaluators.highway.dry_run import DryRun
+from me2e_compress.evaluators.highway.admission import Admission, DryRun, examine
 from me2e_compress.evaluators.highway.generate import (
-    Harvest,
+    ScenarioRoutes,
+    admitted_routes,
     generate,
-    harvest,
     propose,
     seed_of,
 )
@@ -79,7 +78,7 @@ def test_a_proposal_of_an_unknown_type() -> None:
 
 def test_a_harvest_is_the_same_each_time_and_for_any_workers() -> None:
     names = ("ConstructionObstacle", "VanillaNonSignalizedTurnEncounterStopsign")
-    once = [harvest(name, 3, 1) for name in names]
+    once = [admitted_routes(name, 3, 1) for name in names]
 
     assert list(generate(3, names, 1, workers=2)) == once
     assert once[0].routes[0].id == "ConstructionObstacle_0"
@@ -94,4 +93,4 @@ def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
 
 
 def test_a_harvest_counts_what_it_refused() -> None:
-    assert Harvest("Accident", (route_of(),), ("no", "no")).tried == 3
+    assert ScenarioRoutes("Accident", (route_of(),), ("no", "no")).tried == 3

@@ -4,7 +4,7 @@ from typing import cast
 
 import pytest
 
-from me2e_compress.evaluators.highway.endings import Rules
+from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.world import EndReason, World
 
@@ -21,7 +21,7 @@ class Track:
 
 
 def ending_after(track: Track, seconds: float) -> tuple[Ending | None, float]:
-    rules = Rules()
+    rules = EndingRules()
     while track.time_us < seconds * 1e6:
         track.time_us += 50_000
         ending = rules.ending(cast(World, track), track.speed_mps)
@@ -47,7 +47,7 @@ def test_a_minute_at_walking_away_pace_is_blocked(speed: float, ended: bool) -> 
 
 
 def test_moving_on_starts_the_minute_again() -> None:
-    track, rules = Track(0.0), Rules()
+    track, rules = Track(0.0), EndingRules()
     for second in range(100):
         track.speed_mps = 1.0 if second == 50 else 0.0
         track.time_us += 1_000_000

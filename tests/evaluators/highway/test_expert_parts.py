@@ -11,8 +11,11 @@ from me2e_compress.evaluators.highway.expert.lateral_targets import (
     blocked_stretch,
     lateral_targets,
 )
-from me2e_compress.evaluators.highway.expert.speed import LATERAL_MPS2, ceiling
-from me2e_compress.evaluators.highway.expert.stops import somebody_comes
+from me2e_compress.evaluators.highway.expert.speed_limits import (
+    LATERAL_MPS2,
+    ceiling,
+    somebody_comes,
+)
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Actor, ActorKind, Scene
 from me2e_compress.simulator.world.privileged import Intent

@@ -12,12 +12,12 @@ from me2e_compress.simulator.scene import ActorKind, Control
 from me2e_compress.simulator.traffic.bodies import (
     DRY_GRIP_MPS2,
     EgoVehicle,
-    Standing,
+    StaticObject,
     Walker,
 )
-from me2e_compress.simulator.traffic.cars import Car, Manners
+from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.network import Network, Pose, Section
-from me2e_compress.simulator.traffic.road import TrafficRoad, overlap
+from me2e_compress.simulator.traffic.traffic_road import TrafficRoad, overlap
 
 
 def driven(control: Control, seconds: float, dt: float, speed: float) -> EgoVehicle:
@@ -72,11 +72,11 @@ def one_lane(length: float = 300.0) -> tuple[Network, TrafficRoad]:
     return network, TrafficRoad(network)
 
 
-def put(road: TrafficRoad, *cars: Car | Standing) -> None:
+def put(road: TrafficRoad, *cars: Car | StaticObject) -> None:
     for car in cars:
         car.road = road
     road.vehicles = [car for car in cars if isinstance(car, Car)]
-    road.objects = [car for car in cars if isinstance(car, Standing)]
+    road.objects = [car for car in cars if isinstance(car, StaticObject)]
 
 
 def run(road: TrafficRoad, seconds: float) -> None:
@@ -111,7 +111,7 @@ def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
     network.straight("c", "d", pose, 60.0, Section())
     road = TrafficRoad(network)
     car = Car(1, network, [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)], 5.0, 8.0)
-    parked = Standing(2, ActorKind.PARKED, network.pose(("c", "d", 0), 8.0))
+    parked = StaticObject(2, ActorKind.PARKED, network.pose(("c", "d", 0), 8.0))
     put(road, car, parked)
 
     run(road, 20.0)
@@ -140,11 +140,13 @@ def test_manners_belong_to_one_car_and_leave_the_class_alone() -> None:
     network, _ = one_lane()
     before = {name: getattr(IDMVehicle, name) for name in ("TIME_WANTED", "DELTA")}
 
-    pushy = Car(1, network, [("a", "b", 0)], 5.0, 8.0, manners=Manners(headway_s=0.3))
+    pushy = Car(
+        1, network, [("a", "b", 0)], 5.0, 8.0, behaviour=Behaviour(headway_s=0.3)
+    )
     polite = Car(2, network, [("a", "b", 0)], 30.0, 8.0)
 
     assert pushy.TIME_WANTED == 0.3
-    assert Manners().headway_s == polite.TIME_WANTED
+    assert Behaviour().headway_s == polite.TIME_WANTED
     assert {name: getattr(IDMVehicle, name) for name in before} == before
 
 
@@ -180,8 +182,8 @@ boxes = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0), st.floats(-4.0, 4.
 def test_overlap_agrees_with_highway_env(
     one: tuple[float, float, float], other: tuple[float, float, float]
 ) -> None:
-    a = Standing(1, ActorKind.PARKED, Pose(*one))
-    b = Standing(2, ActorKind.VAN, Pose(*other))
+    a = StaticObject(1, ActorKind.PARKED, Pose(*one))
+    b = StaticObject(2, ActorKind.VAN, Pose(*other))
     still = np.zeros(2)
 
     expected, _, _ = are_polygons_intersecting(a.polygon(), b.polygon(), still, still)

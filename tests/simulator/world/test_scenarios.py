@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
 
-from me2e_compress.simulator.scenarios.catalogue import ABILITIES, SCENARIO_ABILITIES
-from me2e_compress.simulator.scenarios.registry import BUILDERS, stage_of
-from me2e_compress.simulator.scenarios.relatives import RELATIVES
-from me2e_compress.simulator.traffic.road import overlap
+from me2e_compress.metrics.abilities import ABILITIES
+from me2e_compress.simulator.scenarios.builders import BUILDERS, stage_of
+from me2e_compress.simulator.scenarios.catalogue import (
+    DIFFERENCES,
+    SCENARIO_ABILITIES,
+)
+from me2e_compress.simulator.traffic.traffic_road import overlap
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import route_of, sleepwalk
 
@@ -72,5 +75,5 @@ def test_the_room_beside_a_route_is_what_the_map_shows(name: str) -> None:
 
 
 def test_what_stands_in_for_a_type_is_documented() -> None:
-    assert set(RELATIVES) <= set(TYPES)
-    assert all(words[0].islower() for words in RELATIVES.values())
+    assert set(DIFFERENCES) <= set(TYPES)
+    assert all(words[0].islower() for words in DIFFERENCES.values())

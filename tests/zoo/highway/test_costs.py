@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.zoo.highway.bev_grid import cell_centres, grid_of, route_points
-from me2e_compress.zoo.highway.candidates import along
 from me2e_compress.zoo.highway.config import BevArea
 from me2e_compress.zoo.highway.costs import (
     DISCS_M,
@@ -23,6 +22,7 @@ from me2e_compress.zoo.highway.costs import (
     ground,
     occupied,
 )
+from me2e_compress.zoo.highway.planner import along
 
 FINE = BevArea(cell_m=1.0, rows=64, columns=48)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags
 from me2e_compress.evaluators.highway.expert.lateral_targets import Options, Place
-from me2e_compress.evaluators.highway.reference import beyond, reentry
+from me2e_compress.evaluators.highway.reentry import beyond, reentry
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Ego, RoutePath
 from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S

@@ -11,13 +11,13 @@ from me2e_compress.simulator.scenarios.scripts.synchronise import (
     release,
 )
 from me2e_compress.simulator.scene import SignalKind
-from me2e_compress.simulator.traffic.cars import Car, Manners
+from me2e_compress.simulator.traffic.cars import Behaviour, Car
 from me2e_compress.simulator.traffic.network import LaneIndex
 from me2e_compress.simulator.traffic.signals import Regulator
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
-HEEDLESS = Manners(sees_ego=False)
-DENSE = Manners(headway_s=0.8, jam_gap_m=3.0)
+HEEDLESS = Behaviour(sees_ego=False)
+DENSE = Behaviour(headway_s=0.8, jam_gap_m=3.0)
 
 
 def oncoming_platoon(stage: Stage, crossing: Crossing) -> Script:
@@ -67,7 +67,7 @@ def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
     begin = max(station - route_s - late, 0.0)
     for k in range(cars):
         lanes, local = on_chain(stage.network, other, max(begin - 14.0 * k, 0.0))
-        stage.car(lanes, local, float(stage.ego.speed), manners=DENSE)
+        stage.car(lanes, local, float(stage.ego.speed), behaviour=DENSE)
     chain = crossing.way("left", "right", crossing.lanes - 1)
     yield from _platoon(
         stage,
@@ -86,7 +86,7 @@ def near_and_far_flow(stage: Stage, crossing: Crossing) -> Script:
     for k in range(2):
         s = max(station - route_s - late - 15.0 * k, 0.0)
         lanes, local = on_chain(stage.network, far, s)
-        stage.car(lanes, local, 9.0, 10.0, manners=DENSE)
+        stage.car(lanes, local, 9.0, 10.0, behaviour=DENSE)
     chain = crossing.way("left", "right", 1)
     cars = stage.integer("cars", 3, 5)
     yield from _platoon(stage, chain, cars, "near_and_far_flow", _sign(crossing))
@@ -113,7 +113,7 @@ def side_flows(stage: Stage, street: Street) -> Script:
         chain, s = on_chain(
             stage.network, street.ahead(lane), street.start_m + 20.0 + ahead
         )
-        stage.car(chain, s, float(stage.ego.speed), manners=DENSE)
+        stage.car(chain, s, float(stage.ego.speed), behaviour=DENSE)
     change = float(stage.parameters["first_m"]) + 12.5
     yield from _beside(stage, street.ahead(1), 60.0, change, "side_flows", 2)
 
@@ -123,9 +123,9 @@ def bay_flow(stage: Stage, street: Street) -> Script:
     chain = street.ahead(0)
     route_s, _ = meeting(stage, chain)
     begin = street.start_m - stage.uniform("behind_m", 3.0, 6.0)
-    lead = stage.car(chain, begin, 3.0, manners=HEEDLESS)
+    lead = stage.car(chain, begin, 3.0, behaviour=HEEDLESS)
     for k in range(stage.integer("followers", 1, 3)):
-        stage.car(chain, begin - 11.0 * (k + 1), 3.0, 8.0, manners=DENSE)
+        stage.car(chain, begin - 11.0 * (k + 1), 3.0, 8.0, behaviour=DENSE)
     while stage.ahead_m(route_s) > 9.0:
         _keep_beside(stage, lead, 0.0, 3.0)
         yield
@@ -154,8 +154,8 @@ def _platoon(
         if s < 0:
             break
         lanes, local = on_chain(stage.network, chain, s)
-        manners = DENSE if k else HEEDLESS
-        row.append(stage.car(lanes, local, speed, 9.0, manners=manners))
+        behaviour = DENSE if k else HEEDLESS
+        row.append(stage.car(lanes, local, speed, 9.0, behaviour=behaviour))
     points = [meeting(stage, car.lanes) for car in row]
     if sign is not None and sign.kind is SignalKind.GIVE_WAY:
         sign.nearest_s = lambda: _nearest(row, [at for _, at in points])
@@ -175,11 +175,11 @@ def _beside(
     speed = float(stage.ego.speed)
     aside = stage.uniform("beside_m", -1.5, 1.5)
     row = [
-        stage.car(chain, start_m + aside - 13.0 * k, speed, manners=DENSE)
+        stage.car(chain, start_m + aside - 13.0 * k, speed, behaviour=DENSE)
         for k in range(cars)
     ]
     lead = row[0]
-    lead.manners = HEEDLESS
+    lead.behaviour = HEEDLESS
     while stage.ahead_m(change_s) > 22.0:
         _keep_beside(stage, lead, aside)
         yield

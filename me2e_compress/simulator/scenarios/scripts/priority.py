@@ -10,7 +10,7 @@ from me2e_compress.simulator.scenarios.scripts.synchronise import (
     patience,
 )
 from me2e_compress.simulator.scene import ActorKind, SignalState
-from me2e_compress.simulator.traffic.cars import Manners
+from me2e_compress.simulator.traffic.cars import Behaviour
 from me2e_compress.simulator.traffic.events import Event, EventKind
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
@@ -58,7 +58,7 @@ def invader(stage: Stage, street: Street) -> Script:
     kind = ActorKind(stage.choice("invader", ("car", "van")))
     s = total - (street.start_m + where + away)
     lanes, local = on_chain(stage.network, chain, s)
-    car = stage.car(lanes, local, 7.0, kind=kind, manners=Manners(sees_ego=False))
+    car = stage.car(lanes, local, 7.0, kind=kind, behaviour=Behaviour(sees_ego=False))
     _, lateral = stage.path.project(car.pose.x, car.pose.y)
     into = stage.uniform("invaded_m", 1.25, 1.45)
     car.offset_m = lateral - into
@@ -93,7 +93,7 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
         float(stage.ego.speed) + 5.0,
         18.0,
         ActorKind.EMERGENCY,
-        Manners(3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False),
+        Behaviour(3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False),
     )
     passed = [False]
 

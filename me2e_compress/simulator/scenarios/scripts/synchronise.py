@@ -98,7 +98,7 @@ def arrive_together(
         yield
     car.forced_mps2 = None
     car.target_speed = max(car.speed, 6.0)
-    car.manners = replace(car.manners, sees_ego=True)
+    car.behaviour = replace(car.behaviour, sees_ego=True)
 
 
 def _hurry(

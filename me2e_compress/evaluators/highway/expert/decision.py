@@ -1,26 +1,30 @@
-"""One decision of the expert: a pure function of what it is told."""
+"""The expert: one decision, a pure function of its arguments, and the policy on it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from me2e_compress.driving.contract import Plan
-from me2e_compress.evaluators.highway.expert.collisions import collision_cost
-from me2e_compress.evaluators.highway.expert.costs import (
+from me2e_compress.driving.contract import Observation, Plan, RouteInfo
+from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, forecast
+from me2e_compress.evaluators.highway.expert.future_costs import (
+    collision_cost,
     drive_cost,
     emergency_cost,
     headway_cost,
     rule_cost,
 )
-from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, forecast
 from me2e_compress.evaluators.highway.expert.futures import sample
 from me2e_compress.evaluators.highway.expert.lateral_targets import (
     Place,
     lateral_targets,
 )
-from me2e_compress.evaluators.highway.expert.speed import EASE_MPS2
-from me2e_compress.evaluators.highway.expert.stops import GIVE_WAY_MPS, Stop, obey
-from me2e_compress.evaluators.highway.reference import in_ego_frame, slope_of
+from me2e_compress.evaluators.highway.expert.speed_limits import (
+    ceiling,
+    obey,
+    slowed,
+)
+from me2e_compress.evaluators.highway.observe import scene_and_world
+from me2e_compress.evaluators.highway.reentry import in_ego_frame, slope_of
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import RoutePath, Scene
 from me2e_compress.simulator.world.privileged import Privileged
@@ -89,7 +93,7 @@ def decide(
     seen = forecast(scene, intents, path, s)
     stop = obey(scene, known.phases, seen, s, memory.served)
     options = lateral_targets(path, place, ego, seen)
-    future = sample(path, _slowed(top, stop), ego, place, options, stop.line_m)
+    future = sample(path, slowed(top, stop), ego, place, options, stop.line_m)
     cost = drive_cost(future, ego, place, memory.target_m)
     cost += rule_cost(future, path, ego, place, stop.line_m)
     if len(seen.length):
@@ -108,11 +112,29 @@ def decide(
     )
 
 
-def _slowed(top: Floats, stop: Stop) -> Floats:
-    """The ceiling with a give-way line ahead, if there is one."""
-    if stop.slow_m is None:
-        return top
-    before = np.maximum(stop.slow_m - np.arange(len(top)), 0.0)
-    slow = np.sqrt(GIVE_WAY_MPS**2 + 2 * EASE_MPS2 * before)
-    past = np.arange(len(top)) > stop.slow_m
-    return np.where(past, top, np.minimum(top, slow))
+@dataclass
+class Expert:
+    """Drives by `decide`, remembering its target lane and the signs it obeyed.
+
+    Args:
+        last: The last decision, for labels and pictures; None before the first.
+    """
+
+    needs_images: bool = field(default=False, init=False)
+    privileged: bool = field(default=True, init=False)
+    last: ExpertDecision | None = field(default=None, init=False)
+    _path: RoutePath | None = field(default=None, init=False, repr=False)
+    _top: Floats | None = field(default=None, init=False, repr=False)
+
+    def reset(self, route: RouteInfo) -> None:
+        """Forget the last route."""
+        self.last = self._path = self._top = None
+
+    def plan(self, observation: Observation) -> Plan:
+        """Return six waypoints [6, 2], metres in the ego frame, every 0.5 s."""
+        scene, world = scene_and_world(observation, "driver expert")
+        if self._top is None or self._path is not world.path:
+            self._path, self._top = world.path, ceiling(world.path)
+        memory = Memory() if self.last is None else self.last.memory
+        self.last = decide(scene, world.privileged(), world.path, self._top, memory)
+        return self.last.waypoints

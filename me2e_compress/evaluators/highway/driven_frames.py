@@ -9,7 +9,7 @@ from me2e_compress.driving.realtime import DT_US
 from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.durations import EXPERT_S
-from me2e_compress.evaluators.highway.endings import Rules
+from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.generate import propose, seed_of
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
@@ -88,7 +88,12 @@ def _look(
     policy: OnnxPolicy, route: Route, begin_us: int, count: int
 ) -> Iterator[dict[str, Array]]:
     """Feeds of the model from a moment on, until there are enough or the route ends."""
-    world, expert, controller, rules = World(route), Expert(), Controller(), Rules()
+    world, expert, controller, rules = (
+        World(route),
+        Expert(),
+        Controller(),
+        EndingRules(),
+    )
     rig = CameraRig(*policy.image_size)
     texture = paint_texture(world.roadmap, world.path.points)
     cameras = Cameras(texture, rig) if policy.needs_images else None

@@ -17,7 +17,7 @@ PATIENCE_S = 900.0
 
 
 @dataclass
-class Together:
+class ProcessGroup:
     """One row of shared memory a process, a barrier, and how far they are.
 
     Loopback sockets, which torch.distributed would use, cost more than the step on
@@ -42,7 +42,7 @@ class Together:
         steps = torch.zeros(1, dtype=torch.int64).share_memory_()
         return cls(rows, mp.get_context("spawn").Barrier(workers), steps)
 
-    def mean(self, rank: int, mine: Tensor) -> Tensor:
+    def average(self, rank: int, mine: Tensor) -> Tensor:
         """Average one flat tensor over the processes; every process must call."""
         count = mine.numel()
         self.rows[rank, :count] = mine
@@ -51,10 +51,10 @@ class Together:
         self.barrier.wait(PATIENCE_S)
         return found
 
-    def tell(self, step: int) -> None:
+    def report(self, step: int) -> None:
         """Let the process that started the others know how many steps are done."""
         self.steps[0] = step
 
-    def told(self) -> int:
+    def steps_done(self) -> int:
         """How many steps are done."""
         return int(self.steps[0])

@@ -1,4 +1,4 @@
-"""Where lights and signs make the expert stop."""
+"""How fast the expert may drive: limits and bends, and stops at lights and signs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,14 +6,35 @@ from dataclasses import dataclass
 import numpy as np
 
 from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast
+from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import (
     Ego,
+    RoutePath,
     Scene,
     Signal,
     SignalKind,
     SignalState,
 )
 from me2e_compress.simulator.world.privileged import Phase
+
+LATERAL_MPS2 = 2.2
+"""Lateral acceleration in bends; the comfort bound of nuPlan is 4.89."""
+EASE_MPS2 = 1.8
+"""Braking ahead of a bend or a lower limit."""
+SLOWEST_MPS = 2.5
+"""No bend is too tight for this."""
+
+
+def ceiling(path: RoutePath) -> Floats:
+    """[N] highest speed (m/s) at every metre of a route, without any traffic."""
+    window = np.full(5, 0.2)
+    bends = np.convolve(np.pad(np.abs(path.curvature), 2, mode="edge"), window, "valid")
+    in_bend = np.sqrt(LATERAL_MPS2 / np.maximum(bends, 1e-4))
+    top = np.minimum(path.speed_limits_mps, np.maximum(in_bend, SLOWEST_MPS))
+    for i in range(len(top) - 2, -1, -1):
+        top[i] = min(top[i], np.sqrt(top[i + 1] ** 2 + 2 * EASE_MPS2))
+    return top
+
 
 STANDING_MPS = 0.08
 """Slower than this has stopped; Bench2Drive asks for less than 0.1 m/s."""
@@ -80,6 +101,16 @@ def obey(
         if _closed(signal, gap, ego.speed_mps, served):
             lines.append(line - ego.length / 2 - min(BEFORE_LINE_M, gap))
     return Stop(min(lines, default=None), min(slow, default=None), served)
+
+
+def slowed(top: Floats, stop: Stop) -> Floats:
+    """The ceiling with a give-way line ahead, if there is one."""
+    if stop.slow_m is None:
+        return top
+    before = np.maximum(stop.slow_m - np.arange(len(top)), 0.0)
+    slow = np.sqrt(GIVE_WAY_MPS**2 + 2 * EASE_MPS2 * before)
+    past = np.arange(len(top)) > stop.slow_m
+    return np.where(past, top, np.minimum(top, slow))
 
 
 def somebody_comes(seen: Forecast, line_m: float, crossing_s: float) -> bool:

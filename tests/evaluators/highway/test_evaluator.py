@@ -16,7 +16,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
 from me2e_compress.evaluators.highway.durations import EXPERT_S, longest_first
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.evaluators.highway.jobs import (
+from me2e_compress.evaluators.highway.evaluator import (
     DrivingProgress,
     HighwayEvaluator,
 )
@@ -177,7 +177,7 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     program = (
         "import sys; from pathlib import Path;"
         "from me2e_compress.simulator.routes import load_routes;"
-        "from me2e_compress.evaluators.highway.jobs import HighwayEvaluator;"
+        "from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator;"
         "from me2e_compress.evaluators.highway.engine import LocalEngine;"
         "from me2e_compress.evaluators.highway.drivers import BlindDriver;"
         "from me2e_compress.evaluators.highway.runner import Conditions;"

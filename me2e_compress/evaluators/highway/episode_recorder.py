@@ -48,7 +48,7 @@ ENDINGS = {
 
 
 @dataclass
-class Recorder:
+class EpisodeRecorder:
     """Writes down one route: a frame every 50 ms, whatever the world's own step."""
 
     world: World
@@ -80,7 +80,7 @@ class Recorder:
         )
 
 
-def unrecorded(route: Route, completion_percent: float, failure: str) -> Episode:
+def failed_episode(route: Route, completion_percent: float, failure: str) -> Episode:
     """Return the episode of a route whose driver took the record down with it."""
     world = World(route)
     return Episode(

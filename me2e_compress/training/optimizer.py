@@ -1,11 +1,11 @@
-"""Gradients of all processes to better weights."""
+"""The optimizer step on averaged gradients, and the running mean of the weights."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.training.together import Together
+from me2e_compress.training.process_group import ProcessGroup
 
 CLIP = 5.0
 """Longest gradient: a batch with a wreck in it must not undo a hundred others."""
@@ -15,23 +15,21 @@ AVERAGED = 0.998
 """Decay of the running mean of the weights: it looks back over about 500 steps."""
 
 
-class Descent:
+class AveragedAdamW:
     """AdamW (Loshchilov and Hutter, 2019) on gradients averaged over processes."""
 
     def __init__(
-        self, learning: Sequence[nn.Parameter], rate: float, together: Together
+        self, learning: Sequence[nn.Parameter], rate: float, group: ProcessGroup
     ) -> None:
         """Prepare the optimizer.
 
         Args:
             learning: parameters, the same in every process.
             rate: first learning rate.
-            together: the processes.
+            group: the processes.
         """
-        self.learning, self.together = list(learning), together
-        self.optimizer = torch.optim.AdamW(
-            self.learning, rate, weight_decay=WEIGHT_DECAY
-        )
+        self.learning, self.group = list(learning), group
+        self.adamw = torch.optim.AdamW(self.learning, rate, weight_decay=WEIGHT_DECAY)
 
     def step(self, loss: Tensor, rate: float, rank: int) -> None:
         """Take one step down; every process must call it.
@@ -41,32 +39,32 @@ class Descent:
             rate: learning rate of this step.
             rank: of this process.
         """
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        self.optimizer.zero_grad()
+        for parameters in self.adamw.param_groups:
+            parameters["lr"] = rate
+        self.adamw.zero_grad()
         loss.backward()
         self._average(rank)
         torch.nn.utils.clip_grad_norm_(self.learning, CLIP)
-        self.optimizer.step()
+        self.adamw.step()
 
     def _average(self, rank: int) -> None:
         grads = [
             p.grad if p.grad is not None else torch.zeros_like(p) for p in self.learning
         ]
-        flat = self.together.mean(rank, torch.cat([g.flatten() for g in grads]))
+        flat = self.group.average(rank, torch.cat([g.flatten() for g in grads]))
         parts = flat.split([p.numel() for p in self.learning])
         for p, part in zip(self.learning, parts, strict=True):
             p.grad = part.view_as(p)
 
 
-class Mean:
+class WeightAverage:
     """Running mean of the weights (Polyak and Juditsky, 1992), which is what drives."""
 
     def __init__(self, model: nn.Module) -> None:
         """Begin with the weights of a model."""
         self.weights = {k: v.clone() for k, v in model.state_dict().items()}
 
-    def follow(self, model: nn.Module, step: int) -> None:
+    def update(self, model: nn.Module, step: int) -> None:
         """Move towards the weights of a model, fast in the first steps.
 
         Args:

@@ -25,7 +25,7 @@ ROAD = (
 
 
 @dataclass
-class Targets:
+class Labels:
     """Labels of B samples.
 
     Attributes:
@@ -67,7 +67,7 @@ class Targets:
     shift_m: Tensor
 
 
-def targets_of(batch: dict[str, Array], area: BevArea) -> Targets:
+def labels_of(batch: dict[str, Array], area: BevArea) -> Labels:
     """Turn recorded arrays [B, ...] into labels."""
     agents = torch.from_numpy(np.asarray(batch["agents"], np.float32))
     futures = torch.from_numpy(np.asarray(batch["futures"], np.float32))
@@ -82,7 +82,7 @@ def targets_of(batch: dict[str, Array], area: BevArea) -> Targets:
     steps = torch.from_numpy(np.asarray(batch["known_steps"], np.int64))
     attributes = _tensor(batch["path_attributes"])
     attributes[..., :3].clamp_(max=WIDEST_M)
-    return Targets(
+    return Labels(
         agents,
         agents[..., 0] >= 0,
         row * area.columns + column,

@@ -5,7 +5,7 @@ from typing import cast
 
 import pytest
 
-from me2e_compress.evaluators.highway.record import Recorder
+from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.simulator.scene import Actor, ActorKind, Scene
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.tiny_world import actor, ego_at
@@ -13,7 +13,7 @@ from tests.evaluators.highway.tiny_world import actor, ego_at
 
 def traffic_speed(*actors: Actor) -> float | None:
     """Return the speed of the traffic that a frame keeps; the ego stands at (5, 0)."""
-    recorder = Recorder(cast(World, SimpleNamespace(progress_m=0.0)))
+    recorder = EpisodeRecorder(cast(World, SimpleNamespace(progress_m=0.0)))
     recorder.see(Scene(0, ego_at(5.0, 0.0), actors, ()))
     (frame,) = recorder.frames
     return frame.traffic_speed_mps

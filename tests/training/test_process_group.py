@@ -8,29 +8,29 @@ import torch.multiprocessing as mp
 from torch.multiprocessing.spawn import spawn
 
 from me2e_compress.training.losses import LampHead
-from me2e_compress.training.together import Together
+from me2e_compress.training.process_group import ProcessGroup
 from me2e_compress.zoo.highway.stack import Highway
 from tests.training.made import LITTLE
 
 
-def average(rank: int, together: Together, answers: torch.Tensor) -> None:
+def average(rank: int, group: ProcessGroup, answers: torch.Tensor) -> None:
     """Twice, so that the second must not meet what the first left behind."""
     for turn in range(2):
         mine = torch.arange(5.0) * (rank + 1) + 100 * turn
-        answers[rank, turn] = together.mean(rank, mine)
+        answers[rank, turn] = group.average(rank, mine)
     if rank == 0:
-        together.tell(2)
+        group.report(2)
 
 
 @pytest.fixture(scope="module")
-def together() -> Together:
-    return Together.of(3, LITTLE)
+def group() -> ProcessGroup:
+    return ProcessGroup.of(3, LITTLE)
 
 
 @pytest.fixture(scope="module")
-def answers(together: Together) -> torch.Tensor:
+def answers(group: ProcessGroup) -> torch.Tensor:
     answers: torch.Tensor = torch.full((3, 2, 5), torch.nan).share_memory_()
-    spawn(average, (together, answers), 3)
+    spawn(average, (group, answers), 3)
     return answers
 
 
@@ -40,22 +40,22 @@ def test_every_process_gets_the_mean(answers: torch.Tensor) -> None:
 
 
 @pytest.mark.usefixtures("answers")
-def test_who_waits_is_told_how_far_they_are(together: Together) -> None:
-    assert together.told() == 2
+def test_who_waits_is_told_how_far_they_are(group: ProcessGroup) -> None:
+    assert group.steps_done() == 2
 
 
-def test_there_is_room_for_all_that_learns(together: Together) -> None:
+def test_there_is_room_for_all_that_learns(group: ProcessGroup) -> None:
     modules = (Highway(LITTLE), LampHead(LITTLE.channels))
     numbers = sum(p.numel() for module in modules for p in module.parameters())
-    assert together.rows.shape == (3, numbers)
+    assert group.rows.shape == (3, numbers)
 
 
 def test_who_waits_in_vain_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("me2e_compress.training.together.PATIENCE_S", 0.1)
-    alone = Together(
+    monkeypatch.setattr("me2e_compress.training.process_group.PATIENCE_S", 0.1)
+    alone = ProcessGroup(
         torch.zeros(2, 5),
         mp.get_context("spawn").Barrier(2),
         torch.zeros(1, dtype=torch.int64),
     )
     with pytest.raises(threading.BrokenBarrierError):
-        alone.mean(0, torch.zeros(5))
+        alone.average(0, torch.zeros(5))

@@ -1,10 +1,10 @@
-"""The expert's plan: which candidate, and how it bends."""
+"""Losses of the plan: which candidate, how it bends, and what it would hit."""
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from me2e_compress.training.labels import Targets
+from me2e_compress.training.label_tensors import Labels
 from me2e_compress.zoo.highway.config import STEP_S, STEPS, BevArea
 from me2e_compress.zoo.highway.costs import (
     agent_costs,
@@ -34,7 +34,7 @@ DECISIVE = 2.0
 
 
 def plan_losses(
-    candidates: Candidates, wanted: Targets, area: BevArea
+    candidates: Candidates, wanted: Labels, area: BevArea
 ) -> dict[str, Tensor]:
     """Choice, the distance of the right candidate, and what the choice would hit.
 
@@ -68,7 +68,7 @@ def plan_losses(
 
 
 @torch.no_grad()
-def true_harm(candidates: Candidates, wanted: Targets, area: BevArea) -> Tensor:
+def true_harm(candidates: Candidates, wanted: Labels, area: BevArea) -> Tensor:
     """[B, K] what each candidate would have met (rules as targets: Hydra-MDP, 2024).
 
     Overlap with where everybody really was, ground that is no road, lines of lights
@@ -90,7 +90,7 @@ def true_harm(candidates: Candidates, wanted: Targets, area: BevArea) -> Tensor:
 
 
 @torch.no_grad()
-def doomed(wanted: Targets) -> Tensor:
+def doomed(wanted: Labels) -> Tensor:
     """[B] whether the expert's own plan meets somebody soon."""
     plan = wanted.plan
     step = torch.diff(plan, dim=1, prepend=torch.zeros_like(plan[:, :1]))
@@ -101,7 +101,7 @@ def doomed(wanted: Targets) -> Tensor:
     return soon
 
 
-def _overlap(plans: Tensor, headings: Tensor, wanted: Targets) -> Tensor:
+def _overlap(plans: Tensor, headings: Tensor, wanted: Labels) -> Tensor:
     """[B, K, 12] with where everybody really was, every quarter of a second."""
     agents = wanted.agents
     columns = [1, 2, 5, 6, 3, 4, 7, 8]
@@ -117,7 +117,7 @@ def _overlap(plans: Tensor, headings: Tensor, wanted: Targets) -> Tensor:
     return overlap
 
 
-def displacement(plans: Tensor, wanted: Targets) -> Tensor:
+def displacement(plans: Tensor, wanted: Labels) -> Tensor:
     """[B] mean distance of plans [B, 6, 2] from the expert's, metres."""
     away: Tensor = (plans - wanted.plan).norm(dim=-1)
     return away.mean(-1)

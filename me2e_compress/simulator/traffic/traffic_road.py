@@ -61,7 +61,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
                 blocking |= np.abs(r - r[row]) < room
             blocking &= (s >= 0) & (s <= self.table.length[column]) & (s + offset > 0)
             blocking[row] = False
-            if not car.manners.sees_ego:
+            if not car.behaviour.sees_ego:
                 blocking &= ~self._ego
             if blocking.any():
                 ahead = np.where(blocking, s, np.inf)
