@@ -2,8 +2,13 @@
 
 from me2e_compress.modules.assign import Assignment, Placement, assign
 from me2e_compress.modules.detect import detect, map_of
-from me2e_compress.modules.inventory import Inventory, WeightEntry, inventory
-from me2e_compress.modules.itemise import Item, itemise
+from me2e_compress.modules.inventory import (
+    Inventory,
+    Item,
+    WeightEntry,
+    inventory,
+    itemise,
+)
 from me2e_compress.modules.module_map import (
     Module,
     ModuleMap,
@@ -11,8 +16,7 @@ from me2e_compress.modules.module_map import (
     Substitute,
     presets,
 )
-from me2e_compress.modules.patterns import Pattern
-from me2e_compress.modules.scopes import exits, scope_of
+from me2e_compress.modules.paths import Pattern, exits, scope_of
 
 __all__ = [
     "Assignment",

@@ -1,22 +1,21 @@
-"""Every node gets a module: by its parameters, by its scope, by its neighbours."""
+"""Assign every node to a module: by its parameters, its scope, its neighbours."""
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal
 
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.modules.module_map import ModuleMap
-from me2e_compress.modules.neighbours import spread
-from me2e_compress.modules.parameters import by_parameter, is_constant, parameter_path
-from me2e_compress.modules.scopes import scope_of
+from me2e_compress.modules.parameters import by_parameter, is_constant
+from me2e_compress.modules.paths import parameter_path, scope_of
 
 Rule = Literal["stamp", "parameter", "scope", "neighbour"]
 
 STAMP = "me2e.module"
-"""Node metadata in which an imported graph already says its module."""
+"""Node metadata that holds the module in a graph that was imported before."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,11 +39,11 @@ class Assignment:
     placements: Mapping[ir.Node, Placement]
 
     def module_of(self, node: ir.Node) -> str:
-        """Name the module of a node of the graph that was assigned."""
+        """Return the module of a node of the graph that was assigned."""
         return self.placements[node].module
 
     def rule_of(self, node: ir.Node) -> Rule:
-        """Say which rule decided."""
+        """Return which rule decided."""
         return self.placements[node].rule
 
     def nodes(self, module: str) -> list[ir.Node]:
@@ -61,15 +60,15 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
 
     The first rule that knows decides:
 
-    0. *stamp*: the node says it itself, being of a graph that was imported before;
+    0. *stamp*: the node's own metadata, in a graph that was imported before;
     1. *parameter*: names of the initializers that reach it, directly or through
        arithmetic of constants alone (Transpose, Cast, Reshape of a weight); a MatMul
        whose weight lost its name goes by the bias added to it. An initializer that
        scopes of several modules read was merged by the exporter and decides nothing;
     2. *scope*: the torch module whose forward made it, see :func:`scope_of`;
     3. *neighbour*: the one module that all its results go to; else the nearest node
-       that has a module, the producer first, then the consumer: see :func:`spread`.
-       Constants go by their consumers.
+       that has a module, the producer first, then the consumer. Constants go by
+       their consumers.
 
     Raises:
         ModuleMapError: a required pattern matches nothing, or none at all does.
@@ -104,7 +103,7 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
             f"map {modules.name}: none of its patterns matches a parameter or a scope"
             f" of this graph, which has {_sample(model, scopes)}"
         )
-    for node, module in spread(nodes, known, constant).items():
+    for node, module in _spread(nodes, known, constant).items():
         placed.setdefault(node, Placement(module, "neighbour"))
     return Assignment(modules, {node: placed[node] for node in nodes})
 
@@ -134,3 +133,64 @@ def _parameters(model: ir.Model) -> list[str]:
     return [
         parameter_path(name) for graph in model.graphs() for name in graph.initializers
     ]
+
+
+def _spread(
+    nodes: Sequence[ir.Node],
+    known: Mapping[ir.Node, str],
+    constant: Collection[ir.Node],
+) -> dict[ir.Node, str]:
+    """Assign the nodes without a name of their own, in a few sweeps over the graph.
+
+    1. A node whose results all end up in one module, whatever glue they pass on the
+       way, prepares that module's input and is of it.
+    2. A node whose results go to several modules, or out of the graph, is of the
+       module it gets its data from: of its producers, the one that comes last.
+    3. What reads no data, as constants do, goes with the consumer that comes first.
+    4. What hangs on nothing goes with the node before it (in a subgraph: with the node
+       that holds it), at the very start with the one after.
+
+    Args:
+        nodes: all nodes, in graph order.
+        known: the modules of those with a name; must not be empty.
+        constant: nodes that compute from constants alone, which do not count as
+            producers.
+
+    Returns:
+        The module of every node, those that were known included.
+    """
+    place = {node: index for index, node in enumerate(nodes)}
+    found = dict(known) | _single_destinations(nodes, known)
+    for node in nodes:
+        if node in found or node in constant:
+            continue
+        makers = [value.producer() for value in node.inputs if value is not None]
+        heard = [m for m in makers if m in found and m not in constant]
+        if heard:
+            found[node] = found[max(heard, key=place.__getitem__)]
+    for node in reversed(nodes):
+        heard = [reader for reader in _readers(node) if reader in found]
+        if node not in found and heard:
+            found[node] = found[min(heard, key=place.__getitem__)]
+    last = next(found[node] for node in nodes if node in found)
+    for node in nodes:
+        last = found.setdefault(node, last)
+    return found
+
+
+def _single_destinations(
+    nodes: Sequence[ir.Node], known: Mapping[ir.Node, str]
+) -> dict[ir.Node, str]:
+    """Return the unknown nodes whose results all end up in one module."""
+    goals: dict[ir.Node, str | None] = {}
+    for node in reversed(nodes):
+        if node in known:
+            continue
+        heard = {known.get(r) or goals.get(r): None for r in _readers(node)}
+        outside = any(value.is_graph_output() for value in node.outputs)
+        goals[node] = next(iter(heard)) if len(heard) == 1 and not outside else None
+    return {node: module for node, module in goals.items() if module is not None}
+
+
+def _readers(node: ir.Node) -> list[ir.Node]:
+    return [reader for value in node.outputs for reader in value.consumers()]

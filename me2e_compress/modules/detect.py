@@ -1,11 +1,10 @@
-"""Which preset a graph is of."""
+"""Find the preset that fits a graph."""
 
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.modules.module_map import ModuleMap, presets
-from me2e_compress.modules.parameters import parameter_path
-from me2e_compress.modules.scopes import scope_of
+from me2e_compress.modules.paths import parameter_path, scope_of
 
 STACK = "me2e.stack"
 """Model metadata in which our exporters name the stack, e.g. ``vad-tiny``."""

@@ -1,4 +1,4 @@
-"""Which part of an ME2E stack goes by which names."""
+"""Module maps: which part of an ME2E stack goes by which names."""
 
 import dataclasses
 import functools
@@ -11,14 +11,14 @@ from typing import Literal, Self
 import pydantic
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules.patterns import Pattern, is_malformed
+from me2e_compress.modules.paths import Pattern, is_malformed
 
 Role = Literal["feature", "prediction"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Substitute:
-    """What stands in for a scope while a module is ablated.
+    """What substitutes the result of a scope while a module is ablated.
 
     Attributes:
         scope: pattern of the scope whose result must no longer depend on the module.
@@ -126,15 +126,15 @@ class ModuleMap:
 
     @classmethod
     def whole(cls) -> Self:
-        """Make the map of a graph that is one module, ``model``, and no ME2E stack."""
+        """Return the map of a graph that is no ME2E stack: one module, ``model``."""
         return cls("whole", (Module("model", "feature", (), ("**",)),))
 
     def names(self, role: Role | None = None) -> tuple[str, ...]:
-        """Name the modules, all or those of a role, in the order of the file."""
+        """List the modules, all or those of a role, in the order of the file."""
         return tuple(m.name for m in self.modules if role in (None, m.role))
 
     def module(self, name: str) -> Module:
-        """Give a module by its name.
+        """Return a module by its name.
 
         Raises:
             ModuleMapError: the map has no such module.
@@ -148,7 +148,7 @@ class ModuleMap:
         )
 
     def match(self, path: str) -> str | None:
-        """Name the module that a dotted path belongs to; None if none claims it."""
+        """Return the module that a dotted path belongs to; None if none claims it."""
         return self._match(path)
 
     def claims(self, path: str) -> list[tuple[str, str]]:
@@ -190,7 +190,7 @@ class ModuleMap:
 
 
 def presets() -> tuple[str, ...]:
-    """Name the maps that come with the package."""
+    """List the maps that come with the package."""
     files = (Path(item.name) for item in _folder().iterdir())
     return tuple(sorted(file.stem for file in files if file.suffix == ".toml"))
 

@@ -1,23 +1,15 @@
-"""What the names of weights say about the nodes that read them."""
+"""Modules of nodes by the names of the weights that reach them."""
 
 from collections.abc import Collection, Mapping, Sequence
 
 import onnx_ir as ir
 
 from me2e_compress.modules.module_map import ModuleMap
-
-
-def parameter_path(name: str | None) -> str:
-    """Give an initializer's dotted path; empty for names that tools made up.
-
-    The TorchScript exporter's ``onnx::MatMul_123`` and values of nodes
-    (``/img_neck/Constant_output_0``) are no parameter names.
-    """
-    return "" if not name or ":" in name or "/" in name else name
+from me2e_compress.modules.paths import parameter_path
 
 
 def is_constant(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
-    """Find the nodes that compute from constants alone. Nodes come in graph order."""
+    """Return the nodes that compute from constants alone; nodes come in graph order."""
     found: set[ir.Node] = set()
     for node in nodes:
         if _holds_a_graph(node):
@@ -33,12 +25,12 @@ def by_parameter(
     by_scope: Mapping[ir.Node, str],
     constant: Collection[ir.Node],
 ) -> dict[ir.Node, str]:
-    """Place the nodes that named parameters reach.
+    """Return the module of every node that named parameters reach.
 
     Args:
         nodes: all nodes, in graph order.
         modules: the map.
-        by_scope: what scopes say, to tell merged initializers.
+        by_scope: module of each node by its scope, to recognise merged initializers.
         constant: the nodes that compute from constants alone.
     """
     claims: dict[ir.Value, str | None] = {}
@@ -66,7 +58,7 @@ def by_parameter(
 def _copied(
     node: ir.Node, modules: ModuleMap, constant: Collection[ir.Node]
 ) -> list[str]:
-    """Name the module of a parameter that is stored as a copy of an equal one.
+    """Return the module of a parameter that is stored as a copy of an equal one.
 
     TorchScript's exporter writes parameters of equal numbers once, and the others as
     an Identity of it that has their name.

@@ -1,4 +1,4 @@
-"""What a model sees at one moment."""
+"""Frames: what a model sees at one moment."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -15,9 +15,9 @@ class Frame:
     """The inputs of one moment.
 
     Attributes:
-        index: place in the recording, from 0.
+        index: position in the recording, from 0.
         starts_scene: True where a new scene begins: recurrent state is reset here.
-        arrays: one array for every input, by input name; recurrent inputs may lack.
+        arrays: one array for every input, by input name; recurrent ones may be missing.
     """
 
     index: int

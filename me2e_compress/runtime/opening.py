@@ -1,4 +1,4 @@
-"""A graph in memory becomes an onnxruntime session, its weights lent, not written out.
+"""Open a graph as an onnxruntime session, its weights lent, not written out.
 
 What onnxruntime is given is the graph without its large weights, as if they lay in a
 file, and the arrays themselves in the place of that file. So no weight is serialized,
@@ -18,8 +18,7 @@ import onnxruntime as ort
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
-from me2e_compress.runtime.native import REFUSALS
-from me2e_compress.runtime.supported import can_run
+from me2e_compress.runtime.native import REFUSALS, unsupported
 
 _INT8_STAYS = "session.qdqisint8allowed"
 LENT_BYTES = 1024
@@ -63,7 +62,7 @@ def open_graph(
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
     """
-    if reason := can_run(model):
+    if reason := unsupported(model):
         raise GraphError(reason)
     lent = {
         name: tensor
@@ -102,7 +101,7 @@ def _without(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> onnx.Mod
 
 
 def _needs_file(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> bool:
-    """Say whether what is not lent lies in files, or is too large for one message."""
+    """Return whether what is not lent lies in files, or fits no single message."""
     kept = [
         tensor
         for each in model.graphs()
@@ -117,7 +116,7 @@ def _needs_file(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> bool:
 
 
 def _build(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
-    """Open a graph; where that fails, without the step that makes int8 uint8.
+    """Open a graph; where that fails, again without the step that makes int8 uint8.
 
     From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
     ``output_dtype`` is not that of their zero point, and then refuses them.

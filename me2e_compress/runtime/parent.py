@@ -1,4 +1,4 @@
-"""Leave no orphans."""
+"""Worker processes that end with their parent."""
 
 import os
 import threading
@@ -6,7 +6,7 @@ from multiprocessing import parent_process
 
 
 def end_with_parent() -> None:
-    """End this process when its parent does: it would wait for ever."""
+    """End this process when its parent does; it would wait for ever."""
     parent = parent_process()
     if parent is None:
         return

@@ -1,4 +1,4 @@
-"""Where the plan stands among a model's outputs."""
+"""Read the planned waypoints off a model's outputs."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ class PlanAdapter(pydantic.BaseModel):
         """Read it from a model's metadata; else an output named ``plan`` is the plan.
 
         Returns:
-            The adapter; None if the model does not say where its plan is.
+            The adapter; None if the model does not name its plan.
 
         Raises:
             GraphError: the metadata is malformed or names an output that is not there.
@@ -53,7 +53,9 @@ class PlanAdapter(pydantic.BaseModel):
             found = cls.model_validate(json.loads(text))
         except (json.JSONDecodeError, pydantic.ValidationError) as error:
             first = str(error).splitlines()[0]
-            raise GraphError(f"metadata {PLAN} is not a plan: {first}") from error
+            raise GraphError(
+                f"metadata {PLAN} is not a plan adapter: {first}"
+            ) from error
         if found.output not in outputs:
             raise GraphError(
                 f"metadata {PLAN} names output {found.output}; there is"
@@ -62,7 +64,7 @@ class PlanAdapter(pydantic.BaseModel):
         return found
 
     def plan(self, outputs: Arrays, inputs: Arrays) -> npt.NDArray[np.float64]:
-        """Give the waypoints, metres in the ego frame, float64 [waypoints, 2].
+        """Return the waypoints, metres in the ego frame, float64 [waypoints, 2].
 
         Raises:
             GraphError: the output has another rank, or no such mode.

@@ -1,4 +1,4 @@
-"""How long a model takes on this machine, alone and warm."""
+"""Measure how long a model takes on this machine, alone and warm."""
 
 import platform
 import time
@@ -24,7 +24,7 @@ def profile(
     threads: int = 1,
     on_sample: Callable[[int, int], None] = lambda done, total: None,
 ) -> LatencyTrace:
-    """Run a model over frames one at a time and write down every latency.
+    """Measure the latency of a model on every frame, one at a time.
 
     Recurrent state is fed forward and reset where scenes begin; reading a frame is
     not counted. The recording is repeated as often as it takes.
@@ -58,7 +58,7 @@ def profile(
 
 
 class TimedSession(Session):
-    """A session that writes down how long each run took.
+    """A session that records how long each run took.
 
     Attributes:
         taken_us: Microseconds, one a run.
@@ -71,7 +71,7 @@ class TimedSession(Session):
     def run(
         self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
     ) -> dict[str, Array]:
-        """Run once, by the clock."""
+        """Run once and record the time."""
         begun = time.perf_counter_ns()
         values = super().run(feeds, outputs)
         self.taken_us.append((time.perf_counter_ns() - begun) // 1_000)
@@ -79,7 +79,7 @@ class TimedSession(Session):
 
 
 def processor() -> str:
-    """Name the processor of this machine as the system knows it."""
+    """Return the name of this machine's processor, as the system knows it."""
     table = Path("/proc/cpuinfo")
     if table.is_file():
         for line in table.read_text("utf-8").splitlines():

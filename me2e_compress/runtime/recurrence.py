@@ -9,7 +9,7 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError
 
 RECURRENT = "me2e.recurrent"
-"""Metadata key: JSON ``{input: output}``; ``{}`` says that nothing is fed back."""
+"""Metadata key: JSON ``{input: output}``; ``{}`` where nothing is fed back."""
 
 SUFFIX = "_out"
 
@@ -65,7 +65,7 @@ def recurrence(
 
 
 def recurrent_inputs(model: ir.Model) -> dict[str, str]:
-    """Do the same for a graph in memory: its ``{recurrent input: output}``."""
+    """Return the ``{recurrent input: output}`` of a graph in memory."""
     return recurrence(
         model.metadata_props, _ports(model.graph.inputs), _ports(model.graph.outputs)
     )

@@ -1,4 +1,4 @@
-"""One graph, ready to run on the CPU."""
+"""Sessions: one graph, ready to run on the CPU."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,9 +13,8 @@ from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.native import REFUSALS, InvalidArgument
 from me2e_compress.runtime.opening import Weights, open_file, open_graph
 from me2e_compress.runtime.recurrence import SessionPort, recurrence
-from me2e_compress.runtime.supported import can_run
 
-__all__ = ["Session", "SessionPort", "can_run", "replay", "run_once"]
+__all__ = ["Session", "SessionPort", "replay", "run_once"]
 
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
     "tensor(float)": np.dtype(np.float32),
@@ -109,7 +108,7 @@ class Session:
         """Run once.
 
         Args:
-            feeds: one array for every input; further names are left aside.
+            feeds: one array for every input; other names are ignored.
             outputs: which to return; None for all.
 
         Raises:
@@ -177,7 +176,7 @@ def replay(
 
 
 def run_once(model: ir.Model, feeds: Mapping[str, Array]) -> dict[str, Array]:
-    """Build, run and drop: for evaluating a few constants.
+    """Run a graph once in a session of its own: for evaluating a few constants.
 
     Raises:
         GraphError: onnxruntime cannot run this graph.

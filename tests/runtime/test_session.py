@@ -8,7 +8,8 @@ from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.session import Session, can_run, replay, run_once
+from me2e_compress.runtime.native import unsupported
+from me2e_compress.runtime.session import Session, replay, run_once
 
 COUNTER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -88,8 +89,11 @@ def test_state_of_open_shape_needs_a_first_value() -> None:
 def test_an_unknown_operator_is_named(counter: ir.Model) -> None:
     plugin = ir.from_onnx_text(PLUGIN)
 
-    assert can_run(counter) is None
-    assert can_run(plugin) == "onnxruntime has no operator vendor::Rotate (node 'turn')"
+    assert unsupported(counter) is None
+    assert (
+        unsupported(plugin)
+        == "onnxruntime has no operator vendor::Rotate (node 'turn')"
+    )
     with pytest.raises(GraphError, match="vendor::Rotate"):
         Session(plugin)
 

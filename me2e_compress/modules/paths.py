@@ -1,17 +1,76 @@
-"""The module path of a node, as the exporters write it down."""
+"""Dotted paths: those that nodes and weights are named by, and patterns over them."""
 
 import ast
+import dataclasses
+import functools
+from fnmatch import fnmatchcase
 
 import onnx_ir as ir
-
-from me2e_compress.modules.patterns import Pattern
 
 _SCOPES = "pkg.torch.onnx.name_scopes"
 _NAMESPACE = "namespace"
 
 
+@dataclasses.dataclass(frozen=True)
+class Pattern:
+    """A glob over whole components of a dotted path.
+
+    ``pts_bbox_head.transformer.encoder`` matches that path and everything below it;
+    ``*`` and ``?`` are wild within a component (``layers.*.norms``, ``pos_mlp*``).
+    A pattern that begins with ``*.`` or ``**.`` may match anywhere in the path, not
+    only from its root: ``*.cls_branches`` matches ``head.cls_branches.0.weight``.
+    ``**`` alone matches every path.
+    """
+
+    text: str
+
+    @functools.cached_property
+    def components(self) -> tuple[str, ...]:
+        """What is written out, without the leading ``*.`` of an anywhere pattern."""
+        parts = tuple(self.text.split("."))
+        return parts[1:] if self.anywhere else parts
+
+    @functools.cached_property
+    def anywhere(self) -> bool:
+        """Whether the match may begin below the root."""
+        head, dot, _ = self.text.partition(".")
+        return head == "**" or (head == "*" and bool(dot))
+
+    def reach(self, path: tuple[str, ...]) -> int | None:
+        """Count the components of a path up to the end of the deepest match.
+
+        None if the pattern does not match the path.
+        """
+        last = len(path) - len(self.components) if self.anywhere else 0
+        for start in range(last, -1, -1):
+            if self._matches_at(path, start):
+                return start + len(self.components)
+        return None
+
+    def _matches_at(self, path: tuple[str, ...], start: int) -> bool:
+        window = path[start : start + len(self.components)]
+        return len(window) == len(self.components) and all(
+            part == wanted or fnmatchcase(part, wanted)
+            for part, wanted in zip(window, self.components, strict=True)
+        )
+
+
+def is_malformed(text: str) -> bool:
+    """Return whether a text cannot be a pattern: empty, or an empty component."""
+    return not text or any(not part for part in text.split("."))
+
+
+def parameter_path(name: str | None) -> str:
+    """Return an initializer's dotted path; empty for names that tools made up.
+
+    The TorchScript exporter's ``onnx::MatMul_123`` and values of nodes
+    (``/img_neck/Constant_output_0``) are not parameter names.
+    """
+    return "" if not name or ":" in name or "/" in name else name
+
+
 def scope_of(node: ir.Node) -> str:
-    """Give the dotted path of the torch module whose forward made a node.
+    """Return the dotted path of the torch module whose forward made a node.
 
     Read, in this order, from
 
