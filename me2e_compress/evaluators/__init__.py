@@ -1,1 +1,19 @@
-"""What drives a compressed model and scores the drive."""
+"""What drives a compressed model, or reads how it drove.
+
+To add an evaluator: write its class, then add it to this table.
+"""
+
+from me2e_compress.driving.contract import Evaluator
+from me2e_compress.errors import EvaluationError
+from me2e_compress.registry import Registry
+
+__all__ = ["EVALUATORS", "Evaluator"]
+
+_HERE = "me2e_compress.evaluators"
+
+EVALUATORS: Registry[Evaluator] = Registry(
+    "evaluator",
+    _HERE,
+    EvaluationError,
+    {"highway": f"{_HERE}.highway.evaluation_options:Highway"},
+)

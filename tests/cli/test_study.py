@@ -4,8 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.cli.commands import evaluate, study
+from me2e_compress.cli.commands import study
 from me2e_compress.errors import StudyError
+from me2e_compress.evaluators.highway import evaluation_options
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import Study
 from me2e_compress.zoo.shipped import shipped
@@ -142,7 +143,7 @@ def test_an_engine_nobody_knows(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(study, "engine_of", evaluate.engine_of)
+    monkeypatch.setattr(study, "engine_of", evaluation_options.engine_of)
 
     assert command("study", toml, "-o", tmp_path / "out", "--engine", "cloud") == 1
     assert "engine 'cloud'" in capsys.readouterr().err

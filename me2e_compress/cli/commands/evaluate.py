@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import TypeAdapter, ValidationError
 from rich.markup import escape
 
 from me2e_compress.cli.commands.score import scores_table
@@ -13,18 +12,19 @@ from me2e_compress.cli.drivers import driver_of
 from me2e_compress.cli.limits import check_number
 from me2e_compress.cli.output import check_folder
 from me2e_compress.driving.latency import parse_latency
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import image_size_of
-from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
-from me2e_compress.evaluators.highway.engine_ray import RayEngine
+from me2e_compress.evaluators.highway.evaluation_options import (
+    engine_of,
+    routes_named,
+    weather_of,
+)
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.render import render
 from me2e_compress.evaluators.highway.results import MANIFEST
 from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
 from me2e_compress.metrics.scores import Scores, score
-from me2e_compress.simulator.cameras import Weather
-from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.simulator.routes import pick_routes
 
 
 def evaluate(
@@ -69,7 +69,7 @@ def evaluate(
         parse_latency(latency, in_order=in_order, scale=latency_scale, seed=seed),
         round(dt_ms * 1000),
         image_size_of(driver.open()),
-        _weather(weather),
+        weather_of(weather),
     )
     job = Job(driver, conditions, frame_limit)
     with progress("evaluate") as advance:
@@ -100,53 +100,3 @@ def _report(policy: str, scores: Scores, as_json: bool) -> None:
         print_json(scores.to_json())
     else:
         console.print(scores_table(policy, scores))
-
-
-def routes_named(text: str) -> tuple[tuple[Route, ...], int]:
-    """Return the routes asked for, and how many the set they are from has.
-
-    Raises:
-        EvaluationError: no such route, or no file of routes.
-    """
-    if text.endswith(".json"):
-        routes = load_routes(Path(text))
-        return routes, len(routes)
-    shipped = load_routes()
-    return pick_routes(shipped, text), len(shipped)
-
-
-def engine_of(name: str, workers: int, address: str | None) -> Engine:
-    """Give the engine that the words of the command line mean.
-
-    Raises:
-        EvaluationError: No such engine, or an address without a cluster.
-    """
-    if name == "local" and address is None:
-        return LocalEngine(workers)
-    if name == "ray":
-        return RayEngine(workers, address)
-    raise EvaluationError(
-        f"engine {name!r} with address {address}: there are local, and ray with or "
-        "without an address"
-    )
-
-
-def _weather(text: str) -> Weather:
-    """Read ``option=value`` pairs; cameras that are dropped are joined by ``+``."""
-    options: dict[str, object] = {}
-    for pair in filter(None, text.split(",")):
-        name, _, value = pair.partition("=")
-        options[name.strip()] = value.split("+") if name == "dropped" else value
-    unknown = [name for name in options if name not in Weather.__dataclass_fields__]
-    if unknown:
-        raise EvaluationError(
-            f"weather option {unknown[0]!r}: there are "
-            f"{', '.join(Weather.__dataclass_fields__)}"
-        )
-    try:
-        return TypeAdapter(Weather).validate_python(options)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise EvaluationError(
-            f"weather option {first['loc'][0]}: {first['msg']}"
-        ) from error

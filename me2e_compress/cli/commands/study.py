@@ -10,10 +10,10 @@ import typer
 from rich.markup import escape
 from rich.table import Table as Shown
 
-from me2e_compress.cli.commands.evaluate import engine_of
 from me2e_compress.cli.console import console, errors, print_json, progress, table
 from me2e_compress.cli.models import model_path
 from me2e_compress.cli.output import Given, check_folder, files_of
+from me2e_compress.evaluators.highway.evaluation_options import engine_of
 from me2e_compress.study import Listener, Study, load_study, run_study
 from me2e_compress.study.cells import Cell, Table
 from me2e_compress.study.tables import all_tables

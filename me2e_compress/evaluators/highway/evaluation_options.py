@@ -1,0 +1,150 @@
+"""An evaluation in highway-env as plain options: who drives what, and under what."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from pydantic import TypeAdapter, ValidationError
+
+from me2e_compress.driving.latency import parse_latency
+from me2e_compress.driving.policies import driver_named
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.drivers import image_size_of
+from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.evaluators.highway.engine_ray import RayEngine
+from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
+from me2e_compress.evaluators.highway.runner import Conditions
+from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.simulator.cameras import Weather
+from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+
+
+@dataclass(frozen=True)
+class Highway:
+    """Drive a policy over routes of highway-env, and go on where a run was ended.
+
+    Attributes:
+        policy: A policy by name, ``blind:8``, or the path of an ONNX file.
+        folder: Where the results go.
+        routes: ``all``, a number, ids parted by commas, or a file of routes.
+        latency: What decisions cost: ``none``, ``fps:10``, ``trace:FILE``.
+        seed: Of the draws from a trace.
+        adapter: TOML file that adapts a model to the policy contract.
+        dt_ms: Step of the world, milliseconds.
+        weather: ``fog_m=80,night=0.5,dropped=BACK``; empty for a clear day.
+        frame_limit_s: Seconds until a decision counts as hung.
+        workers: Routes at a time.
+        engine: Where: processes of this machine, or a Ray cluster.
+        address: Of a running Ray cluster; None starts one.
+    """
+
+    name: ClassVar[str] = "highway"
+    policy: str
+    folder: Path
+    routes: str = "all"
+    latency: str = "none"
+    seed: int = 0
+    adapter: Path | None = None
+    dt_ms: float = 50.0
+    weather: str = ""
+    frame_limit_s: float = FRAME_LIMIT_S
+    workers: int = 1
+    engine: Literal["local", "ray"] = "local"
+    address: str | None = None
+
+    def episodes(self) -> Iterator[Episode]:
+        """Drive what is missing, then yield all routes in the order given.
+
+        Raises:
+            EvaluationError: An option that nothing can be driven with, or see
+                `HighwayEvaluator.episodes`.
+        """
+        yield from self.evaluator().episodes()
+
+    def evaluator(
+        self,
+        on_progress: Callable[[DrivingProgress], None] = lambda progress: None,
+        on_warning: Callable[[str], None] = lambda line: None,
+    ) -> HighwayEvaluator:
+        """Build what drives.
+
+        Args:
+            on_progress: Called at the start and after every route.
+            on_warning: Called with one line a surprise.
+
+        Raises:
+            EvaluationError: An option that nothing can be driven with.
+        """
+        picked, set_size = routes_named(self.routes)
+        driver = driver_named(self.policy, self.adapter)
+        conditions = Conditions(
+            parse_latency(self.latency, seed=self.seed),
+            round(self.dt_ms * 1000),
+            image_size_of(driver.open()),
+            weather_of(self.weather),
+        )
+        return HighwayEvaluator(
+            Job(driver, conditions, self.frame_limit_s),
+            picked,
+            self.folder,
+            set_size,
+            engine_of(self.engine, self.workers, self.address),
+            on_progress,
+            on_warning,
+        )
+
+
+def routes_named(text: str) -> tuple[tuple[Route, ...], int]:
+    """Return the routes asked for, and how many the set they are from has.
+
+    Raises:
+        EvaluationError: No such route, or no file of routes.
+    """
+    if text.endswith(".json"):
+        routes = load_routes(Path(text))
+        return routes, len(routes)
+    shipped = load_routes()
+    return pick_routes(shipped, text), len(shipped)
+
+
+def engine_of(name: str, workers: int, address: str | None) -> Engine:
+    """Return the engine of a name.
+
+    Raises:
+        EvaluationError: No such engine, or an address without a cluster.
+    """
+    if name == "local" and address is None:
+        return LocalEngine(workers)
+    if name == "ray":
+        return RayEngine(workers, address)
+    raise EvaluationError(
+        f"engine {name!r} with address {address}: there are local, and ray with or "
+        "without an address"
+    )
+
+
+def weather_of(text: str) -> Weather:
+    """Read ``option=value`` pairs; cameras that are dropped are joined by ``+``.
+
+    Raises:
+        EvaluationError: No such option, or a value that it refuses.
+    """
+    options: dict[str, object] = {}
+    for pair in filter(None, text.split(",")):
+        name, _, value = pair.partition("=")
+        options[name.strip()] = value.split("+") if name == "dropped" else value
+    unknown = [name for name in options if name not in Weather.__dataclass_fields__]
+    if unknown:
+        raise EvaluationError(
+            f"weather option {unknown[0]!r}: there are "
+            f"{', '.join(Weather.__dataclass_fields__)}"
+        )
+    try:
+        return TypeAdapter(Weather).validate_python(options)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise EvaluationError(
+            f"weather option {first['loc'][0]}: {first['msg']}"
+        ) from error
