@@ -107,13 +107,16 @@ def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
     """Name the nodes that a pass made or changed without putting its name on them.
 
     A node is changed where its operator or an attribute is another; reading another
-    value of the same meaning is no change of its own.
+    value of the same meaning is no change of its own. Empty where the graph before
+    says nothing of its nodes: they may have no names yet to be known by.
 
     Args:
         before: the graph that the pass was given.
         after: the graph that it returned.
         by: the pass's name.
     """
+    if missing(before):
+        return []
     return [node.name or node.op_type for node in _unsigned(before, after, by)]
 
 
@@ -135,7 +138,9 @@ def foreign(before: ir.Model, after: ir.Model) -> list[str]:
 
 
 def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
-    known = {node.name: node for node in _nodes_of(before.graph)}
+    known: dict[str | None, ir.Node] = {}
+    for node in _nodes_of(before.graph):
+        known.setdefault(node.name, node)  # where two bear a name, the first keeps it
     return [
         node
         for node in _nodes_of(after.graph)

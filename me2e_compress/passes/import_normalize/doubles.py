@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.graph import provenance
 from me2e_compress.passes.import_normalize.bodies import bodies
 
 _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
@@ -15,7 +16,7 @@ _BY_WIDTH = ("BitCast",)
 """Standard operators that mean something else at another width."""
 
 
-def demote(model: ir.Model) -> tuple[int, str]:
+def demote(model: ir.Model, by: str) -> tuple[int, str]:
     """Turn double into float32 everywhere: weights, attributes, value types.
 
     Left alone where the outside wants double: an input or output of the graph, or a
@@ -34,7 +35,9 @@ def demote(model: ir.Model) -> tuple[int, str]:
         return 0, f"float64 stays: {keeper} is double"
     count = _demote_weights(model)
     for node in _nodes(model):
-        count += _demote_attributes(node)
+        if found := _demote_attributes(node):
+            provenance.inherit(node, [node], by=by)
+            count += found
     for value in _values(model):
         if value.type is not None and _is_double(value.type):
             value.type = _single(value.type)

@@ -45,9 +45,9 @@ class ImportNormalize(Pass):
         Raises:
             ModuleMapError: the module map does not fit the graph.
         """
-        changes = names.name_nodes(model) + _stamp(model, context)
-        changes += plugins.isolate(model)
-        demoted, note = doubles.demote(model)
+        changes = names.name_nodes(model, self.name) + _stamp(model, context)
+        changes += plugins.isolate(model, self.name)
+        demoted, note = doubles.demote(model, self.name)
         changes += demoted + constants.lift(model) + _declare(model)
         return PassResult(model, changes, (note,) if note else ())
 

@@ -5,6 +5,7 @@ import functools
 import onnx
 import onnx_ir as ir
 
+from me2e_compress.graph import provenance
 from me2e_compress.passes.import_normalize.bodies import bodies
 
 PLUGIN_DOMAIN = "me2e.plugin"
@@ -14,7 +15,7 @@ ORIGINAL_DOMAIN = "me2e.domain"
 """Node metadata with the domain that a plugin had in the file it came from."""
 
 
-def isolate(model: ir.Model) -> int:
+def isolate(model: ir.Model, by: str) -> int:
     """Move default-domain nodes that ONNX has no operator for; count them.
 
     Such nodes come from ``OperatorExportTypes.ONNX_FALLTHROUGH`` (BEVFormer_tensorrt,
@@ -34,6 +35,7 @@ def isolate(model: ir.Model) -> int:
         for node in moved:
             node.metadata_props.setdefault(ORIGINAL_DOMAIN, node.domain)
             node.domain = PLUGIN_DOMAIN
+            provenance.inherit(node, [node], by=by)
         if moved:
             body.opset_imports.setdefault(PLUGIN_DOMAIN, 1)
         count += len(moved)

@@ -1,0 +1,31 @@
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.graph import provenance
+from me2e_compress.manager import PassManager
+from me2e_compress.passes.base import Context
+from me2e_compress.passes.import_normalize import ImportNormalize
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["fresh", "with a past"])
+@pytest.mark.parametrize(
+    "body",
+    [
+        "a = Relu(x) y = Neg(a)",
+        '["/backbone/n"] a = Relu(x) ["/backbone/n"] y = Neg(a)',
+        '["/backbone/a"] a = Cast<to = 11>(x) ["/backbone/y"] y = Cast<to = 1>(a)',
+        '["/backbone/a"] a = RotateTRT(x) ["/backbone/y"] y = Neg(a)',
+    ],
+    ids=["no names", "one name twice", "float64", "plugin"],
+)
+def test_a_graph_is_imported_as_exporters_leave_it(
+    body: str, known: bool, context: Context
+) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        f'm (float[1,8] x) => (float[1,8] y) {{ ["/backbone/b"] b = Abs(x) {body} }}'
+    )
+    for node in model.graph if known else ():
+        provenance.stamp(node, provenance.Provenance("backbone", (str(node.name),)))
+    report = PassManager((ImportNormalize(),)).run(model, context)
+    assert report.steps[0].changes > 0
