@@ -12,6 +12,7 @@ from me2e_compress.cli.commands.export import export
 from me2e_compress.cli.commands.frames import frames
 from me2e_compress.cli.commands.inspect import inspect
 from me2e_compress.cli.commands.lint import lint
+from me2e_compress.cli.commands.list import list_entries
 from me2e_compress.cli.commands.plan import plan
 from me2e_compress.cli.commands.profile import profile
 from me2e_compress.cli.commands.search import search
@@ -32,6 +33,7 @@ for command in (
     profile, sensitivity, search,
 ):  # fmt: skip
     app.command()(command)
+app.command("list")(list_entries)
 closed_loop(app)
 training(app)
 

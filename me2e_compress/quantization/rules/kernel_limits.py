@@ -20,7 +20,11 @@ from me2e_compress.quantization.rules.stages import PaperRules
 
 @dataclasses.dataclass(frozen=True)
 class SmallProduct(Rule):
-    """A product whose inner or outer dimension is below one tile stays float."""
+    """A product whose inner or outer dimension is below one tile stays float.
+
+    Attributes:
+        minimum: of both dimensions, in elements.
+    """
 
     minimum: int = 16
     name: ClassVar[str] = "small-product"
@@ -44,6 +48,10 @@ class NarrowConvolution(Rule):
     int8 only if ungrouped with a square kernel, one side a multiple of ``packing`` and
     one side wide enough or the input an image; or grouped with outputs a multiple of
     ``packing`` and every kernel dimension at least 3.
+
+    Attributes:
+        minimum: channels on either side that any kernel takes.
+        packing: channels that a kernel reads together.
     """
 
     minimum: int = 16

@@ -21,6 +21,9 @@ class AttentionLength(Rule):
 
     TensorRT fuses int8 attention up to 512 queries and 512 keys, and errors of the
     product of queries and keys grow with the length in the softmax.
+
+    Attributes:
+        limit: longest attention that becomes int8, in tokens.
     """
 
     limit: int = 512
