@@ -52,20 +52,27 @@ def is_read(value: ir.Value) -> bool:
     return bool(value.uses()) or value.is_graph_output()
 
 
+def holds_numbers(value: ir.Value | None) -> bool:
+    """Return whether a value is a constant of a floating-point type."""
+    return value is not None and value.dtype in FLOATS and array_of(value) is not None
+
+
 def numbers_of(value: ir.Value | None) -> Numbers | None:
     """Return a constant floating-point array, widened to float64."""
-    if value is None or value.dtype not in FLOATS:
-        return None
-    array = array_of(value)
+    array = array_of(value) if holds_numbers(value) else None
     return None if array is None else array.astype(np.float64)
 
 
 def scalar_of(value: ir.Value | None) -> float | None:
     """Return a constant of one element; None if it is an array or computed."""
-    if value is None or value.dtype not in FLOATS:
-        return None
-    array = array_of(value)
+    array = array_of(value) if holds_numbers(value) else None
     return float(array.item()) if array is not None and array.size == 1 else None
+
+
+def overflow(numbers: Numbers, stored: Array) -> bool:
+    """Return whether numbers are too large for the type of a stored array."""
+    limit = np.finfo(stored.dtype.name).max
+    return not np.all(np.abs(numbers) <= limit)
 
 
 def is_close(value: float | None, expected: float) -> bool:

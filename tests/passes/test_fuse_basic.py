@@ -4,7 +4,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.graph import static_shape
+from me2e_compress.graph import digest, provenance, static_shape
 from me2e_compress.passes.fuse_basic import FuseBasic
 from tests.passes.small import apply, compute, ops, read
 
@@ -150,6 +150,38 @@ def test_a_factor_goes_into_weight_and_bias() -> None:
     check(text, ["MatMul", "Add"], w=normal(4, 8), bias=normal(8), c=np.float32(0.35))
 
 
+def test_a_factor_is_folded_into_both_or_neither() -> None:
+    text = opset(17) + (
+        "g (float[2,5,4] x) => (float[2,5,8] y) {"
+        " a = MatMul(x, w) b = Add(a, bias) y = Mul(b, c) }"
+    )
+    large = np.full((4, 8), 1e38, np.float32)
+    model = read(text, w=large, bias=normal(8), c=np.float32(10))
+    before = digest(model)
+
+    result = apply(FuseBasic(), model)
+
+    assert result.notes == ("left 1: a factor under which a weight would overflow",)
+    assert digest(model) == before
+
+
+def test_what_was_fused_owns_its_weights_at_once() -> None:
+    text = opset(17) + (
+        "g (float[5,4] x) => (float[5,8] y) {"
+        " a = MatMul(x, w) b = Add(a, bias) y = Mul(b, c) }"
+    )
+    check(text, ["Gemm"], w=normal(4, 8), bias=normal(8), c=normal(8))
+
+
+def test_the_weight_of_a_constant_node_is_written_anew() -> None:
+    text = opset(17) + (
+        f"g ({IMAGE} x) => (float[1,1,6,6] y) {{"
+        " weight = Constant<value = float[1,4,1,1] {1.0, 2.0, 3.0, 4.0}>()"
+        " a = Conv(x, weight) y = Mul(a, c) }"
+    )
+    check(text, ["Conv"], c=np.float32(3))
+
+
 @pytest.mark.parametrize("op", ["Add", "Mul"])
 def test_constants_in_a_row_are_combined(op: str) -> None:
     text = (
@@ -191,6 +223,14 @@ def test_layer_normalization() -> None:
     )
     node = after.graph.node(0)
     assert node.attributes.get_float("epsilon", 0.0) == pytest.approx(1e-5)
+    past = provenance.read(node)
+    assert past is not None
+    assert set(past.origins) == {f"n{index}" for index in range(9)}
+
+
+def test_a_layer_normalization_is_counted_once() -> None:
+    model = read(opset(17) + NORM, **NORM_WEIGHTS, gamma=normal(8), beta=normal(8))
+    assert apply(FuseBasic(), model).notes == ("fused: 1 layer normalizations",)
 
 
 def test_layer_normalization_needs_opset_17() -> None:
@@ -229,6 +269,21 @@ ACTIVATIONS: list[tuple[int, str, dict[str, Any], list[str]]] = [
         ),
         {"p": np.float32(3), "u": UNIT, "h": HALF, **TANH},
         ["Gelu"],
+    ),
+    (
+        20,
+        body(
+            "a = Pow(x, p) b = Mul(a, k) c = Add(x, b) d = Div(c, r) e = Tanh(d)",
+            "f = Add(e, u) i = Mul(x, f) y = Mul(i, h)",
+        ),
+        {**TANH, "p": np.float32(3), "u": UNIT, "h": HALF, "r": 1 / TANH["r"]},
+        ["Gelu"],
+    ),
+    (
+        17,
+        body("a = Neg(x) b = Exp(a) c = Add(b, u) y = Div(v, c)"),
+        {"u": UNIT, "v": UNIT},
+        ["Sigmoid"],
     ),
     (
         17,

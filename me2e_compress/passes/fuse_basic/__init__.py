@@ -1,36 +1,16 @@
 """Fuse what standard operators can say in one."""
 
 import dataclasses
-from collections import Counter
-from collections.abc import Callable
 from typing import ClassVar
 
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_basic import activations, clip, linear
-from me2e_compress.passes.fuse_basic.affine import fuse_affine
-from me2e_compress.passes.fuse_basic.layer_norm import fuse_layer_norm
-from me2e_compress.passes.fuse_basic.match import Site, maker
-from me2e_compress.rewrite import graphs_of, is_standard, remove_dead
+from me2e_compress.passes.fuse_basic import activations, affine, layer_norm, linear
+from me2e_compress.rewrite import Fusion, fuse, maker
 
 __all__ = ["FuseBasic"]
-
-RULES: tuple[tuple[str, Callable[[ir.Node, Site], bool]], ...] = (
-    ("layers with what follows them", fuse_affine),
-    ("factors into MatMul weights", linear.fuse_scale),
-    ("MatMul + bias", linear.fuse_gemm),
-    ("layer normalizations", fuse_layer_norm),
-    ("activations", activations.fuse_activation),
-    ("Sigmoid", activations.fuse_sigmoid),
-    ("Softplus", activations.fuse_softplus),
-    ("Clip", clip.fuse_clip),
-    ("constant chains", linear.fuse_chain),
-)
-
-ROUNDS = 16
-"""A fusion can complete the pattern of another: real graphs need two or three."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,34 +33,21 @@ class FuseBasic(Pass):
     swish: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Try every rule on every node until none applies."""
-        opsets = model.opset_imports
-        opset = opsets.get("", opsets.get("ai.onnx", 0))
-        done: Counter[str] = Counter()
-        refused: Counter[str] = Counter()
-        for body in graphs_of(model.graph):
-            refused_now: Counter[str] = Counter()
-            for _ in range(ROUNDS):
-                before = done.total()
-                refused_now.clear()
-                _round(Site(body, opset, self.name, self.swish, refused_now), done)
-                if done.total() == before:
-                    break
-            refused.update(refused_now)
-        if done:
-            remove_dead(model.graph)
+        """Try every fusion on every node until none applies."""
+        found = fuse(model, self.fusions(), by=self.name)
         residual = sum(_is_residual(node) for node in model.graph)
-        return PassResult(model, done.total(), _notes(done, refused, residual))
+        return PassResult(model, found.changes, (*found.notes(), *_left(residual)))
 
-
-def _round(site: Site, done: Counter[str]) -> None:
-    for node in list(site.graph):
-        if node.graph is not site.graph or not is_standard(node):
-            continue
-        for what, rule in RULES:
-            if rule(node, site):
-                done[what] += 1
-                break
+    def fusions(self) -> tuple[Fusion, ...]:
+        """List the fusions, those that are tried first first."""
+        return (
+            affine.FUSION,
+            linear.SCALE,
+            linear.GEMM,
+            layer_norm.FUSION,
+            *activations.fusions(swish=self.swish),
+            *linear.CHAIN,
+        )
 
 
 def _is_residual(node: ir.Node) -> bool:
@@ -91,15 +58,10 @@ def _is_residual(node: ir.Node) -> bool:
     )
 
 
-def _notes(done: Counter[str], refused: Counter[str], residual: int) -> tuple[str, ...]:
-    notes = []
-    if done:
-        what = ", ".join(f"{count} {name}" for name, count in done.items())
-        notes.append(f"fused: {what}")
-    notes.extend(f"left {count}: {reason}" for reason, count in refused.items())
-    if residual:
-        notes.append(
-            f"left {residual} residual Conv + Add as they are: TensorRT and onnxruntime"
-            " fuse them with the activation behind"
-        )
-    return tuple(notes)
+def _left(residual: int) -> tuple[str, ...]:
+    if not residual:
+        return ()
+    return (
+        f"left {residual} residual Conv + Add as they are: TensorRT and onnxruntime"
+        " fuse them with the activation behind",
+    )

@@ -10,128 +10,130 @@ attention patterns and misplace the quantizers.
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, provenance, static_shape
-from me2e_compress.passes.fuse_basic.match import (
+from me2e_compress.graph import static_shape
+from me2e_compress.rewrite import (
+    FLOATS,
+    Facts,
+    Fusion,
+    Kit,
+    Match,
     Numbers,
-    Site,
-    constant_and_rest,
-    numbers_of,
-    sole_maker,
+    Pattern,
+    constant,
+    either,
+    op,
+    overflow,
+    sole_reader,
+    var,
 )
-from me2e_compress.rewrite import FLOATS, add_constant, put, replace_value, sole_reader
 
 CANCELLATION = 1e3
 """Constants that cancel more than three decimal digits are not added up ahead."""
 
+X = var("x")
+WEIGHT, BIAS, FACTOR = constant(), constant(), constant()
+PRODUCT = op("MatMul", X, WEIGHT)
+SUM = op("Add", PRODUCT, BIAS)
+SCALED = op(("Mul", "Div"), either(SUM, PRODUCT), FACTOR)
 
-def fuse_gemm(node: ir.Node, site: Site) -> bool:
-    """Make MatMul + Add a Gemm where both operands are matrices."""
-    if node.op_type != "Add" or node.outputs[0].dtype not in FLOATS or site.opset < 7:
+
+def _is_per_column(match: Match, facts: Facts) -> bool:
+    weight, factor = match.array(WEIGHT).shape, match.array(FACTOR).shape
+    if len(weight) != 2 or factor not in ((), (1,), (weight[1],)):
         return False
-    for product_index in (0, 1):
-        product = sole_maker(node.inputs[product_index], "MatMul")
-        bias = node.inputs[1 - product_index]
-        if product is None or bias is None or array_of(bias) is None:
-            continue
-        shapes = [static_shape(value) for value in product.inputs]
-        out, added = static_shape(product.outputs[0]), static_shape(bias)
-        if any(shape is None or len(shape) != 2 for shape in shapes):
-            return False
-        if out is None or added not in ((), (1,), (out[1],), (1, out[1])):
-            return False
-        put(node, "Gemm", [*product.inputs, bias], by=site.by, sources=[product])
-        return True
-    return False
+    return match.root.op_type == "Mul" or bool(match.numbers(FACTOR).all())
 
 
-def fuse_scale(node: ir.Node, site: Site) -> bool:
-    """Fold a constant factor after a linear layer into its weight (and bias)."""
-    factor = _factor(node)
-    if factor is None:
+def _shares(match: Match, facts: Facts) -> str | None:
+    if not _is_owned(match, PRODUCT, WEIGHT):
+        return "a factor after a MatMul that shares its weight"
+    if SUM in match:
+        vector = match.array(BIAS).ndim == 1
+        if not vector or not _is_owned(match, SUM, BIAS):
+            return "a factor after a MatMul that shares its bias"
+    return None
+
+
+def _is_owned(match: Match, layer: Pattern, part: Pattern) -> bool:
+    value = match[part]
+    return value.is_initializer() and sole_reader(value) is match.node(layer)
+
+
+def _scale(match: Match, kit: Kit) -> str | None:
+    factor = match.numbers(FACTOR)
+    factor = factor if match.root.op_type == "Mul" else 1 / factor
+    parts = [("weight", PRODUCT, WEIGHT)]
+    if SUM in match:
+        parts.insert(0, ("bias", SUM, BIAS))
+    scaled = [match.numbers(part) * factor for _, _, part in parts]
+    for (what, _, part), numbers in zip(parts, scaled, strict=True):
+        if overflow(numbers, match.array(part)):
+            return f"a factor under which a {what} would overflow"
+    for (_, layer, part), numbers in zip(parts, scaled, strict=True):
+        node, kind = match.node(layer), match.array(part).dtype
+        index = list(node.inputs).index(match[part])
+        kit.refill(node, index, numbers.astype(kind), str(match[part].name))
+    kit.absorb(*(match.node(layer) for _, layer, _ in parts))
+    return None
+
+
+LEFT, RIGHT, OFFSET = var("left"), var("right"), constant(floating=False)
+INNER = op("MatMul", LEFT, RIGHT)
+PLUS = op("Add", INNER, OFFSET)
+
+
+def _is_of_matrices(match: Match, facts: Facts) -> bool:
+    """Return whether the product is of matrices, and the offset one a column."""
+    inner = match.node(INNER)
+    if facts.opset < 7 or match.root.outputs[0].dtype not in FLOATS:
         return False
-    numbers, value = factor
-    added = sole_maker(value, "Add")
-    parts = constant_and_rest(added) if added is not None else None
-    product = sole_maker(parts[1] if parts is not None else value, "MatMul")
-    weight = numbers_of(product.inputs[1]) if product is not None else None
-    if product is None or weight is None or weight.ndim != 2:
+    left, right, out = map(static_shape, (*inner.inputs, *inner.outputs))
+    if left is None or right is None or out is None:
         return False
-    if numbers.shape not in ((), (1,), (weight.shape[1],)):
-        return False
-    if product.graph is not node.graph or not _is_owned(product, 1):
-        return site.refuse("a factor after a MatMul that shares its weight")
-    if added is not None and parts is not None:
-        place = 0 if array_of(added.inputs[0]) is not None else 1
-        if parts[0].ndim != 1 or not _is_owned(added, place):
-            return site.refuse("a factor after a MatMul that shares its bias")
-        if not _rewrite(added.inputs[place], parts[0] * numbers):
-            return site.refuse("a factor under which a bias would overflow")
-    if not _rewrite(product.inputs[1], weight * numbers):
-        return site.refuse("a factor under which a weight would overflow")
-    last = added if added is not None and parts is not None else product
-    for changed in dict.fromkeys((product, last)):
-        provenance.inherit(changed, (changed, node), by=site.by)
-    replace_value(node.outputs[0], last.outputs[0])
-    site.graph.remove(node, safe=True)
-    return True
+    columns = out[-1:]
+    added = match.array(OFFSET).shape
+    return len(left) == len(right) == 2 and added in ((), (1,), columns, (1, *columns))
 
 
-def fuse_chain(node: ir.Node, site: Site) -> bool:
+def _gemm(match: Match, kit: Kit) -> None:
+    kit.put("Gemm", [match[LEFT], match[RIGHT], match[OFFSET]])
+
+
+SOURCE = var("source", computed=True)
+FIRST, SECOND = constant(), constant()
+CHAINS = {
+    op_type: op(op_type, op(op_type, SOURCE, FIRST), SECOND)
+    for op_type in ("Add", "Mul")
+}
+
+
+def _chain(match: Match, kit: Kit) -> str | None:
     """Multiply (add) two constants in a row ahead of time."""
-    if node.op_type not in ("Add", "Mul"):
-        return False
-    outer = constant_and_rest(node)
-    inner_node = sole_maker(outer[1], node.op_type) if outer is not None else None
-    inner = constant_and_rest(inner_node) if inner_node is not None else None
-    if outer is None or inner is None or inner_node is None:
-        return False
-    if node.op_type == "Mul":
-        together = outer[0] * inner[0]
+    first, second = match.numbers(FIRST), match.numbers(SECOND)
+    op_type, output = match.root.op_type, match.root.outputs[0]
+    if op_type == "Mul":
+        together = second * first
     else:
-        together = outer[0] + inner[0]
-        if np.any(np.abs(inner[0]) > CANCELLATION * np.abs(together)):
-            return site.refuse("constants that cancel when added up")
-    kind = node.outputs[0].dtype
-    if kind is None or not _fits(together, kind):
-        return site.refuse("constants that overflow when multiplied")
-    if together.size > max(outer[0].size, inner[0].size):
-        return site.refuse("constants that grow when combined")
-    array = together.astype(kind.numpy())
-    name = f"{node.outputs[0].name}_{node.op_type.lower()}"
-    value = add_constant(site.graph, array, name)
-    put(node, node.op_type, [inner[1], value], by=site.by, sources=[inner_node])
-    return True
-
-
-def _factor(node: ir.Node) -> tuple[Numbers, ir.Value] | None:
-    if node.op_type not in ("Mul", "Div"):
-        return None
-    parts = constant_and_rest(node)
-    if parts is None or node.op_type == "Mul":
-        return parts
-    if parts[1] is not node.inputs[0] or not parts[0].all():
-        return None
-    return 1 / parts[0], parts[1]
-
-
-def _is_owned(node: ir.Node, index: int) -> bool:
-    value = node.inputs[index]
-    return value is not None and value.is_initializer() and (sole_reader(value) is node)
+        together = second + first
+        if np.any(np.abs(first) > CANCELLATION * np.abs(together)):
+            return "constants that cancel when added up"
+    if output.dtype is None or not _fits(together, output.dtype):
+        return "constants that overflow when multiplied"
+    if together.size > max(first.size, second.size):
+        return "constants that grow when combined"
+    array = together.astype(output.dtype.numpy())
+    value = kit.constant(array, f"{output.name}_{op_type.lower()}")
+    kit.put(op_type, [match[SOURCE], value])
+    return None
 
 
 def _fits(numbers: Numbers, kind: ir.DataType) -> bool:
-    """Say whether numbers neither overflow nor lose digits in a type."""
+    """Return whether numbers neither overflow nor lose digits in a type."""
     limits = np.finfo(kind.numpy())
     size = np.abs(numbers[numbers != 0])
     return bool(np.all((size <= limits.max) & (size >= limits.tiny)))
 
 
-def _rewrite(value: ir.Value | None, numbers: Numbers) -> bool:
-    if value is None or value.dtype is None:
-        return False
-    limit = np.finfo(value.dtype.numpy()).max
-    if not np.all(np.abs(numbers) <= limit):
-        return False
-    array = numbers.astype(value.dtype.numpy())
-    value.const_value = ir.tensor(array, name=value.name)
-    return True
+SCALE = Fusion("factors into MatMul weights", SCALED, _scale, _shares, _is_per_column)
+GEMM = Fusion("MatMul + bias", PLUS, _gemm, where=_is_of_matrices)
+CHAIN = tuple(Fusion("constant chains", pattern, _chain) for pattern in CHAINS.values())

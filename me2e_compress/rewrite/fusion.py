@@ -1,0 +1,258 @@
+"""A fusion: what to look for, whether it may be done, and what takes its place."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import graphs_of, is_standard, provenance
+from me2e_compress.rewrite.edits import (
+    add_constant,
+    put,
+    remove_dead,
+    replace_value,
+    value_names,
+)
+from me2e_compress.rewrite.match import Match, match
+from me2e_compress.rewrite.pattern import Pattern
+from me2e_compress.rewrite.values import Array, is_read, sole_reader
+
+ROUNDS = 16
+"""A fusion can complete the pattern of another: real graphs need two or three."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """What a check may ask for besides the match.
+
+    Attributes:
+        opset: the version of ONNX's own operators.
+    """
+
+    opset: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Kit:
+    """What a rewrite edits the graph with.
+
+    Attributes:
+        graph: where the match is: the main graph, or a body.
+        match: where the expression was found.
+        by: the pass's name.
+        names: of all values of the model; new ones are entered.
+    """
+
+    graph: ir.Graph
+    match: Match
+    by: str
+    names: set[str]
+
+    def constant(self, array: Array, name: str) -> ir.Value:
+        """Register an initializer beside the match, under this name if it is free."""
+        return add_constant(self.graph, array, name, self.names)
+
+    def refill(self, node: ir.Node, index: int, array: Array, name: str) -> None:
+        """Write other numbers into a constant operand, or add one of this name.
+
+        An initializer that nothing else reads keeps its name.
+        """
+        old = node.inputs[index] if index < len(node.inputs) else None
+        if old is not None and old.is_initializer() and sole_reader(old) is node:
+            flat = np.ascontiguousarray(array).reshape(array.shape)
+            old.const_value = ir.tensor(flat, name=old.name)
+            old.shape = ir.Shape(array.shape)
+            return
+        node.resize_inputs(max(index + 1, len(node.inputs)))
+        node.replace_input_with(index, self.constant(array, name))
+
+    def put(
+        self,
+        op_type: str,
+        inputs: Sequence[ir.Value | None],
+        attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
+        *,
+        behind: Sequence[ir.Node] = (),
+    ) -> None:
+        """Let one standard operator take the place of all that matched.
+
+        Args:
+            op_type: the operator.
+            inputs: what it reads.
+            attributes: its attributes.
+            behind: nodes in a row behind the match that it replaces too.
+        """
+        *sources, last = (self.match.root, *behind)
+        sources += self.match.nodes[1:]
+        put(last, op_type, inputs, by=self.by, sources=sources, attributes=attributes)
+        for node in reversed(behind[:-1]):
+            self.graph.remove(node, safe=True)
+
+    def absorb(self, *changed: ir.Node) -> None:
+        """Remove the last node; the first of the changed ones makes its output.
+
+        Args:
+            changed: nodes of the match that do the work of the last one from now on.
+        """
+        root = self.match.root
+        for node in changed:
+            provenance.inherit(node, (node, root), by=self.by)
+        replace_value(root.outputs[0], changed[0].outputs[0])
+        self.graph.remove(root, safe=True)
+
+
+def _no_objection(found: Match, facts: Facts) -> None:
+    return None
+
+
+def _always(found: Match, facts: Facts) -> bool:
+    return True
+
+
+@dataclasses.dataclass(frozen=True)
+class Fusion:
+    """A pattern, a check and a rewrite.
+
+    ``Relu(Relu(x))`` is ``Relu(x)``::
+
+        x = var("x")
+        twice = op("Relu", op("Relu", x))
+        once = Fusion("Relu of Relu", twice, lambda m, kit: kit.put("Relu", [m[x]]))
+
+    Attributes:
+        name: what the report counts it as.
+        pattern: the expression.
+        rewrite: edits the graph; or gives a reason and leaves it alone, where only
+            the computed result tells (weights that would overflow).
+        check: gives the reason why a match may not be fused, which the report counts;
+            None if it may.
+        where: whether a match is one at all; what it leaves out is not counted.
+    """
+
+    name: str
+    pattern: Pattern
+    rewrite: Callable[[Match, Kit], str | None]
+    check: Callable[[Match, Facts], str | None] = _no_objection
+    where: Callable[[Match, Facts], bool] = _always
+
+
+def needs_opset(what: str, version: int) -> Callable[[Match, Facts], str | None]:
+    """Build the check that an operator is there in the model's opset."""
+
+    def check(found: Match, facts: Facts) -> str | None:
+        return None if facts.opset >= version else f"{what} needs opset {version}"
+
+    return check
+
+
+@dataclasses.dataclass
+class Fused:
+    """What was fused, and what was left and why; each counted.
+
+    Attributes:
+        done: by the name of the fusion.
+        refused: by the reason.
+    """
+
+    done: Counter[str] = dataclasses.field(default_factory=Counter)
+    refused: Counter[str] = dataclasses.field(default_factory=Counter)
+
+    @property
+    def changes(self) -> int:
+        """How many fusions were done."""
+        return self.done.total()
+
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences for the report."""
+        what = ", ".join(f"{count} {name}" for name, count in self.done.items())
+        left = (f"left {count}: {reason}" for reason, count in self.refused.items())
+        return ((f"fused: {what}",) if what else ()) + tuple(left)
+
+
+def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
+    """Try fusions on every node, in order, until none applies; sweep what is dead.
+
+    Args:
+        model: the graph, shapes inferred; rewritten in place, its bodies too.
+        fusions: those that come first are tried first.
+        by: the pass's name.
+    """
+    run = _Run(_facts(model), by, value_names(model.graph), _by_root(fusions))
+    fused = Fused()
+    for body in graphs_of(model.graph):
+        refused: Counter[str] = Counter()
+        for _ in range(ROUNDS):
+            refused.clear()  # those of the last round are left
+            done = run.round(body, refused)
+            fused.done.update(done)
+            if not done:
+                break
+        fused.refused.update(refused)
+    if fused.changes:
+        remove_dead(model.graph)
+    return fused
+
+
+_Table: TypeAlias = Mapping[tuple[str, str], Sequence[Fusion]]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """What stays the same while a model is fused."""
+
+    facts: Facts
+    by: str
+    names: set[str]
+    table: _Table
+
+    def round(self, body: ir.Graph, refused: Counter[str]) -> Counter[str]:
+        """Try every node once; count what was done, and enter what was refused."""
+        done: Counter[str] = Counter()
+        for node in list(body):
+            domain = "" if is_standard(node) else node.domain
+            for fusion in self.table.get((domain, node.op_type), ()):
+                if node.graph is body and self._attempt(fusion, node, body, refused):
+                    done[fusion.name] += 1
+                    break
+        return done
+
+    def _attempt(
+        self, fusion: Fusion, node: ir.Node, body: ir.Graph, refused: Counter[str]
+    ) -> bool:
+        found = match(fusion.pattern, node)
+        if found is None or not fusion.where(found, self.facts):
+            return False
+        reason = fusion.check(found, self.facts)
+        if reason is None:
+            reason = fusion.rewrite(found, Kit(body, found, self.by, self.names))
+        if reason is None:
+            _clear(found, body)
+            return True
+        refused[reason] += 1
+        return False
+
+
+def _clear(found: Match, body: ir.Graph) -> None:
+    """Remove the nodes of a match that nothing reads any more, readers first."""
+    while dead := [
+        node
+        for node in found.nodes
+        if node.graph is body and not any(is_read(each) for each in node.outputs)
+    ]:
+        body.remove(dead, safe=True)
+
+
+def _facts(model: ir.Model) -> Facts:
+    opsets = model.opset_imports
+    return Facts(opsets.get("", opsets.get("ai.onnx", 0)))
+
+
+def _by_root(fusions: Sequence[Fusion]) -> _Table:
+    table: dict[tuple[str, str], list[Fusion]] = {}
+    for fusion in fusions:
+        for root in sorted(fusion.pattern.roots()):
+            table.setdefault(root, []).append(fusion)
+    return table

@@ -1,0 +1,243 @@
+"""A piece of graph as an expression, and the search for it.
+
+``x * Sigmoid(x)``::
+
+    x = var("x")
+    swish = op("Mul", x, op("Sigmoid", x))
+
+An expression is matched from its last operator upwards. One object stands for one
+value wherever it occurs, so the two ``x`` must be the same. Operands of commutative
+operators match in either order. What an inner operator makes must be read inside the
+expression alone, in the same graph, and be no output, unless it is ``shared``.
+"""
+
+import abc
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
+
+import onnx_ir as ir
+
+from me2e_compress.errors import GraphError
+from me2e_compress.graph import array_of, is_standard
+from me2e_compress.rewrite.products import factors_of
+from me2e_compress.rewrite.values import FLOATS, is_close, scalar_of
+
+_IN_ANY_ORDER = frozenset(
+    {"Add", "And", "Equal", "Max", "Mean", "Min", "Mul", "Or", "Sum", "Xor"}
+)
+"""The standard operators whose operands may change places, up to rounding."""
+
+
+class Pattern(abc.ABC):
+    """An expression that a value may match; compared by identity."""
+
+    @abc.abstractmethod
+    def ways(self, value: ir.Value) -> Iterator["Way"]:
+        """Walk the ways in which a value may be this: what must match then."""
+
+    def agree(self, known: ir.Value, value: ir.Value) -> bool:
+        """Return whether a value may stand beside another that is this already."""
+        return known is value
+
+    def roots(self) -> frozenset[tuple[str, str]]:
+        """List the domain and type of the operators that can end the expression.
+
+        Raises:
+            GraphError: it does not end in an operator, so nothing could be replaced.
+        """
+        raise GraphError(f"a fusion ends in an operator, not in {self}")
+
+
+Goal: TypeAlias = tuple[Pattern, ir.Value]
+
+
+@dataclasses.dataclass(frozen=True)
+class Way:
+    """What has to match besides, and the nodes that this takes in.
+
+    Attributes:
+        goals: the patterns of the operands, each with its value.
+        nodes: the nodes taken in, the last one first.
+        inner: the values that these nodes make for the expression alone.
+    """
+
+    goals: tuple[Goal, ...] = ()
+    nodes: tuple[ir.Node, ...] = ()
+    inner: tuple[ir.Value, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Variable(Pattern):
+    """Any value; one that is computed, if asked."""
+
+    name: str
+    computed: bool = False
+
+    def ways(self, value: ir.Value) -> Iterator[Way]:
+        """Take the value as it is."""
+        if not (self.computed and array_of(value) is not None):
+            yield Way()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Constant(Pattern):
+    """A weight; one element near a number, or one element at all, if asked."""
+
+    close_to: float | None = None
+    scalar: bool = False
+    floating: bool = True
+
+    def ways(self, value: ir.Value) -> Iterator[Way]:
+        """Look at the array, which is copied only where its number counts."""
+        if self.floating and value.dtype not in FLOATS:
+            return
+        array = array_of(value)
+        if array is None or (self.scalar and array.size != 1):
+            return
+        if self.close_to is None or is_close(scalar_of(value), self.close_to):
+            yield Way()
+
+    def agree(self, known: ir.Value, value: ir.Value) -> bool:
+        """Take any value for a given number: files hold many ones and halves."""
+        given = self.close_to is not None and any(True for _ in self.ways(value))
+        return given or known is value
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Operator(Pattern):
+    """A node of one of some types, with operands that match."""
+
+    types: tuple[str, ...]
+    inputs: tuple[Pattern, ...] = ()
+    more: bool = False
+    shared: bool = False
+    where: Callable[[ir.Node], bool] | None = None
+    domain: str = ""
+
+    def roots(self) -> frozenset[tuple[str, str]]:
+        """List its own types."""
+        return frozenset((self.domain, op_type) for op_type in self.types)
+
+    def ways(self, value: ir.Value) -> Iterator[Way]:
+        """Look at the maker; try the operands in each order that means the same."""
+        node = value.producer()
+        if node is None or node.op_type not in self.types or value.index() != 0:
+            return
+        if self.domain != ("" if is_standard(node) else node.domain):
+            return
+        if self.where is not None and not self.where(node):
+            return
+        inner = () if self.shared else (value,)
+        for operands in self._orders(node):
+            goals = tuple(zip(self.inputs, operands, strict=True))
+            yield Way(goals, (node,), inner)
+
+    def _orders(self, node: ir.Node) -> Iterator[tuple[ir.Value, ...]]:
+        given = list(node.inputs)
+        while given and given[-1] is None:
+            given.pop()
+        if self.more:
+            given = given[: len(self.inputs)]
+        operands = tuple(value for value in given if value is not None)
+        if not len(operands) == len(given) == len(self.inputs):
+            return
+        if node.op_type in _IN_ANY_ORDER and is_standard(node):
+            yield from itertools.permutations(operands)
+        else:
+            yield operands
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Either(Pattern):
+    """The first of some expressions that matches."""
+
+    options: tuple[Pattern, ...]
+
+    def roots(self) -> frozenset[tuple[str, str]]:
+        """Unite those of the options."""
+        return frozenset().union(*(option.roots() for option in self.options))
+
+    def ways(self, value: ir.Value) -> Iterator[Way]:
+        """Try the options in order."""
+        for option in self.options:
+            yield Way(((option, value),))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Product(Pattern):
+    """A number times some factors, in whatever order and grouping it is written."""
+
+    factors: tuple[Pattern, ...]
+    scale: float
+
+    def roots(self) -> frozenset[tuple[str, str]]:
+        """List what multiplies."""
+        return frozenset({("", "Mul"), ("", "Div")})
+
+    def ways(self, value: ir.Value) -> Iterator[Way]:
+        """Take the value apart; try the factors in each order."""
+        found = factors_of(value)
+        if found is None or len(found.factors) != len(self.factors):
+            return
+        if not is_close(found.scale, self.scale):
+            return
+        nodes = tuple(found.nodes)
+        inner = tuple(node.outputs[0] for node in nodes)
+        for factors in itertools.permutations(found.factors):
+            yield Way(tuple(zip(self.factors, factors, strict=True)), nodes, inner)
+
+
+def var(name: str, *, computed: bool = False) -> Variable:
+    """Build the pattern of any value, or of any that is no constant."""
+    return Variable(name, computed)
+
+
+def constant(
+    close_to: float | None = None, *, scalar: bool = False, floating: bool = True
+) -> Constant:
+    """Build the pattern of a weight.
+
+    Args:
+        close_to: the number that it holds, within a relative 1e-4; None for any.
+        scalar: True for one element only.
+        floating: False for any element type.
+    """
+    return Constant(close_to, scalar or close_to is not None, floating)
+
+
+def op(
+    types: str | tuple[str, ...],
+    *inputs: Pattern,
+    more: bool = False,
+    shared: bool = False,
+    where: Callable[[ir.Node], bool] | None = None,
+    domain: str = "",
+) -> Operator:
+    """Build the pattern of an operator's first output.
+
+    Args:
+        types: the operator, or several of which it is one.
+        inputs: its operands.
+        more: True where operands may follow that the pattern does not look at.
+        shared: True where others may read what it makes: it stays for them.
+        where: what else must hold of the node, of its attributes say.
+        domain: of the operator; that of ONNX by default.
+    """
+    names = (types,) if isinstance(types, str) else types
+    return Operator(names, inputs, more, shared, where, domain)
+
+
+def either(*options: Pattern) -> Either:
+    """Build the pattern of one of several expressions, tried in this order."""
+    return Either(options)
+
+
+def product(*factors: Pattern, scale: float = 1.0) -> Product:
+    """Build the pattern of ``scale`` times some factors.
+
+    It matches Mul, Div by a constant and Pow by 2 or 3, nested in any way; the
+    constants, one element each, must multiply to ``scale``.
+    """
+    return Product(factors, scale)
