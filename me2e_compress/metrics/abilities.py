@@ -19,7 +19,7 @@ JUNCTION_MARGIN_M = 8.0
 
 
 def mastered(episode: Episode, ability: str) -> bool:
-    """Say whether a route counts as a success for one of its abilities.
+    """Return whether a route counts as a success for one of its abilities.
 
     A route counts if it succeeded. For Traffic_Signs it also counts if the ego passed
     its first junction by more than 8 m without running a stop sign or a red light,

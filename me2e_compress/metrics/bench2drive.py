@@ -100,7 +100,7 @@ def smoothness(episode: Episode) -> Measure:
 def block_is_smooth(
     along: Floats, across: Floats, length: Floats, yaw_rate_degps: Floats
 ) -> bool:
-    """Say whether all samples of a block lie inside the bounds.
+    """Return whether all samples of a block lie within the bounds.
 
     Args:
         along: [N] acceleration along the heading, m/s2.

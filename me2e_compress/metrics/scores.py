@@ -132,7 +132,7 @@ def _rate(outcomes: Sequence[bool]) -> Estimate:
 
 
 def _abilities(episodes: Sequence[Episode], seed: int) -> Estimate:
-    """Mean of the abilities' success rates; all five must have been driven."""
+    """Return the mean of the abilities' success rates, if all five were driven."""
     outcomes = successes(episodes)
     missing = [name for name in ABILITIES if not outcomes[name]]
     if missing:

@@ -1,6 +1,6 @@
 """The world that is driven in, on highway-env: routes, traffic, scenarios, cameras.
 
-It knows no model: whoever drives is somebody else's business.
+It knows no policy and no model: at each frame it is given a `Control`.
 
 Raises:
     MissingExtraError: On import, if the extra ``highway`` is not installed.

@@ -13,18 +13,18 @@ MAX_STEERING_RAD = 0.6
 
 
 def slip_of(steering_rad: float) -> float:
-    """Slip angle (rad) at the centre for a front wheel angle (rad)."""
+    """Return the slip angle (rad) at the centre for a front wheel angle (rad)."""
     return math.atan(math.tan(steering_rad) / 2)
 
 
 def steering_of(slip_rad: float) -> float:
-    """Front wheel angle (rad) for a slip angle, within what the wheels can do."""
+    """Return the front wheel angle (rad) for a slip angle, clipped to its range."""
     wanted = math.atan(2 * math.tan(slip_rad))
     return min(max(wanted, -MAX_STEERING_RAD), MAX_STEERING_RAD)
 
 
 def curvature_of(steering_rad: float, length_m: float) -> float:
-    """Curvature (1/m) of the centre's circle for a front wheel angle (rad)."""
+    """Return the curvature (1/m) of the centre's circle for a wheel angle (rad)."""
     return math.sin(slip_of(steering_rad)) / (length_m / 2)
 
 
@@ -36,7 +36,7 @@ def advance(
     travel_m: float,
     length_m: float,
 ) -> tuple[float, float, float]:
-    """Pose (x, y, heading) after ``travel_m`` on the circle of a steering angle."""
+    """Return the pose (x, y, heading) after ``travel_m`` at a fixed steering angle."""
     slip = slip_of(steering_rad)
     turn = travel_m * math.sin(slip) / (length_m / 2)
     chord = travel_m * math.sin(turn / 2) / (turn / 2) if abs(turn) > 1e-6 else travel_m
@@ -45,7 +45,7 @@ def advance(
 
 
 def steering_through(forward_m: float, left_m: float, length_m: float) -> float:
-    """Steering angle whose circle leads the centre through a point ahead.
+    """Return the steering angle whose circle leads the centre through a point ahead.
 
     The chord to a point at distance D leaves the heading by the slip angle b plus
     half the turn: ``bearing = b + asin(D sin b / length)``. The left side grows with

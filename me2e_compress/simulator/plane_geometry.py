@@ -18,7 +18,7 @@ LANE_SPACING_M = 2.0
 
 
 class Command(IntEnum):
-    """What the navigator says; the order of Bench2Drive's one-hot command."""
+    """Navigation commands, in the order of Bench2Drive's one-hot command."""
 
     LEFT = 0
     RIGHT = 1
@@ -47,8 +47,8 @@ class Lane:
         left: Marking of the left edge, seen in driving direction.
         right: Marking of the right edge.
         speed_limit_mps: Speed limit.
-        shoulder: Paved but not meant for driving: nobody is routed over it, yet
-            standing on it is not off-road.
+        shoulder: Paved but not meant for driving: no route uses it, yet a car on it
+            is not off-road.
     """
 
     name: str
@@ -75,11 +75,11 @@ class Roadmap:
     """Four corners each, in order around the rectangle."""
 
     def outside_m(self, x: float, y: float) -> float:
-        """Metres between a point and the nearest lane's surface, 0 inside any lane."""
+        """Return the metres from a point to the nearest lane's edge, 0 inside one."""
         return float(self.outside_all(np.array([[x, y]]))[0])
 
     def outside_all(self, points: Floats) -> Floats:
-        """`outside_m` of [N, 2] points at once: [N]."""
+        """Return [N], `outside_m` of [N, 2] points at once."""
         start, direction, length, half_width = self._chords
         away = _distance_to_chords(points, start, direction, length) - half_width
         return np.asarray(np.maximum(np.min(away, axis=1), 0.0))
@@ -138,7 +138,7 @@ class RoutePath:
     def project(
         self, x: float, y: float, near_m: float | None = None
     ) -> tuple[float, float]:
-        """(arc length, lateral offset) of a point; lateral is positive to the left.
+        """Return (arc length, lateral offset) of a point, positive to the left.
 
         Args:
             x: Metres.
@@ -164,7 +164,7 @@ class RoutePath:
     def at(
         self, s_m: npt.ArrayLike, lateral_m: npt.ArrayLike = 0.0
     ) -> tuple[Floats, Floats, Floats]:
-        """(x, y, heading) at arc lengths and lateral offsets (broadcast together)."""
+        """Return (x, y, heading) at arc lengths and lateral offsets (broadcast)."""
         s, lateral = np.asarray(s_m, float), np.asarray(lateral_m, float)
         heading = self.value(self.headings, s)
         x = self.value(self.points[:, 0], s) - lateral * np.sin(heading)
@@ -172,12 +172,12 @@ class RoutePath:
         return x, y, heading
 
     def value(self, column: Floats, s_m: npt.ArrayLike) -> Floats:
-        """One of the [N] columns, interpolated at arc lengths."""
+        """Interpolate one of the [N] columns at arc lengths."""
         stations = np.arange(len(column)) * SPACING_M
         return np.asarray(np.interp(np.asarray(s_m, float), stations, column))
 
     def command_at(self, s_m: float) -> Command:
-        """The navigator's command at an arc length."""
+        """Return the navigation command at an arc length."""
         i = int(np.clip(s_m, 0, len(self.commands) - 1))
         return Command(int(self.commands[i]))
 
@@ -189,14 +189,14 @@ class RoutePath:
 
 
 def polyline_headings(points: Floats) -> Floats:
-    """[N] unwrapped headings of the chords of [N, 2] points; the last repeats."""
+    """Return [N] unwrapped headings of the chords of [N, 2]; the last repeats."""
     steps = np.diff(points, axis=0)
     headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     return np.append(headings, headings[-1])
 
 
 def resample(points: Floats, spacing_m: float) -> Floats:
-    """Points every ``spacing_m`` along a polyline (chord length), the first kept."""
+    """Return points every ``spacing_m`` along a polyline, the first one kept."""
     steps = np.hypot(*np.diff(points, axis=0).T)
     arc = np.concatenate([[0.0], np.cumsum(steps)])
     stations = np.arange(0.0, arc[-1] + 1e-9, spacing_m)
@@ -207,7 +207,7 @@ def resample(points: Floats, spacing_m: float) -> Floats:
 def _distance_to_chords(
     points: Floats, start: Floats, direction: Floats, length: Floats
 ) -> Floats:
-    """[N, C] distances of N points to C chords."""
+    """Return [N, C] distances of N points to C chords."""
     offset = points[:, None, :] - start[None]
     along = np.clip(np.sum(offset * direction, axis=2), 0.0, length)
     miss = offset - along[..., None] * direction

@@ -23,14 +23,14 @@ class Route:
 
     Args:
         id: Unique in its manifest; letters, digits, ``_`` and ``-``.
-        scenario: One of the 44 types (`abilities.SCENARIO_ABILITIES`).
+        scenario: One of the 44 types (`catalogue.SCENARIO_ABILITIES`).
         ability: The first ability that Bench2Drive counts the type under.
         seed: Decides every parameter that is not given.
         parameters: Values by name; what is given here is not drawn from the seed,
             so editing one changes that one and nothing else.
 
     Raises:
-        EvaluationError: An id that is no file name, or an unknown scenario.
+        EvaluationError: An id that is not a file name, or an unknown scenario.
     """
 
     id: str
@@ -40,7 +40,7 @@ class Route:
     parameters: dict[str, Parameter] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what no world could be built from."""
+        """Check the id, the scenario and the ability."""
         if not self.id or not all(c.isalnum() or c in "_-" for c in self.id):
             raise EvaluationError(
                 f"route id {self.id!r}: only letters, digits, '_' and '-' are allowed"
@@ -70,7 +70,7 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
     """Read a manifest.
 
     Raises:
-        EvaluationError: The file is missing, is no manifest, or repeats an id.
+        EvaluationError: The file is missing, not a manifest, or repeats an id.
     """
     try:
         routes = _MANIFEST.validate_json(path.read_bytes(), strict=True)
@@ -104,7 +104,7 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
 
 
 def pick_routes(routes: Sequence[Route], which: str) -> tuple[Route, ...]:
-    """The routes that ``which`` asks for.
+    """Return the routes that ``which`` asks for.
 
     Args:
         routes: What there is.
@@ -112,7 +112,7 @@ def pick_routes(routes: Sequence[Route], which: str) -> tuple[Route, ...]:
             ids separated by commas.
 
     Raises:
-        EvaluationError: An id that is not there, or a number that is too large.
+        EvaluationError: An unknown id, or a number that is too large.
     """
     if which == "all":
         return tuple(routes)

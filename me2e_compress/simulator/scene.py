@@ -35,7 +35,7 @@ __all__ = [
 
 
 class ActorKind(StrEnum):
-    """What an actor is; its size comes from `DIMENSIONS` unless a script says else."""
+    """What an actor is; its size comes from `DIMENSIONS` unless a script sets it."""
 
     CAR = "car"
     VAN = "van"

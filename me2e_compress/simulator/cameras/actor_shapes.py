@@ -15,7 +15,7 @@ VEHICLE_SHADOW = shadow((-0.53, 0.53), (-0.56, 0.56))
 
 
 def _wheels(box: Box, u: tuple[float, ...], radius: float, top: float) -> list[Quad]:
-    """Wheels on both sides of a box, from the ground up to v = top of its sides.
+    """Build wheels on both sides of a box, from the ground up to v = top.
 
     Args:
         box: Where.
@@ -34,7 +34,7 @@ def _wheels(box: Box, u: tuple[float, ...], radius: float, top: float) -> list[Q
 
 
 def _lamps(box: Box, v: tuple[float, float], width: float) -> list[Quad]:
-    """Head lamps, tail lamps and the indicators at the four corners."""
+    """Build headlamps, tail lamps and the indicators at the four corners."""
     ends = (0.03, 0.03 + width), (0.97 - width, 0.97)
     # the front's lower edge runs from right to left, the back's from left to right
     quads = [box.on("front", u, v, Slot.HEADLAMP) for u in ends]

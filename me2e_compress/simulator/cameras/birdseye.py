@@ -1,4 +1,4 @@
-"""The classes seen from above, in the ego frame."""
+"""The pixel classes seen from above, in the ego frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -52,13 +52,13 @@ class BevGrid:
             )
 
     def cells(self, points: Floats) -> Floats:
-        """Points [..., 2] of the ego frame to continuous cells (column, row)."""
+        """Convert ego-frame points [..., 2] to continuous cells (column, row)."""
         x, y = points[..., 0], points[..., 1]
         return np.stack([self.left_m - y, self.front_m - x], axis=-1) / self.cell_m
 
 
 def bev_classes(scene: Scene, texture: GroundTexture, grid: BevGrid) -> Bytes:
-    """What each cell shows at its centre: `PixelClass`, uint8 [rows, columns].
+    """Return the `PixelClass` at the centre of each cell, uint8 [rows, columns].
 
     Signals have no extent on the ground and are left out; the ego is drawn last.
     """
@@ -70,7 +70,7 @@ def bev_classes(scene: Scene, texture: GroundTexture, grid: BevGrid) -> Bytes:
 
 
 def ground_classes(ego: Ego, texture: GroundTexture, grid: BevGrid) -> Bytes:
-    """What the ground is at the centre of each cell, whoever stands on it.
+    """Return the class of the ground at the centre of each cell, actors left out.
 
     Args:
         ego: Where the grid lies.
@@ -103,7 +103,7 @@ def ground_classes(ego: Ego, texture: GroundTexture, grid: BevGrid) -> Bytes:
 
 
 def covered(actors: Sequence[Actor], ego: Ego, grid: BevGrid) -> Flags:
-    """Whether a cell is touched by an actor: bool [rows, columns].
+    """Return whether each cell is touched by an actor: bool [rows, columns].
 
     Args:
         actors: Boxes of any instant.
@@ -117,7 +117,7 @@ def covered(actors: Sequence[Actor], ego: Ego, grid: BevGrid) -> Flags:
 
 
 def _footprint(box: Actor | Ego, ego: Ego) -> Floats:
-    """[4, 2] corners of a box in the ego frame."""
+    """Return the [4, 2] corners of a box in the ego frame."""
     half = np.array([box.length, box.width]) / 2
     corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     turn = box.heading - ego.heading

@@ -123,7 +123,7 @@ class GroundSampler:
     def _coordinates(
         self, group: RowGroup, texture: GroundTexture, ego: Ego
     ) -> tuple[Floats32, Floats32]:
-        """[T, R, W] columns and rows in the texture, each on its own mip level."""
+        """Return [T, R, W] texture columns and rows, each on its own mip level."""
         cos, sin = np.cos(ego.heading), np.sin(ego.heading)
         # ego frame to metres right and down from the texture's corner: rows run south
         rotation = np.array([[cos, -sin], [-sin, -cos]])
@@ -182,7 +182,7 @@ class GroundSampler:
     def _levels(
         self, camera: npt.NDArray[np.intp], row: npt.NDArray[np.intp], taps: int
     ) -> npt.NDArray[np.intp]:
-        """Mip level at which neither columns nor samples skip texels."""
+        """Return the mip level at which neither columns nor samples skip texels."""
         depth = row_depths(self.rig, 1)[0, camera, row]
         across = depth / self.rig.focals_px[camera]
         along = across * depth / CAMERA_HEIGHT_M / taps
@@ -191,7 +191,7 @@ class GroundSampler:
 
 
 def row_depths(rig: CameraRig, taps: int) -> Floats:
-    """[T, 6, H] depth of the ground in T samples of each row; inf at and above the sky.
+    """Return [T, 6, H], the ground's depth in T samples of each row; inf for the sky.
 
     A row belongs to the ground if its centre does.
     """

@@ -42,10 +42,12 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     Returns:
         Camera and solid, [V] each: camera by camera, the first to paint first.
     """
+    # by distance, camera by camera
     nearest = np.hypot(right, forward).min(axis=1)
     camera, solid = np.nonzero(visible)
     order = np.lexsort((-nearest[camera, solid], camera))
     camera, solid = camera[order], solid[order]
+    # pairs in the same columns whose separating edges contradict the distance
     x, y = right[camera, :, solid].T, forward[camera, :, solid].T
     first, second = _rivals(x, y, camera)
     if len(first) == 0:
@@ -53,6 +55,7 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     edges = _edges(x, y)
     before, after = _hides(edges, second, first), _hides(edges, first, second)
     wrong = after & ~before
+    # sort the cameras with such a pair anew, by the edges
     for k in np.unique(camera[first[wrong]]).tolist():
         low, high = np.searchsorted(camera, [k, k + 1]).tolist()
         behind = np.zeros((high - low, high - low), np.bool_)
@@ -65,7 +68,7 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
 
 
 def _rivals(x: Floats, y: Floats, camera: Ints) -> tuple[Ints, Ints]:
-    """Pairs (farther, nearer) of one camera that may share columns of its image."""
+    """Find the pairs (farther, nearer) that may share columns of a camera's image."""
     bearing = np.arctan2(x, y)
     low, high = bearing.min(axis=0), bearing.max(axis=0)
     wide = high - low > np.pi  # a footprint across the line straight behind
@@ -84,7 +87,7 @@ def _edges(x: Floats, y: Floats) -> Edges:
 
 
 def _hides(edges: Edges, front: Ints, back: Ints) -> Flags:
-    """Whether an edge shows that solid front[i] stands on the camera's side.
+    """Return whether an edge shows that solid front[i] is on the camera's side.
 
     Either an edge of the one at the back, with the camera and the one in front both
     outside of it, or an edge of the one in front, with the camera inside.
@@ -95,14 +98,14 @@ def _hides(edges: Edges, front: Ints, back: Ints) -> Flags:
 
 
 def _outside(edges: Edges, of: Ints, other: Ints) -> Flags:
-    """[4, P] whether all corners of one footprint lie outside each edge of another."""
+    """Return [4, P]: all corners of one footprint lie outside each edge of another."""
     reach = edges.normal_x[:, None, of] * edges.x[:, other]
     reach += edges.normal_y[:, None, of] * edges.y[:, other]
     return np.asarray(reach.min(axis=1) - edges.at[:, of] > -TOUCH_M)
 
 
 def _sorted(behind: Flags) -> list[int]:
-    """Topological order; the farthest of the free ones first, also out of a cycle."""
+    """Sort topologically: the farthest free solid first, also to break a cycle."""
     left, result = list(range(len(behind))), list[int]()
     while left:
         waits = behind[np.ix_(left, left)].any(axis=0)

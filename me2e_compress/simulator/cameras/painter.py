@@ -80,13 +80,16 @@ class Painter:
         """Cull, order, cut at the near plane and project."""
         if not solids:
             return NO_FACES
+        # which solids each camera may see, in painting order
         poses = _to_ego(np.array([s.pose for s in solids]), ego)
         corners, footprints = _place(solids, poses)
         camera, solid = painting_order(*self._views(footprints))
+        # their faces that look at the camera, inside its frustum
         view, face = _spread(np.array([len(s.colours) for s in solids]), solid)
         points = self._to_camera(corners[:, :, face], camera[view])
         seen = self._seen(points, camera[view])
         points, view, face = points[:, :, seen], view[seen], face[seen]
+        # details that are large enough to be seen
         pixels = self._project(points, camera[view])
         details = np.concatenate([s.template.details for s in solids])[face]
         lamps = np.concatenate([s.template.slots for s in solids])[face] >= FIRST_LAMP
@@ -108,7 +111,7 @@ class Painter:
         )
 
     def _views(self, footprints: Floats) -> tuple[Floats, Floats, Flags]:
-        """Footprints [6, 4, S] in each camera's frame, and whether it may see them."""
+        """Return footprints [6, 4, S] in each camera's frame, and which it may see."""
         positions, rotations = self.rig.positions, self.rig.rotations
         dx = footprints[0] - positions[:, 0, None, None]
         dy = footprints[1] - positions[:, 1, None, None]
@@ -121,7 +124,7 @@ class Painter:
         return right, forward, ~hidden
 
     def _to_camera(self, points: Floats, camera: Ints) -> Floats:
-        """[3, 4, M] in the ego frame to [3, 4, M] right, down, forward."""
+        """Convert [3, 4, M] of the ego frame to [3, 4, M] right, down, forward."""
         dx, dy = (points[i] - self.rig.positions[camera, i] for i in (0, 1))
         axes = self.rig.rotations[camera]
         right = axes[:, 0, 0] * dx + axes[:, 0, 1] * dy
@@ -129,7 +132,7 @@ class Painter:
         return np.stack([right, CAMERA_HEIGHT_M - points[2], forward])
 
     def _seen(self, points: Floats, camera: Ints) -> Ints:
-        """Indices of the faces [3, 4, M] that look at the camera, in its frustum."""
+        """Return the indices of the faces [3, 4, M] that a camera sees."""
         front = np.flatnonzero(_towards(points))
         right, down, depth = points[:, :, front]
         centre_column, horizon = self.rig.centre_px
@@ -144,7 +147,7 @@ class Painter:
         return np.asarray(front[~outside])
 
     def _project(self, points: Floats, camera: Ints) -> Floats:
-        """[2, 4, M] pixels; corners before the near plane come out wrong."""
+        """Project to [2, 4, M] pixels; corners before the near plane come out wrong."""
         scale = self.rig.focals_px[camera] / np.maximum(points[2], NEAR_M)
         pixels = points[:2] * scale
         pixels += np.array(self.rig.centre_px)[:, None, None]
@@ -177,7 +180,7 @@ def label(labels: Bytes, faces: Faces) -> None:
 
 
 def _to_ego(poses: Floats, ego: Ego) -> Floats:
-    """World poses [S, 3] (x, y, heading) in the ego frame."""
+    """Convert world poses [S, 3] (x, y, heading) to the ego frame."""
     cos, sin = np.cos(ego.heading), np.sin(ego.heading)
     dx, dy = poses[:, 0] - ego.x, poses[:, 1] - ego.y
     turned = poses[:, 2] - ego.heading
@@ -185,7 +188,7 @@ def _to_ego(poses: Floats, ego: Ego) -> Floats:
 
 
 def _place(solids: list[Solid], poses: Floats) -> tuple[Floats, Floats]:
-    """Corners [3, 4, N] of all faces and footprints [2, 4, S], in the ego frame."""
+    """Return the corners [3, 4, N] of all faces and the footprints [2, 4, S]."""
     sizes = np.array([solid.size for solid in solids]).T
     owner = np.repeat(np.arange(len(solids)), [len(s.colours) for s in solids])
     unit = np.concatenate([s.template.corners for s in solids], axis=2)
@@ -201,7 +204,7 @@ def _place(solids: list[Solid], poses: Floats) -> tuple[Floats, Floats]:
 
 
 def _spread(counts: Ints, solid: Ints) -> tuple[Ints, Ints]:
-    """For the faces of the solids seen: which view [M], and which face [M]."""
+    """Return, for the faces of the solids seen, the view [M] and the face [M]."""
     many = counts[solid]
     view = np.repeat(np.arange(len(solid)), many)
     within = np.arange(len(view)) - np.repeat(np.cumsum(many) - many, many)
@@ -209,12 +212,12 @@ def _spread(counts: Ints, solid: Ints) -> tuple[Ints, Ints]:
 
 
 def _extent(pixels: Floats) -> Floats:
-    """[M] longer side of what encloses each polygon [2, 4, M], in pixels."""
+    """Return [M], the longer side of each polygon's bounding box, in pixels."""
     return np.asarray((pixels.max(axis=1) - pixels.min(axis=1)).max(axis=0))
 
 
 def _towards(points: Floats) -> Flags:
-    """Whether faces [3, 4, M] look at the camera; their diagonals give the normal."""
+    """Return whether faces [3, 4, M] look at the camera, by their diagonals."""
     (ax, ay, az), (bx, by, bz) = (
         points[:, 2] - points[:, 0],
         points[:, 3] - points[:, 1],
@@ -225,7 +228,7 @@ def _towards(points: Floats) -> Flags:
 
 
 def _cut(polygon: list[list[float]]) -> Floats:
-    """The part in front of the near plane [N, 3] of a polygon of (x, y, depth)."""
+    """Cut a polygon of (x, y, depth) at the near plane: the part before it, [N, 3]."""
     kept = list[list[float]]()
     for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         if a[2] >= NEAR_M:
@@ -237,6 +240,6 @@ def _cut(polygon: list[list[float]]) -> Floats:
 
 
 def _fixed(pixels: Floats) -> npt.NDArray[np.int32]:
-    """Fixed-point pixels for cv2, which has pixel centres at whole numbers."""
+    """Convert to fixed point for cv2, which has pixel centres at whole numbers."""
     scaled = np.clip(pixels - 0.5, -LIMIT_PX, LIMIT_PX) * (1 << SUBPIXEL_BITS)
     return np.rint(scaled).astype(np.int32)

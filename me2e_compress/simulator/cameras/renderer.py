@@ -96,7 +96,7 @@ class Sky:
 
 
 def _skyline(waves: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    """[COLUMNS] between -1 and 1: waves around the circle with seeded phases."""
+    """Return [COLUMNS] in -1 .. 1: waves around the circle with seeded phases."""
     angle = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
     phases = rng.uniform(0, 2 * np.pi, len(waves))
     terms = [np.sin(n * angle + p) for n, p in zip(waves, phases, strict=True)]
@@ -122,18 +122,21 @@ class Cameras:
         cv2.setNumThreads(1)
 
     def render(self, scene: Scene) -> Bytes:
-        """The six images, uint8 [6, H, W, 3], RGB, in the order of the rig."""
+        """Render the six images, uint8 [6, H, W, 3], RGB, in the order of the rig."""
         images = np.empty((*self._shape, 3), np.uint8)
+        # background: sky and ground, with light and fog pixel by pixel
         self._sky.paint(images, scene.ego.heading)
         self._ground.paint(images, self.texture, scene.ego)
         self._atmosphere.veil(images)
+        # solids from far to near, with light and fog face by face
         faces = self._painter.faces(solids_of(scene), scene.ego)
         draw(images, faces, self._atmosphere.tint(faces))
+        # rain on the lens, exposure, noise and failed cameras
         self._sensor.expose(images, scene.time_us)
         return images
 
     def classes(self, scene: Scene) -> Bytes:
-        """What each pixel shows, whatever the weather: `PixelClass`, uint8 [6, H, W].
+        """Return the `PixelClass` of each pixel in clear weather, uint8 [6, H, W].
 
         A pixel has the class of what its centre sees, edges of solids rounded out.
         """

@@ -118,7 +118,7 @@ class Solid:
 
 
 def solids_of(scene: Scene) -> list[Solid]:
-    """Everything in a scene that is near enough to be seen from the ego."""
+    """Return every solid of a scene that is near enough to be seen from the ego."""
     ego, solids = scene.ego, list[Solid]()
     for actor in scene.actors:
         if np.hypot(actor.x - ego.x, actor.y - ego.y) < FARTHEST_M:
@@ -152,7 +152,7 @@ def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
 
 
 def _paint(actor: Actor) -> Colour:
-    """Colour of an actor: of its kind, or by its id, the same in every frame."""
+    """Return an actor's colour: of its kind, or by its id, the same in every frame."""
     if actor.kind in FIXED_PAINT:
         return FIXED_PAINT[actor.kind]
     people = actor.kind in (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
@@ -172,7 +172,7 @@ def _signal_solid(signal: Signal) -> Solid:
 def _colours(
     template: Template, paint: Colour, stripe: Colour, lit: tuple[Slot, ...]
 ) -> npt.NDArray[np.float64]:
-    """[Q, 3] colours of the faces; there are few combinations, so they are kept."""
+    """Return [Q, 3] colours of the faces; there are few combinations, so cached."""
     palette = np.array(
         [
             {Slot.BODY: paint, Slot.STRIPE: stripe}.get(slot)

@@ -42,12 +42,12 @@ class GroundPlan:
     classes: Bytes
 
     def texels(self, points: Floats) -> Floats:
-        """World points [..., 2] to continuous texels (column, row)."""
+        """Convert world points [..., 2] to continuous texels (column, row)."""
         offset = np.asarray(points) - (self.west_m, self.north_m)
         return np.asarray(offset * (1.0, -1.0) / self.resolution_m)
 
     def near(self, points: Floats) -> bool:
-        """Whether a polyline may touch the rasters."""
+        """Return whether a polyline may touch the rasters."""
         height, width = self.classes.shape
         low, high = (f(self.texels(points), axis=0) for f in (np.min, np.max))
         return bool((high > -width).all() and (low < (2 * width, 2 * height)).all())
@@ -69,19 +69,19 @@ class GroundPlan:
             cv2.fillConvexPoly(self.colours, soft, colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
     def _quads(self, line: Floats, width_m: float) -> npt.NDArray[np.int32]:
-        """[N - 1, 4, 2] the pieces of a band."""
+        """Return [N - 1, 4, 2], the pieces of a band."""
         sides = (offset_line(line, side * width_m) for side in (0.5, -0.5))
         left, right = (self._fixed(side) for side in sides)
         return np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1)
 
     def _fixed(self, points: Floats) -> npt.NDArray[np.int32]:
-        """Fixed-point texels for cv2, which has pixel centres at whole numbers."""
+        """Convert to fixed point for cv2, which has pixel centres at whole numbers."""
         scaled = (self.texels(points) - 0.5) * (1 << SUBPIXEL_BITS)
         return np.rint(scaled).astype(np.int32)
 
 
 def offset_line(line: Floats, lateral_m: float) -> Floats:
-    """[N, 2] a polyline moved to its left."""
+    """Return a polyline [N, 2] moved to its left."""
     tangent = np.gradient(line, axis=0)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     normal *= lateral_m / np.linalg.norm(normal, axis=1)[:, None]
@@ -89,7 +89,7 @@ def offset_line(line: Floats, lateral_m: float) -> Floats:
 
 
 def paint_lanes(plan: GroundPlan, roadmap: Roadmap) -> None:
-    """Kerbs of all lanes first, then shoulders, then asphalt: overlaps join up."""
+    """Paint all kerbs, then shoulders, then asphalt, so that overlaps join up."""
     lanes = [lane for lane in roadmap.lanes if plan.near(lane.centre)]
     shoulders = [lane for lane in lanes if lane.shoulder]
     driven = [lane for lane in lanes if not lane.shoulder]
@@ -115,7 +115,7 @@ def paint_markings(plan: GroundPlan, roadmap: Roadmap) -> None:
 
 
 def _pieces(edge: Floats, marking: LaneMarking) -> Iterator[Floats]:
-    """The polylines to paint along an edge: all of it, its dashes, or nothing."""
+    """Yield the polylines to paint along an edge: all of it, its dashes, or none."""
     if marking is LaneMarking.SOLID:
         yield edge
     if marking is LaneMarking.DASHED:

@@ -93,7 +93,7 @@ def paint_texture(
 
 
 def _texels(span_m: float) -> int:
-    """Whole texels of a span, divisible down to the coarsest level."""
+    """Return the whole texels of a span, divisible down to the coarsest level."""
     coarsest = 1 << (LEVELS - 1)
     return int(np.ceil(span_m / RESOLUTION_M / coarsest)) * coarsest
 

@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Weather:
-    """What stands between the world and the six images. The default is a clear day.
+    """Weather and sensor faults. The default is a clear day.
 
     Args:
         fog_m: Meteorological visibility in metres (contrast 5 %); None for no fog.
@@ -26,7 +26,7 @@ class Weather:
         rain: 0 to 1: streaks, a grey sky and noise.
         brightness: Factor on all pixels, 0 to 4: exposure, or a dirty lens.
         noise: Standard deviation of the sensor's noise in grey levels, 0 to 64.
-        dropped: Names of cameras that deliver nothing: their images are black.
+        dropped: Names of cameras that fail: their images are black.
         seed: Of rain and noise.
 
     Raises:
@@ -61,7 +61,7 @@ class Weather:
         for camera in self.dropped:
             if camera not in CAMERA_NAMES:
                 raise EvaluationError(
-                    f"weather option dropped names camera {camera!r}; there are "
+                    f"weather option dropped: no camera {camera!r}; there are "
                     f"{', '.join(CAMERA_NAMES)}"
                 )
         if self.seed < 0:
@@ -77,20 +77,20 @@ KOSCHMIEDER = 3.0
 (Koschmieder's law, CIE definition of meteorological optical range)."""
 FOG = np.array([206.0, 210.0, 214.0])
 MOONLIGHT = 0.12
-"""What is left of the day's light at night = 1."""
+"""Share of the day's light that is left at night = 1."""
 BEAM_M, BEAM_RAD = 32.0, 0.45
-"""Head lamps: light falls to 1/e at this distance and at this bearing (an own choice:
+"""Head lamps: light falls to 1/e at this distance and at this bearing (our choice:
 a dipped beam lights some 40 to 60 m of road)."""
 DULL = 0.25
-"""What heavy rain takes from the light."""
+"""Share of the light that heavy rain takes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Atmosphere:
-    """Applies fog and darkness, to the still ground by pixel and to solids by place.
+    """Applies fog and darkness, to the ground by pixel and to solids by place.
 
     Args:
-        ground: Knows where in the ego frame each pixel of the ground lies.
+        ground: Gives the place of each ground pixel in the ego frame.
         weather: The options.
     """
 
@@ -99,7 +99,7 @@ class Atmosphere:
 
     @property
     def clear(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether there is no fog, darkness or rain."""
         weather = self.weather
         return weather.fog_m is None and weather.night == 0.0 and weather.rain == 0.0
 
@@ -112,7 +112,7 @@ class Atmosphere:
         np.copyto(flat, cv2.add(cv2.multiply(flat, gain, dtype=cv2.CV_8U), added))
 
     def tint(self, faces: Faces) -> Bytes:
-        """uint8 [M, 3] colours of the faces as the cameras see them."""
+        """Return uint8 [M, 3], the colours of the faces as the cameras see them."""
         colours = faces.colours
         if not self.clear:
             light = self._light(faces.places[:, 0], faces.places[:, 1])
@@ -140,13 +140,13 @@ class Atmosphere:
         return day * (1.0 - DULL * self.weather.rain)
 
     def _light(self, x: Floats, y: Floats) -> Floats:
-        """Part of full light at places in the ego frame: daylight and head lamps."""
+        """Return the share of full light at places in the ego frame."""
         beam = np.exp(-np.hypot(x, y) / BEAM_M)
         beam *= np.exp(-((np.arctan2(y, x) / BEAM_RAD) ** 2))
         return np.asarray(np.maximum(self._daylight, self.weather.night * beam))
 
     def _through(self, distance: Floats) -> Floats:
-        """What fog (or heavy rain, at 300 m) lets through of a colour."""
+        """Return the share of a colour that fog (or heavy rain, at 300 m) transmits."""
         extinction = 0.0 if self.weather.fog_m is None else 1.0 / self.weather.fog_m
         extinction += self.weather.rain / 300.0
         return np.asarray(np.exp(-KOSCHMIEDER * extinction * distance))
@@ -163,7 +163,7 @@ POOL = 2
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Spoils finished images; the same weather, seed and time give the same bytes.
+    """Adds sensor faults; the same weather, seed and time give the same bytes.
 
     Args:
         rig: The cameras.

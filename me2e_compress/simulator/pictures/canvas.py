@@ -39,7 +39,7 @@ class Canvas:
         return self.scale * np.array([(sin, -cos), (-cos, -sin)])
 
     def to_pixels(self, points: npt.ArrayLike) -> Floats:
-        """World points [..., 2] to continuous pixels (column, row)."""
+        """Convert world points [..., 2] to continuous pixels (column, row)."""
         offset = np.asarray(points, float) - self.centre
         return np.asarray(offset @ self.axes.T + self.anchor)
 
@@ -73,7 +73,7 @@ class Canvas:
     def box(
         self, x: float, y: float, heading: float, size: tuple[float, float]
     ) -> Floats:
-        """[4, 2] world corners of a box: front left first, counter-clockwise."""
+        """Return [4, 2] world corners of a box: front left first, counter-clockwise."""
         forward = np.array([np.cos(heading), np.sin(heading)]) * size[0] / 2
         left = np.array([-np.sin(heading), np.cos(heading)]) * size[1] / 2
         centre = np.array([x, y])
@@ -114,5 +114,5 @@ def write(pixels: Bytes, texts: Iterable[Text]) -> None:
 
 
 def text_width(content: str, size_px: int) -> float:
-    """Width of a text in pixels."""
+    """Return the width of a text in pixels."""
     return float(ImageFont.load_default(size_px).getlength(content))

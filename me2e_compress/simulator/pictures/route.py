@@ -38,8 +38,8 @@ class Moment:
         scene: Everything there was.
         images: The six cameras, uint8 [6, H, W, 3] RGB; None if not rendered.
         plan: [6, 2] metres in the ego frame: the plan in force; None before the first.
-        events: What was noticed, at least since the moment before; an event that is
-            handed in again is marked once.
+        events: Events, at least since the moment before; a repeated event is drawn
+            once.
         score: Driving score so far, 0 to 100; None if not computed.
     """
 
@@ -62,7 +62,7 @@ class RoutePicture:
         tile_width: Width of a camera's tile in pixels.
 
     Raises:
-        EvaluationError: There is no moment.
+        EvaluationError: There are no moments.
     """
 
     title: str
@@ -74,10 +74,10 @@ class RoutePicture:
     def __post_init__(self) -> None:
         """Check that there is something to draw."""
         if not self.moments:
-            raise EvaluationError(f"{self.title}: no moment was recorded to draw")
+            raise EvaluationError(f"{self.title}: no moments to draw")
 
     def frame(self, index: int) -> Bytes:
-        """The six cameras, the view from above and a caption: uint8 [rows, cols, 3]."""
+        """Draw the six cameras, the view from above and a caption: uint8 [H, W, 3]."""
         rows = [
             _beside([self._tile(index, name) for name in names]) for names in MONTAGE
         ]
@@ -88,13 +88,13 @@ class RoutePicture:
         return self._captioned(picture, index)
 
     def frames(self, every: int = 1) -> Iterable[Bytes]:
-        """All moments, or every n-th and the last one."""
+        """Yield all moments, or every n-th and the last one."""
         last = len(self.moments) - 1
         yield from (self.frame(i) for i in range(0, last, every))
         yield self.frame(last)
 
     def strip(self, indices: Sequence[int]) -> Bytes:
-        """Moments side by side, the front camera above the view from above."""
+        """Draw moments side by side, the front camera above the view from above."""
         columns = []
         for index in indices:
             tile = self._tile(index, "FRONT")
@@ -148,7 +148,7 @@ class RoutePicture:
         return _above([picture, caption])
 
     def _infractions(self, index: int) -> tuple[Event, ...]:
-        """Infractions up to a moment, each once, in the order they came."""
+        """Return the infractions up to a moment, each once, in order."""
         events = (e for moment in self.moments[: index + 1] for e in moment.events)
         return tuple(dict.fromkeys(e for e in events if e.kind in INFRACTIONS))
 
@@ -213,7 +213,7 @@ def write_gif(path: Path, pictures: Iterable[Bytes], frame_us: int) -> None:
 
 
 def _palette(images: list[Image.Image]) -> Image.Image:
-    """The 256 colours of a few frames from the whole animation."""
+    """Return the 256 colours of a few frames from the whole animation."""
     chosen = images[:: max(1, len(images) // 6)]
     sheet = np.concatenate([np.asarray(image) for image in chosen])
     return Image.fromarray(sheet).quantize(COLOURS, Image.Quantize.MEDIANCUT)

@@ -84,7 +84,7 @@ class BirdsEye:
         events: tuple[Event, ...],
         size: tuple[int, int],
     ) -> Bytes:
-        """One moment, uint8 [rows, columns, 3].
+        """Draw one moment, uint8 [rows, columns, 3].
 
         Args:
             scene: What is there.
@@ -148,7 +148,7 @@ class BirdsEye:
 
 
 def _vehicle(canvas: Canvas, corners: Floats, colour: Colour) -> None:
-    """A box with a lighter windscreen, so that one sees which way it faces."""
+    """Draw a box with a lighter windscreen that shows which way it faces."""
     canvas.polygon(corners, colour)
     front_left, rear_left, rear_right, front_right = corners
     edges = (front_left, front_right, front_right, front_left)
@@ -207,7 +207,7 @@ def _plan(canvas: Canvas, scene: Scene, plan: Floats) -> None:
 
 
 def _infractions(canvas: Canvas, events: tuple[Event, ...]) -> None:
-    """A cross where the ego was, and the name beside it; one of a kind at a place."""
+    """Draw a cross and a name where the ego was; one of a kind at a place."""
     rows, columns = canvas.pixels.shape[:2]
     arm, texts = 7.0 / canvas.scale, list[Text]()
     for event in events:

@@ -90,7 +90,7 @@ SCENARIO_ABILITIES: dict[str, tuple[str, ...]] = {
 
 DIFFERENCES: dict[str, str] = {
     "ControlLoss": "a slick patch halves the grip before a car that stands across the "
-    "lane; noise on the controls, as there, would punish a driver for the simulator",
+    "lane; noise on the controls, as there, would penalise what no driver did",
     "CrossingBicycleFlow": "the cyclists cross the arm that the ego turns into, on a "
     "path beside the lights, instead of the junction's middle",
     "EnterActorFlow": "the flow that must be entered circulates in a roundabout",
@@ -100,19 +100,19 @@ DIFFERENCES: dict[str, str] = {
     "near flow and into the far one",
     "MergerIntoSlowTrafficV2": "a lane that ends beside the crawling queue; the older "
     "type has an on-ramp",
-    "ParkingExit": "as HighwayExit: somebody is always level with the ego",
+    "ParkingExit": "as HighwayExit: a car is always level with the ego",
     "SequentialLaneChange": "as HighwayExit, three changes in a row",
     "SignalizedJunctionLeftTurnEnterFlow": "latecomers clear the junction on their "
     "red; there is no turn on red here",
     "SignalizedJunctionRightTurn": "latecomers clear the junction on their red; there "
     "is no right turn on red here",
-    "T_Junction": "there a plain turn, which a blind driver survives; here two flows",
+    "T_Junction": "there a plain turn without traffic; here two flows",
     "VanillaNonSignalizedTurn": "there an empty junction; here a give-way sign and one "
     "car with priority",
     "VanillaSignalizedTurnEncounterGreenLight": "there nothing but the green light; "
     "here a queue that has not noticed it yet",
-    "VehicleTurningRoute": "three cyclists in a row instead of one: whoever takes the "
-    "turn too fast drifts a lane's width and would miss a single one",
+    "VehicleTurningRoute": "three cyclists in a row instead of one: a car that takes "
+    "the turn too fast drifts a lane's width and would miss a single one",
     "VehicleTurningRoutePedestrian": "three pedestrians, for the same reason",
 }
 """Scenario type to how it differs from Bench2Drive's type of that name, and why."""

@@ -1,4 +1,4 @@
-"""Bodies that follow no lane: the ego, pedestrians, things that stand."""
+"""Bodies that follow no lane: the ego, pedestrians, static objects."""
 
 import math
 
@@ -18,9 +18,9 @@ from me2e_compress.simulator.traffic.network import Pose, flip
 
 GRAVITY_MPS2 = 9.81
 DRY_GRIP_MPS2 = 0.8 * GRAVITY_MPS2
-"""Largest acceleration that tyres hand on: friction 0.8, dry asphalt."""
+"""Largest acceleration that the tyres transmit: friction 0.8, dry asphalt."""
 ACCELERATION_RANGE_MPS2 = (-8.0, 4.0)
-"""What the ego's brakes and motor can do."""
+"""Limits of the ego's brakes and engine."""
 ACCELERATION_LAG_S = 0.2
 STEERING_LAG_S = 0.1
 """Time constants of the ego's first-order actuators: our choice. highway-env acts at
@@ -54,7 +54,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         return Pose(float(x), -float(y), -float(self.heading))
 
     def act(self, action: object = None) -> None:
-        """Nothing: the ego is driven from outside through `wanted`."""
+        """Do nothing: the ego is driven from outside through `wanted`."""
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds."""
@@ -87,7 +87,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         self.yaw_rate_radps = mean * curvature
 
     def snapshot(self) -> Ego:
-        """Right-handed state."""
+        """Return the state, right-handed."""
         pose = self.pose
         return Ego(
             pose.x,
@@ -104,7 +104,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
 
 
 class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
-    """Somebody who crosses: walks a polyline once told to, and looks at nobody.
+    """A pedestrian or cyclist who follows a polyline once started and never yields.
 
     Args:
         id: Unique.
@@ -137,7 +137,7 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         return self.walked_m >= float(self._arc[-1])
 
     def act(self, action: object = None) -> None:
-        """Nothing: only `going` matters."""
+        """Do nothing: only `going` matters."""
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds; walking speed is reached within 0.5 s."""
@@ -156,13 +156,13 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         self.position = flip(x, y)
 
     def rest(self) -> Floats:
-        """[M, 2] what is left of its line, where it stands first."""
+        """Return [M, 2], what is left of its line, from where it is."""
         ahead = self.line[self._arc > self.walked_m]
         return np.vstack([flip(*self.position), ahead])
 
 
 class StaticObject(Obstacle):  # type: ignore[misc]  # highway-env is untyped
-    """A thing that stands: parked car, door, cone, barrier."""
+    """A static object: parked car, door, cone, barrier."""
 
     def __init__(
         self,

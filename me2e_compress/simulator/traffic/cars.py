@@ -1,4 +1,4 @@
-"""Cars that follow lanes by highway-env's IDM, with behaviour of their own.
+"""Cars that follow lanes by highway-env's IDM, each with its own behaviour.
 
 What stock `IDMVehicle` gets wrong and this one does not (highway-env 1.12): its
 parameters are class attributes that one environment changes under another; it reverses
@@ -43,7 +43,7 @@ class Behaviour:
     jam_gap_m: float = 2.5
     headway_s: float = 1.2
     sees_ego: bool = True
-    """False for actors that take their way whatever the ego does."""
+    """False for actors that ignore the ego."""
     obeys_limits: bool = True
     """False for emergency vehicles."""
 
@@ -127,7 +127,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         return last and self.lane_s > self.network.length(self.lanes[-1])
 
     def change_lane(self, lanes: Sequence[LaneIndex], indicator: int) -> None:
-        """Go on in other lanes, the first of them beside the present one."""
+        """Continue in other lanes, the first of them beside the present one."""
         self.indicator = indicator
         self.lanes[self.leg :] = lanes
 
@@ -157,7 +157,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.braking = wanted < -0.7 or self.speed < 0.2
 
     def idm(self, leader: RoadObject | None, gap_m: float, allowed_mps: float) -> float:
-        """IDM's acceleration (m/s2) for a leader at a gap between bumpers.
+        """Return IDM's acceleration (m/s2) for a leader at a gap between bumpers.
 
         highway-env's own `acceleration`, but for the gap: that one subtracts
         coordinates of the present lane, which means nothing around a corner.
@@ -171,7 +171,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         return float(free - self.COMFORT_ACC_MAX * (wanted / max(gap_m, 0.3)) ** 2)
 
     def allowed_mps(self, lane_s: float) -> float:
-        """The wanted speed, less where a limit or a curve is or comes."""
+        """Return the wanted speed, lowered for a limit or a curve here or ahead."""
         allowed, ahead = float(self.target_speed), -lane_s
         for index in self.lanes[self.leg :]:
             lane = self.network.lane(index)
@@ -200,7 +200,7 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.speed = after
 
     def _steering(self, s: float, r: float) -> float:
-        """highway-env's `steering_control`, with an offset from the lane's centre.
+        """Return highway-env's `steering_control`, with an offset from the centre.
 
         The same cascade (lateral position, lateral speed, heading, heading rate,
         slip) in plain floats, which is five times as fast.

@@ -1,4 +1,4 @@
-"""What the world noticed."""
+"""Events of a route: triggers, collisions and broken rules."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,7 +12,7 @@ class EventKind(StrEnum):
     TRIGGER = "trigger"
     """A scenario's script began to act."""
     COLLISION = "collision"
-    """The ego and somebody or something else."""
+    """The ego with another body."""
     ACTOR_COLLISION = "actor_collision"
     """Two others; never in a well-written scenario."""
     OUTSIDE_LANES = "outside_lanes"
@@ -31,7 +31,7 @@ INFRACTIONS: frozenset[EventKind] = frozenset(EventKind) - {
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened at one instant.
+    """One event.
 
     Attributes:
         time_us: When.

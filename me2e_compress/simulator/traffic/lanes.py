@@ -1,7 +1,7 @@
 """Coordinates of many points in all lanes at once.
 
-highway-env asks every lane about every vehicle one by one, which is where most of its
-time goes; straight and circular lanes, the only ones we build, allow one vectorised
+highway-env asks every lane about every vehicle one by one, which takes most of its
+time; straight and circular lanes, the only ones we build, allow one vectorised
 answer.
 """
 
@@ -37,7 +37,7 @@ class LaneTable:
         self._sense = np.array([lane.direction for lane in arcs])
 
     def coordinates(self, points: Floats) -> tuple[Floats, Floats]:
-        """Arc length and lateral offset (highway-env's sign) of points in lanes.
+        """Return arc lengths and lateral offsets (highway-env's sign) in all lanes.
 
         Args:
             points: [N, 2] in highway-env's plane.
@@ -62,7 +62,7 @@ class LaneTable:
         return s, r
 
     def headings(self, s: Floats) -> Floats:
-        """Headings [N, lanes] (highway-env's sign) at arc lengths [N, lanes]."""
+        """Return headings [N, lanes] (highway-env's sign) at arc lengths [N, lanes]."""
         angles = np.empty_like(s)
         along = np.arctan2(self._along[:, 1], self._along[:, 0])
         angles[:, self._straight] = along

@@ -48,6 +48,7 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
     """Join legs into a path of points 1 m apart."""
     pieces, marks, owners = list[Floats](), list[tuple[float, float, Command]](), []
     done = 0.0
+    # one dense piece a leg, a bridge where it starts elsewhere, its command's stretch
     for leg in legs:
         end = network.length(leg.lane) if leg.leave_m is None else leg.leave_m
         count = max(2, round((end - leg.enter_m) / FINE_M) + 1)
@@ -66,6 +67,7 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
         owners.append((done, leg))
         stop = change_end if leg.command in _CHANGES else done
         marks.append((begin - ANNOUNCED_M, stop, leg.command))
+    # points 1 m apart, each with what its lane and the road beside it allow
     points = resample(_joined(pieces), SPACING_M)
     owner = _owner_of(len(points), owners)
     width = np.array([network.lane(legs[i].lane).width for i in owner], float)
@@ -86,7 +88,7 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
 
 
 def _bridge(before: Floats, after: Floats) -> Floats:
-    """Cubic Hermite curve from the end of one piece to the start of the next."""
+    """Return a cubic Hermite curve from the end of a piece to the next one's start."""
     start, end = before[-1], after[0]
     reach = float(np.hypot(*(end - start)))
     out = (before[-1] - before[-2]) / np.hypot(*(before[-1] - before[-2])) * reach
@@ -133,7 +135,7 @@ def _commands(
 def _room_beside(
     network: Network, points: Floats, headings: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Metres of road left (same way), right (with shoulders), left (all lanes)."""
+    """Return metres of road left (same way), right (with shoulders), left (all)."""
     table = LaneTable(network.graph)
     shoulder = np.zeros(len(table.length), bool)
     for index in network.shoulders:

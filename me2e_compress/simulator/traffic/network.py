@@ -34,7 +34,7 @@ _MARKING = {line: marking for marking, line in _LINE.items()}
 
 
 def flip(x: float, y: float) -> Floats:
-    """A point of one plane in the other (the map is its own inverse)."""
+    """Convert a point between the two planes (the map is its own inverse)."""
     return np.array([x, -y])
 
 
@@ -47,7 +47,7 @@ class Pose:
     heading: float
 
     def moved(self, forward_m: float, left_m: float = 0.0) -> "Pose":
-        """The pose after a step in its own frame."""
+        """Return the pose after a step in its own frame."""
         c, s = math.cos(self.heading), math.sin(self.heading)
         return Pose(
             self.x + c * forward_m - s * left_m,
@@ -56,11 +56,11 @@ class Pose:
         )
 
     def turned(self, angle_rad: float) -> "Pose":
-        """The pose turned on the spot, positive to the left."""
+        """Return the pose turned on the spot, positive to the left."""
         return Pose(self.x, self.y, self.heading + angle_rad)
 
     def along_arc(self, radius_m: float, angle_rad: float) -> "Pose":
-        """The pose after an arc; a positive angle turns left."""
+        """Return the pose after an arc; a positive angle turns left."""
         side = math.copysign(radius_m, angle_rad)
         return self.moved(0.0, side).turned(angle_rad).moved(0.0, -side)
 
@@ -78,7 +78,7 @@ class Section:
     shoulder: bool = False
 
     def markings(self, lane: int) -> tuple[LaneMarking, LaneMarking]:
-        """Left and right marking of one lane."""
+        """Return the left and right marking of one lane."""
         left = self.left if lane == 0 else self.between
         right = self.right if lane == self.lanes - 1 else self.between
         return left, right
@@ -153,21 +153,21 @@ class Network:
         return pose.along_arc(radius_m, angle_rad)
 
     def lane(self, index: LaneIndex) -> AbstractLane:
-        """The highway-env lane."""
+        """Return the highway-env lane."""
         return self.graph.get_lane(index)
 
     def pose(self, index: LaneIndex, s_m: float, left_m: float = 0.0) -> Pose:
-        """Where a lane is at an arc length and an offset to the left."""
+        """Return the pose of a lane at an arc length and an offset to the left."""
         lane = self.lane(index)
         x, y = lane.position(s_m, -left_m)
         return Pose(float(x), -float(y), -float(lane.heading_at(s_m)))
 
     def length(self, index: LaneIndex) -> float:
-        """Length of a lane in metres."""
+        """Return the length of a lane in metres."""
         return float(self.lane(index).length)
 
     def centre(self, index: LaneIndex) -> Floats:
-        """[N, 2] centre line, at most `CHORD_M` apart, computed once."""
+        """Return the [N, 2] centre line, at most `CHORD_M` apart, cached."""
         if index not in self._centres:
             self._centres[index] = self._sampled(index)
         return self._centres[index]
@@ -183,7 +183,7 @@ class Network:
         stop_lines: tuple[tuple[Point, Point], ...],
         crosswalks: tuple[tuple[Point, Point, Point, Point], ...],
     ) -> Roadmap:
-        """Everything painted, in the right-handed plane."""
+        """Return everything painted, in the right-handed plane."""
         lanes = list[Lane]()
         for index, lane in self.graph.lanes_dict().items():
             left, right = (_MARKING[line] for line in lane.line_types)

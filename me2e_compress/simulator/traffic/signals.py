@@ -13,7 +13,7 @@ STOP_ZONE_M = (-1.0, 5.0)
 """Where a stop counts: metres from the front bumper to the line. CARLA looks for the
 stop within 4 m of the sign."""
 YIELD_GAP_S = 1.5
-"""A priority vehicle that is nearer than this to the conflict was not given way to."""
+"""With a priority vehicle nearer than this to the conflict, the ego did not yield."""
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Regulator:
     _stopped: bool = False
 
     def snapshot(self) -> Signal:
-        """As it is seen: the lamp stands at the right end of the line."""
+        """Return it as it is seen: the lamp is at the right end of the line."""
         left = self.line.moved(0.0, self.width_m / 2)
         right = self.line.moved(0.0, -self.width_m / 2)
         post = self.line.moved(0.5, -self.width_m / 2 - 0.8)
@@ -58,7 +58,7 @@ class Regulator:
         )
 
     def check(self, front_s: float, tail_s: float, speed: float) -> EventKind | None:
-        """What the ego, between two arc lengths of its route, does wrong now.
+        """Return which rule the ego breaks now, between two arc lengths of its route.
 
         A red light is run if both the front and the tail of the ego cross the line
         on red (CARLA looks at the tail alone, which blames a car that entered on

@@ -32,7 +32,7 @@ Script = Iterator[None]
 """One actor script: resumed at every decision, it yields until the next one."""
 GOAL_M = 150.0
 SLOWEST_MPS = 1.0
-"""Slower than this, the ego's arrival is reckoned at this speed."""
+"""Below this speed, the ego's arrival is estimated with this speed."""
 
 
 class Stage:
@@ -53,7 +53,7 @@ class Stage:
         self.script_names: list[str] = []
         self.scripts: list[Script] = []
         self.bodies: list[Car | Walker] = []
-        self.things: list[StaticObject] = []
+        self.static_objects: list[StaticObject] = []
         self.regulators: list[Regulator] = []
         self.crosswalks: list[tuple[Point, Point, Point, Point]] = []
         self.at_goal: list[Callable[[], Event | None]] = []
@@ -85,16 +85,16 @@ class Stage:
         return self.time_us / 1e6
 
     def uniform(self, name: str, low: float, high: float) -> float:
-        """A parameter between two bounds, to the millimetre."""
+        """Draw a parameter between two bounds, to the millimetre."""
         drawn = round(float(self._random(name).uniform(low, high)), 3)
         return float(self._given(name, drawn))
 
     def integer(self, name: str, low: int, high: int) -> int:
-        """A whole parameter between two bounds, both included."""
+        """Draw an integer parameter between two bounds, both included."""
         return int(self._given(name, int(self._random(name).integers(low, high + 1))))
 
     def choice(self, name: str, options: Sequence[str]) -> str:
-        """One of several words."""
+        """Draw one of several words."""
         drawn = options[int(self._random(name).integers(len(options)))]
         value = str(self._given(name, drawn))
         if value not in options:
@@ -105,7 +105,7 @@ class Stage:
         return value
 
     def complete(self) -> None:
-        """Setting up is over: every parameter has been drawn.
+        """Finish the setup: every parameter has been drawn.
 
         Raises:
             EvaluationError: The route gives a parameter that nothing asked for.
@@ -161,21 +161,21 @@ class Stage:
         return car
 
     def walker(self, kind: ActorKind, line: Floats, speed_mps: float) -> Walker:
-        """Put somebody at the beginning of a line; `going` sends them off."""
+        """Put a walker at the beginning of a line; `going` starts it."""
         walker = Walker(self._id(), kind, line, speed_mps)
         self.bodies.append(walker)
         return walker
 
-    def thing(
+    def static_object(
         self,
         kind: ActorKind,
         pose: Pose,
         size: tuple[float, float, float] | None = None,
     ) -> StaticObject:
-        """Put a thing somewhere."""
-        thing = StaticObject(self._id(), kind, pose, size)
-        self.things.append(thing)
-        return thing
+        """Put a static object somewhere."""
+        placed = StaticObject(self._id(), kind, pose, size)
+        self.static_objects.append(placed)
+        return placed
 
     def regulate(
         self,
@@ -195,33 +195,33 @@ class Stage:
         return regulator
 
     def route_pose(self, s_m: float, left_m: float = 0.0) -> Pose:
-        """A place beside the route."""
+        """Return a pose beside the route."""
         x, y, heading = self.path.at(s_m, left_m)
         return Pose(float(x), float(y), float(heading))
 
     def ahead_m(self, s_m: float) -> float:
-        """Metres of route from the ego's centre to an arc length."""
+        """Return the metres of route from the ego's centre to an arc length."""
         return s_m - self.ego_s
 
     def gap_m(self, car: Car) -> float:
-        """Metres of route between the bumpers of the ego and a car before it."""
+        """Return the metres of route between the bumpers of the ego and a car ahead."""
         pose = car.pose
         s, _ = self.path.project(pose.x, pose.y)
         return float(s - self.ego_s - (self.ego.LENGTH + car.LENGTH) / 2)
 
     def arrival_s(self, s_m: float) -> float:
-        """Seconds until the ego's front is there at its present speed."""
+        """Return the seconds until the ego's front is there at its present speed."""
         left = self.ahead_m(s_m) - self.ego.LENGTH / 2
         return float(left / max(self.ego.speed, SLOWEST_MPS))
 
     def fire(self, script: str, body: RoadObject | None = None) -> None:
-        """Note that a script's event happens now."""
+        """Record that a script's event happens now."""
         self.events.append(self.event(EventKind.TRIGGER, script, body))
 
     def event(
         self, kind: EventKind, detail: str, body: RoadObject | None = None
     ) -> Event:
-        """An event here and now."""
+        """Return an event here and now."""
         pose = self.ego.pose
         return Event(
             self.time_us,
@@ -243,7 +243,7 @@ class Stage:
         if isinstance(value, str) != isinstance(drawn, str):
             raise EvaluationError(
                 f"route {self.route.id}: parameter {name} is {value!r}, "
-                f"expected something like {drawn!r}"
+                f"expected a value like {drawn!r}"
             )
         self.parameters[name] = value
         return value

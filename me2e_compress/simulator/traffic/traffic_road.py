@@ -1,4 +1,4 @@
-"""highway-env's road with one vectorised look a decision instead of n squared."""
+"""highway-env's road with one vectorised query a decision instead of n squared."""
 
 import math
 
@@ -35,7 +35,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._ego: npt.NDArray[np.bool_] = np.zeros(0, bool)
 
     def refresh(self) -> None:
-        """Look where everybody is; the queries below answer from this look."""
+        """Update the positions from which the queries below answer."""
         self._bodies = [*self.vehicles, *self.objects]
         self._row = {id(body): i for i, body in enumerate(self._bodies)}
         points = np.array([body.position for body in self._bodies])
@@ -44,12 +44,12 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         self._ego = np.array([body.id == 0 for body in self._bodies])
 
     def seat(self, car: Car, index: LaneIndex) -> tuple[float, float]:
-        """Arc length and offset to the right of a car in a lane, at the last look."""
+        """Return a car's arc length and right offset in a lane, at the last refresh."""
         row, column = self._row[id(car)], self.table.column[index]
         return float(self._s[row, column]), float(self._r[row, column])
 
     def lead(self, car: Car) -> tuple[RoadObject, float] | None:
-        """The next body in a car's way, and the gap between their bumpers (m)."""
+        """Return the next body in a car's way, and the gap between the bumpers (m)."""
         row = self._row[id(car)]
         offset = -self._s[row, self.table.column[car.lanes[car.leg]]]
         for k, index in enumerate(car.lanes[car.leg :]):
@@ -77,7 +77,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
     def neighbour_vehicles(
         self, vehicle: RoadObject, lane_index: LaneIndex | None = None
     ) -> tuple[RoadObject | None, RoadObject | None]:
-        """highway-env's query: the bodies before and behind in one lane."""
+        """Return the bodies before and behind in one lane: highway-env's query."""
         index = lane_index or vehicle.lane_index
         if not index:
             return None, None
@@ -96,7 +96,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         )
 
     def act(self) -> None:
-        """Every car decides on the same look."""
+        """Let every car decide on the same positions."""
         self.refresh()
         super().act()
 
@@ -106,7 +106,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             vehicle.step(dt)
 
     def touching(self) -> list[tuple[RoadObject, RoadObject]]:
-        """Pairs that overlap now and of which one moves."""
+        """Return the pairs that overlap now and of which at least one moves."""
         bodies = [*self.vehicles, *self.objects]
         if not any(body.speed > 0 for body in self.vehicles):
             return []
@@ -126,7 +126,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
 
 
 def overlap(a: RoadObject, b: RoadObject) -> bool:
-    """Whether two rectangles overlap (separating axes)."""
+    """Return whether two rectangles overlap (separating axes)."""
     dx = float(b.position[0] - a.position[0])
     dy = float(b.position[1] - a.position[1])
     turn = float(b.heading - a.heading)

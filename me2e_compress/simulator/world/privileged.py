@@ -1,4 +1,4 @@
-"""What only the expert may know: where everybody wants to go."""
+"""What only a privileged policy may see: where actors are going, signal phases."""
 
 from dataclasses import dataclass
 
@@ -15,14 +15,14 @@ FORESEEN_M = 90.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Intent:
-    """The way of one moving actor.
+    """Where one moving actor is going.
 
     Attributes:
         actor_id: As in the scene.
-        path: [M, 2] metres: where it stands, then the way that it will take.
-        target_mps: The speed that it wants on this way; 0 for somebody who waits.
-        acceleration_mps2: What it does now.
-        sees_ego: Whether it brakes for the ego; those that do not just come.
+        path: [M, 2] metres: where it is, then the way that it will take.
+        target_mps: The speed that it wants on this way; 0 while it waits.
+        acceleration_mps2: Its present acceleration.
+        sees_ego: Whether it brakes for the ego.
     """
 
     actor_id: int
@@ -51,14 +51,14 @@ class Phase:
 
 @dataclass(frozen=True, slots=True)
 class Privileged:
-    """Everything that the expert may know beside the scene."""
+    """What a privileged policy may see besides the scene."""
 
     intents: tuple[Intent, ...]
     phases: tuple[Phase, ...]
 
 
 def intent_of(body: Car | Walker) -> Intent:
-    """What an actor will do if nobody disturbs it."""
+    """Return what an actor will do if nothing disturbs it."""
     if isinstance(body, Walker):
         target = body.top_speed_mps if body.going and not body.done else 0.0
         return Intent(body.id, body.rest(), target, 0.0, False)
@@ -71,14 +71,14 @@ def intent_of(body: Car | Walker) -> Intent:
 
 
 def phase_of(regulator: Regulator) -> Phase | None:
-    """A signal as the expert knows it, None if the ego never meets it."""
+    """Return a signal on the ego's route, None if the route does not meet it."""
     if regulator.line_s is None:
         return None
     return Phase(regulator.id, regulator.line_s, regulator.state, regulator.remaining_s)
 
 
 def _way(car: Car) -> Floats:
-    """The centre lines of the lanes ahead, after the place where the car is."""
+    """Return the centre lines of the lanes ahead, after the place of the car."""
     pieces = [np.array([[car.pose.x, car.pose.y]])]
     skip, found = car.lane_s + car.speed * 0.5 + 1.0, 0.0
     for index in car.lanes[car.leg :]:
@@ -97,7 +97,7 @@ def _way(car: Car) -> Floats:
 
 
 def _normals(points: Floats) -> Floats:
-    """[N, 2] unit vectors to the left of a polyline."""
+    """Return [N, 2] unit vectors to the left of a polyline."""
     steps = np.gradient(points, axis=0)
     steps /= np.hypot(steps[:, :1], steps[:, 1:])
     return np.stack([-steps[:, 1], steps[:, 0]], axis=1)

@@ -41,10 +41,9 @@ class World:
 
     Args:
         route: What to stage.
-        dt_us: Frame length in microseconds. A finer one lets a policy act more
-            often; actors still decide every 0.1 s.
-        builder: Sets the stage instead of the registered scenario type; for those who
-            write new types.
+        dt_us: Frame length in microseconds. A finer one takes controls more often;
+            actors still decide every 0.1 s.
+        builder: Sets the stage instead of the registered scenario type: for new types.
 
     Attributes:
         route: What is staged.
@@ -61,7 +60,7 @@ class World:
     ) -> None:
         if not 0 < dt_us <= DECISION_US:
             raise EvaluationError(
-                f"a frame of {dt_us} us: it must be within 1 and {DECISION_US}"
+                f"frame of {dt_us} us: it must be between 1 and {DECISION_US}"
             )
         self.route, self.dt_us = route, dt_us
         self._stage = stage = stage_of(route, builder)
@@ -108,8 +107,8 @@ class World:
         return min(self._furthest_m, self.path.goal_m)
 
     def scene(self) -> Scene:
-        """A frozen snapshot, right-handed."""
-        bodies = [*self._stage.bodies, *self._stage.things]
+        """Return a frozen snapshot, right-handed."""
+        bodies = [*self._stage.bodies, *self._stage.static_objects]
         return Scene(
             self.time_us,
             self._stage.ego.snapshot(),
@@ -118,7 +117,7 @@ class World:
         )
 
     def privileged(self) -> Privileged:
-        """What only the expert may know."""
+        """Return what only a privileged policy may see: intents and signal phases."""
         phases = (phase_of(regulator) for regulator in self._stage.regulators)
         return Privileged(
             tuple(intent_of(body) for body in self._stage.bodies),
@@ -133,16 +132,18 @@ class World:
         """
         wanted = (control.acceleration_mps2, control.steering_rad)
         if not all(math.isfinite(value) for value in wanted):
-            raise EvaluationError(f"route {self.route.id}: the control is {control}")
+            raise EvaluationError(f"route {self.route.id}: {control} is not finite")
         if self.done:
             raise EvaluationError(f"route {self.route.id} has ended: {self.reason}")
         stage = self._stage
         stage.ego.wanted = control
+        # every 0.1 s: scripts act, then cars decide on the same positions
         if stage.time_us >= self._next_decision_us:
             self._next_decision_us += DECISION_US
             stage.scripts = [s for s in stage.scripts if next(s, stage) is not stage]
             self._take_stage()
             self._road.act()
+        # every frame: bodies move, then the rules are checked
         self._road.step(self.dt_us / 1e6)
         stage.time_us += self.dt_us
         self._follow_route()
@@ -153,13 +154,13 @@ class World:
             self._reach_goal()
 
     def _take_stage(self) -> None:
-        """Scripts add and remove bodies; cars that left the map are gone."""
+        """Take over the bodies that scripts added and removed; drop cars that left."""
         stage = self._stage
         stage.bodies = [
             body for body in stage.bodies if not (isinstance(body, Car) and body.gone)
         ]
         self._road.vehicles = [stage.ego, *stage.bodies]
-        self._road.objects = list(stage.things)
+        self._road.objects = list(stage.static_objects)
         for body in stage.bodies:
             body.road = self._road
 

@@ -133,7 +133,7 @@ def test_real_images_make_the_same_picture_every_time() -> None:
 
 
 def test_without_a_moment_there_is_nothing_to_draw() -> None:
-    with pytest.raises(EvaluationError, match="Accident_1: no moment was recorded"):
+    with pytest.raises(EvaluationError, match="Accident_1: no moments to draw"):
         picture()
 
 

@@ -49,7 +49,7 @@ def test_its_route_is_drivable_and_nobody_overlaps_at_the_start(name: str) -> No
         bends = np.abs(np.diff(path.headings))
         steps = np.hypot(*np.diff(path.points, axis=0).T)
         stage = stage_of(route_of(name, seed))
-        bodies = [stage.ego, *stage.bodies, *stage.things]
+        bodies = [stage.ego, *stage.bodies, *stage.static_objects]
 
         assert path.length_m >= path.goal_m + 40
         assert bends.max() < 0.12  # a radius of 8.3 m: the ego can turn in 7.6 m

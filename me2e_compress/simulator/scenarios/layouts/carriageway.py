@@ -53,15 +53,15 @@ class Carriageway:
     end: Pose
 
     def ahead(self, lane: int) -> list[LaneIndex]:
-        """The chain of a forward lane; 0 is the leftmost."""
+        """Return the chain of a forward lane; 0 is the leftmost."""
         return [(a, b, lane) for a, b in self.forward]
 
     def oncoming(self, lane: int = 0) -> list[LaneIndex]:
-        """The chain of an oncoming lane; 0 is the one next to ours."""
+        """Return the chain of an oncoming lane; 0 is the one next to ours."""
         return [(a, b, lane) for a, b in self.backward]
 
     def shoulder(self) -> list[LaneIndex]:
-        """The chain of the shoulder or parking lane."""
+        """Return the chain of the shoulder or parking lane."""
         return [(a, b, 0) for a, b in self.verge]
 
     @property
@@ -70,7 +70,7 @@ class Carriageway:
         return sum(self.network.length(index) for index in self.ahead(0))
 
     def pose(self, s_m: float, lane: int = 0, left_m: float = 0.0) -> Pose:
-        """A place by arc length along a forward lane."""
+        """Return the pose at an arc length along a forward lane."""
         for index in self.ahead(lane):
             length = self.network.length(index)
             if s_m <= length or index == self.ahead(lane)[-1]:
@@ -182,5 +182,5 @@ def _after(pose: Pose, piece: Piece) -> Pose:
 
 
 def straight_section(lanes: int, limit_mps: float) -> Section:
-    """The usual cross-section."""
+    """Return the usual cross-section."""
     return Section(lanes=lanes, width=LANE_WIDTH_M, limit_mps=limit_mps)

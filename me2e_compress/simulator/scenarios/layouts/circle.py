@@ -30,7 +30,7 @@ LIMIT_MPS = 11.0
 
 
 def ring_way(start: str, end: str) -> list[LaneIndex]:
-    """The chain of lanes from one arm around the ring to another."""
+    """Return the chain of lanes from one arm around the ring to another."""
     chain: list[LaneIndex] = [
         (f"{start}.far", f"{start}.in", 0),
         (f"{start}.in", f"{start}.on", 0),
@@ -75,7 +75,7 @@ def roundabout(stage: Stage) -> Regulator:
 
 
 def _arm(stage: Stage, centre: Pose, name: str, reach: float, tangent: float) -> None:
-    """One arm, its entry and exit arcs, and the ring up to the next arm."""
+    """Lay one arm, its entry and exit arcs, and the ring up to the next arm."""
     net, half_lane = stage.network, LANE_WIDTH_M / 2
     road = Section(limit_mps=LIMIT_MPS + 2.0)
     inside = replace(PLAIN, limit_mps=LIMIT_MPS)

@@ -56,7 +56,7 @@ class Crossing:
     signals: dict[str, Regulator]
 
     def way(self, origin: str, to: str, lane: int = 0) -> list[LaneIndex]:
-        """The chain of lanes from one arm to another."""
+        """Return the chain of lanes from one arm to another."""
         turn = (ARMS.index(to) - ARMS.index(origin)) % 4
         entry = {1: self.lanes - 1, 2: lane, 3: 0}[turn]
         inside = lane if turn == 2 else 0
@@ -67,7 +67,7 @@ class Crossing:
         ]
 
     def arm(self, name: str, out_m: float, left_m: float = 0.0) -> Pose:
-        """A place on an arm, ``out_m`` outside the junction, heading outwards.
+        """Return a pose on an arm, ``out_m`` outside the junction, heading outwards.
 
         ``left_m`` is measured from the arm's centre line.
         """
@@ -83,7 +83,7 @@ def junction(
     lanes: int = 1,
     limit_mps: float = 13.0,
 ) -> Crossing:
-    """A junction without lights; ``sign`` stands on the ego's arm."""
+    """Lay a junction without lights; ``sign`` stands on the ego's arm."""
     stage.layout = "junction"
     crossing = _crossing(stage, move, arms, lanes, limit_mps)
     if sign is not None:
@@ -96,7 +96,7 @@ def junction(
 def signal_junction(
     stage: Stage, move: str, ego_light: SignalState = SignalState.GREEN
 ) -> Crossing:
-    """A junction with lights; cross traffic has red where the ego has green."""
+    """Lay a junction with lights; cross traffic has red where the ego has green."""
     crossing = junction(stage, move)
     stage.layout = "signal_junction"
     green = ego_light is SignalState.GREEN
@@ -110,14 +110,14 @@ def signal_junction(
 
 
 def t_junction(stage: Stage, move: str) -> Crossing:
-    """A side road that ends at a through road; the ego gives way and turns."""
+    """Lay a side road that ends at a through road; the ego gives way and turns."""
     crossing = junction(stage, move, SignalKind.GIVE_WAY, ("left", "back", "right"))
     stage.layout = "t_junction"
     return crossing
 
 
 def interurban_turnoff(stage: Stage) -> Crossing:
-    """A fast two-way road with a side road to the left, which the ego takes."""
+    """Lay a fast two-way road with a side road on the left, which the ego takes."""
     arms = ("ahead", "left", "back")
     crossing = junction(stage, "left", arms=arms, limit_mps=16.0)
     stage.layout = "interurban_turnoff"
@@ -125,7 +125,7 @@ def interurban_turnoff(stage: Stage) -> Crossing:
 
 
 def interurban_entry(stage: Stage) -> Crossing:
-    """A side road that ends at a four-lane road; the ego turns left into it."""
+    """Lay a side road that ends at a four-lane road; the ego turns left into it."""
     arms, sign = ("left", "back", "right"), SignalKind.GIVE_WAY
     crossing = junction(stage, "left", sign, arms, lanes=2, limit_mps=14.0)
     stage.layout = "interurban_entry"
@@ -145,7 +145,7 @@ def crosswalk_on(stage: Stage, crossing: Crossing, arm: str) -> None:
 
 
 def _stop_line(crossing: Crossing, arm: str) -> Pose:
-    """Across the lanes that come in, heading inwards."""
+    """Return the stop line across the incoming lanes, heading inwards."""
     across = crossing.lanes * LANE_WIDTH_M / 2
     return crossing.arm(arm, SETBACK_M + 1.0, across).turned(math.pi)
 

@@ -53,7 +53,7 @@ class Ramp:
 
 
 def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
-    """A ramp joins from the right and runs beside the main road for a while."""
+    """Lay a ramp that joins from the right and runs beside the main road."""
     stage.layout = "on_ramp" if ego_on_ramp else "main_road_past_on_ramp"
     start, section = origin(stage), straight_section(2, LIMIT_MPS)
     main = carriageway(stage.network, "m", start, [Straight(TOTAL_M)], section)
@@ -87,7 +87,7 @@ def on_ramp(stage: Stage, ego_on_ramp: bool) -> Ramp:
 
 
 def off_ramp(stage: Stage) -> Ramp:
-    """An exit on the right; the ego starts in the left lane of the main road."""
+    """Lay an exit on the right; the ego starts in the left lane of the main road."""
     stage.layout = "off_ramp"
     start, section = origin(stage), straight_section(2, LIMIT_MPS)
     main = carriageway(stage.network, "m", start, [Straight(TOTAL_M)], section)
@@ -116,7 +116,7 @@ def off_ramp(stage: Stage) -> Ramp:
 
 
 def lane_drop(stage: Stage) -> Street:
-    """A two-lane road whose right lane, the ego's, ends."""
+    """Lay a two-lane road whose right lane, the ego's, ends."""
     stage.layout = "lane_drop"
     start, section = origin(stage), straight_section(2, LIMIT_MPS)
     ends = BEFORE_M + stage.uniform("ends_m", 85.0, 95.0)
@@ -136,7 +136,7 @@ def lane_drop(stage: Stage) -> Street:
 
 
 def four_lanes(stage: Stage) -> Street:
-    """Four lanes one way, which the ego crosses from the left to the right."""
+    """Lay four lanes one way, which the ego crosses from the left to the right."""
     stage.layout = "four_lanes"
     section: Section = straight_section(4, LIMIT_MPS)
     road = carriageway(stage.network, "r", origin(stage), [Straight(TOTAL_M)], section)
@@ -153,12 +153,12 @@ def four_lanes(stage: Stage) -> Street:
 
 
 def block_end(stage: Stage, pose: Pose) -> None:
-    """Barriers where a lane ends."""
+    """Put barriers where a lane ends."""
     for left in (-0.9, 0.9):
-        stage.thing(ActorKind.BARRIER, pose.moved(1.0, left), (0.5, 1.6, 0.98))
+        stage.static_object(ActorKind.BARRIER, pose.moved(1.0, left), (0.5, 1.6, 0.98))
 
 
 def _beside(stage: Stage, start: Pose, s_m: float) -> float:
-    """Route arc length beside a point of the main road's right lane."""
+    """Return the route arc length beside a point of the main road's right lane."""
     pose = start.moved(s_m, -1.5 * LANE_WIDTH_M)
     return stage.path.project(pose.x, pose.y)[0]

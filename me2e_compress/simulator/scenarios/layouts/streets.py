@@ -44,26 +44,26 @@ class Street:
     start_m: float
 
     def ahead(self, lane: int) -> list[LaneIndex]:
-        """Chain of a forward lane."""
+        """Return the chain of a forward lane."""
         return self.road.ahead(lane)
 
     def other_lane(self) -> int:
-        """A lane beside the ego's."""
+        """Return a lane beside the ego's."""
         return self.lane - 1 if self.lane > 0 else self.lane + 1
 
 
 def origin(stage: Stage) -> Pose:
-    """Where the world begins: a drawn compass direction."""
+    """Return where the world begins, with a random heading."""
     return Pose(0.0, 0.0, stage.uniform("heading_rad", -math.pi, math.pi))
 
 
 def start_speed(stage: Stage) -> float:
-    """The ego's speed at frame 0 (m/s)."""
+    """Return the ego's speed at frame 0 (m/s)."""
     return stage.uniform("speed_mps", 7.0, 10.0)
 
 
 def multilane(stage: Stage) -> Street:
-    """A straight one-way road of two or three lanes and a narrow shoulder."""
+    """Lay a straight one-way road of two or three lanes and a narrow shoulder."""
     stage.layout = "multilane"
     lanes = stage.integer("lanes", 2, 3)
     lane = min(stage.integer("ego_lane", 0, lanes - 1), lanes - 1)
@@ -72,14 +72,14 @@ def multilane(stage: Stage) -> Street:
 
 
 def single_lane(stage: Stage) -> Street:
-    """A straight one-way road of one lane: nobody gets past anybody."""
+    """Lay a straight one-way road of one lane, without room to overtake."""
     stage.layout = "single_lane"
     pieces = [Straight(BEFORE_M + GOAL_M + BEYOND_M)]
     return _street(stage, pieces, 1, 0, oncoming=0, limit_mps=14.0, shoulder=0.5)
 
 
 def bend(stage: Stage) -> Street:
-    """A one-way road of two or three lanes through a bend."""
+    """Lay a one-way road of two or three lanes through a bend."""
     stage.layout = "bend"
     lanes = stage.integer("lanes", 2, 3)
     lane = min(stage.integer("ego_lane", 0, lanes - 1), lanes - 1)
@@ -88,28 +88,28 @@ def bend(stage: Stage) -> Street:
 
 
 def two_way(stage: Stage) -> Street:
-    """A straight road with one lane each way; overtaking uses the oncoming lane."""
+    """Lay a straight road, one lane each way; overtaking uses the oncoming lane."""
     stage.layout = "two_way"
     pieces = [Straight(BEFORE_M + GOAL_M + BEYOND_M)]
     return _street(stage, pieces, 1, 0, oncoming=1, limit_mps=13.0, shoulder=0.6)
 
 
 def two_way_bend(stage: Stage) -> Street:
-    """A winding road with one lane each way and a paved shoulder."""
+    """Lay a winding road with one lane each way and a paved shoulder."""
     stage.layout = "two_way_bend"
     pieces = _curve(stage, 50.0, 90.0)
     return _street(stage, pieces, 1, 0, oncoming=1, limit_mps=12.0, shoulder=1.8)
 
 
 def parking_street(stage: Stage) -> Street:
-    """A street with one lane each way and a parking lane on either side."""
+    """Lay a street with one lane each way and a parking lane on either side."""
     stage.layout = "parking_street"
     pieces = [Straight(BEFORE_M + GOAL_M + BEYOND_M)]
     return _street(stage, pieces, 1, 0, oncoming=1, limit_mps=12.0, shoulder=PARKING_M)
 
 
 def parking_bay(stage: Stage) -> Street:
-    """The parking street again, but the ego starts, at rest, in the parking lane."""
+    """Lay the parking street; the ego starts, at rest, in the parking lane."""
     stage.layout = "parking_bay"
     pieces = [Straight(BEFORE_M + GOAL_M + BEYOND_M)]
     section = straight_section(1, 12.0)
@@ -125,7 +125,7 @@ def parking_bay(stage: Stage) -> Street:
 
 
 def zebra_street(stage: Stage) -> Street:
-    """A two-way street with a marked crosswalk; see `Stage.crosswalks`."""
+    """Lay a two-way street with a marked crosswalk; see `Stage.crosswalks`."""
     street = two_way(stage)
     stage.layout = "zebra_street"
     s = stage.uniform("crosswalk_m", 55.0, 80.0)

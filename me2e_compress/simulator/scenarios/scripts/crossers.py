@@ -1,4 +1,4 @@
-"""People on foot and on bicycles who cross the ego's way."""
+"""Pedestrians and cyclists who cross the ego's way."""
 
 from dataclasses import dataclass
 
@@ -15,30 +15,30 @@ HALF_LANE_M = LANE_WIDTH_M / 2
 
 
 def walker_behind_van(stage: Stage) -> Script:
-    """A pedestrian walks out from behind a van that stands at the kerb."""
+    """Send a pedestrian out from behind a van that stands at the kerb."""
     s = stage.uniform("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.5, 2.5)
     van = stage.route_pose(s - 5.0, -(HALF_LANE_M + 1.1))
-    stage.thing(ActorKind.VAN, van)
+    stage.static_object(ActorKind.VAN, van)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.2), 6.5)
     yield from steps_out(stage, walker, s, HALF_LANE_M + 2.2)
     stage.fire("walker_behind_van", walker)
 
 
 def walker_between_cars(stage: Stage) -> Script:
-    """A pedestrian steps out between two parked cars."""
+    """Send a pedestrian out between two parked cars."""
     s = stage.uniform("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.4, 2.2)
     for aside in (-16.5, -10.0, -3.3, 3.3, 9.9):
         pose = stage.route_pose(s + aside, -(HALF_LANE_M + 1.3))
-        stage.thing(ActorKind.PARKED, pose)
+        stage.static_object(ActorKind.PARKED, pose)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.4), 7.0)
     yield from steps_out(stage, walker, s, HALF_LANE_M + 2.4)
     stage.fire("walker_between_cars", walker)
 
 
 def walkers_on_zebra(stage: Stage) -> Script:
-    """Two to four people cross at the crosswalk from both sides."""
+    """Send two to four people over the crosswalk from both sides."""
     s = float(stage.parameters["crosswalk_m"])
     count = stage.integer("walkers", 2, 4)
     walkers = list[Walker]()
@@ -55,21 +55,21 @@ def walkers_on_zebra(stage: Stage) -> Script:
 
 
 def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:
-    """While the ego turns, three pedestrians cross the arm that it turns into."""
+    """Send three pedestrians across the arm that the ego turns into."""
     speed = stage.uniform("walk_mps", 1.3, 2.0)
     row = _row(stage, crossing, ActorKind.PEDESTRIAN, speed, LANE_WIDTH_M + 1.5, 3, 1.3)
     yield from _set_off(stage, row, 1, "pedestrians_on_exit")
 
 
 def cyclists_on_exit(stage: Stage, crossing: Crossing) -> Script:
-    """While the ego turns, three cyclists cross the arm that it turns into."""
+    """Send three cyclists across the arm that the ego turns into."""
     speed = stage.uniform("ride_mps", 2.8, 4.0)
     row = _row(stage, crossing, ActorKind.BICYCLE, speed, LANE_WIDTH_M + 4.0, 3, 2.4)
     yield from _set_off(stage, row, 1, "cyclists_on_exit")
 
 
 def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
-    """A long row of cyclists crosses the arm that the ego turns into."""
+    """Send a long row of cyclists across the arm that the ego turns into."""
     speed = stage.uniform("ride_mps", 3.0, 4.0)
     count = stage.integer("cyclists", 4, 7)
     spacing = stage.uniform("spacing_m", 2.6, 3.6)
@@ -102,7 +102,7 @@ def _row(
     count: int,
     spacing_m: float,
 ) -> Row:
-    """People who cross the arm that the ego leaves by, from a drawn side."""
+    """Place people who cross the arm that the ego leaves by, from a random side."""
     side = -1.0 if stage.choice("side", ("right", "left")) == "right" else 1.0
     out_m = 2.0 if kind is ActorKind.PEDESTRIAN else 3.0
     target = crossing.arm(crossing.move, out_m, -HALF_LANE_M)
@@ -131,7 +131,7 @@ def _set_off(stage: Stage, row: Row, timed: int, name: str) -> Script:
 def _across_route(
     stage: Stage, s_m: float, speed: float, from_m: float, to_m: float
 ) -> Walker:
-    """Somebody who crosses the route at a right angle, offsets to the left."""
+    """Place a pedestrian who crosses the route at a right angle; offsets are left."""
     begin, end = stage.route_pose(s_m, from_m), stage.route_pose(s_m, to_m)
     line = np.array([[begin.x, begin.y], [end.x, end.y]])
     return stage.walker(ActorKind.PEDESTRIAN, line, speed)

@@ -21,28 +21,28 @@ DENSE = Behaviour(headway_s=0.8, jam_gap_m=3.0)
 
 
 def oncoming_platoon(stage: Stage, crossing: Crossing) -> Script:
-    """Oncoming traffic goes straight on while the ego wants to turn left."""
+    """Drive oncoming traffic straight on while the ego wants to turn left."""
     cars = stage.integer("cars", 2, 4)
     chain = crossing.way("ahead", "back")
     yield from _platoon(stage, chain, cars, "oncoming_platoon")
 
 
 def platoon_from_left(stage: Stage, crossing: Crossing) -> Script:
-    """Cars from the left drive straight into the arm that the ego turns into."""
+    """Drive cars from the left straight into the arm that the ego turns into."""
     cars = stage.integer("cars", 2, 4)
     chain = crossing.way("left", "right")
     yield from _platoon(stage, chain, cars, "platoon_from_left", _sign(crossing))
 
 
 def platoon_to_enter(stage: Stage, crossing: Crossing) -> Script:
-    """Cars from the right go where the ego turns left to: it joins their flow."""
+    """Drive cars from the right into the road that the ego turns left into."""
     cars = stage.integer("cars", 2, 4)
     chain = crossing.way("right", "left")
     yield from _platoon(stage, chain, cars, "platoon_to_enter", _sign(crossing))
 
 
 def priority_car(stage: Stage, crossing: Crossing) -> Script:
-    """One car, from a drawn side, that has the right of way."""
+    """Drive one car, from a random side, that has the right of way."""
     side = stage.choice("from", ("left", "right"))
     other = "right" if side == "left" else "left"
     chain = crossing.way(side, other)
@@ -52,14 +52,14 @@ def priority_car(stage: Stage, crossing: Crossing) -> Script:
 
 
 def crossing_car(stage: Stage, crossing: Crossing) -> Script:
-    """A car from the side that must wait, and does not."""
+    """Drive a car from the side that must give way, and does not."""
     side = stage.choice("from", ("left", "right"))
     chain = crossing.way(side, "right" if side == "left" else "left")
     yield from _platoon(stage, chain, 1, "crossing_car")
 
 
 def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
-    """A platoon from the left and, a little later, cars from the right."""
+    """Drive a platoon from the left and, a little later, cars from the right."""
     late = stage.uniform("late_m", 8.0, 16.0)
     other = crossing.way("right", "left", crossing.lanes - 1)
     route_s, station = meeting(stage, other)
@@ -79,7 +79,7 @@ def flows_from_both_sides(stage: Stage, crossing: Crossing) -> Script:
 
 
 def near_and_far_flow(stage: Stage, crossing: Crossing) -> Script:
-    """Fast traffic from the left to cross, slower from the right to join."""
+    """Drive fast traffic from the left to cross, slower from the right to join."""
     far = crossing.way("right", "left", 0)
     route_s, station = meeting(stage, far)
     late = stage.uniform("late_m", 20.0, 30.0)
@@ -93,21 +93,21 @@ def near_and_far_flow(stage: Stage, crossing: Crossing) -> Script:
 
 
 def ring_flow(stage: Stage, sign: Regulator) -> Script:
-    """Cars circulate past the entry at which the ego waits."""
+    """Circulate cars past the entry at which the ego waits."""
     to = stage.choice("flow_to", ("right", "ahead"))
     cars = stage.integer("cars", 2, 4)
     yield from _platoon(stage, ring_way("left", to), cars, "ring_flow", sign)
 
 
 def exit_lane_flow(stage: Stage, ramp: Ramp) -> Script:
-    """Cars beside the ego, in the lane that it must cross to reach the exit."""
+    """Keep cars beside the ego, in the lane that it must cross to reach the exit."""
     yield from _beside(
         stage, ramp.main.ahead(1), 60.0, ramp.merge_s, "exit_lane_flow", 3
     )
 
 
 def side_flows(stage: Stage, street: Street) -> Script:
-    """A car beside the ego at its first change, others in the lanes beyond."""
+    """Keep a car beside the ego at its first change, others in the lanes beyond."""
     for lane in (2, 3):
         ahead = stage.uniform(f"lane_{lane}_m", 8.0, 25.0) * (lane * 2 - 5)
         chain, s = on_chain(
@@ -119,7 +119,7 @@ def side_flows(stage: Stage, street: Street) -> Script:
 
 
 def bay_flow(stage: Stage, street: Street) -> Script:
-    """Cars pass the parking bay that the ego wants to leave."""
+    """Drive cars past the parking bay that the ego wants to leave."""
     chain = street.ahead(0)
     route_s, _ = meeting(stage, chain)
     begin = street.start_m - stage.uniform("behind_m", 3.0, 6.0)
@@ -143,7 +143,7 @@ def _platoon(
     name: str,
     sign: Regulator | None = None,
 ) -> Script:
-    """A row of cars whose first one meets the ego, then drive on by IDM."""
+    """Drive a row of cars, the first timed to meet the ego, and then by IDM."""
     route_s, station = meeting(stage, chain)
     ratio = stage.uniform("flow_ratio", 0.9, 1.05)
     gap = stage.uniform("flow_gap_m", 11.0, 15.0)
@@ -207,7 +207,7 @@ def _sign(crossing: Crossing) -> Regulator | None:
 
 
 def _nearest(row: list[Car], stations: list[float]) -> float:
-    """Seconds until the next car of a row is at its meeting point."""
+    """Return the seconds until the next car of a row is at its meeting point."""
     soonest = float("inf")
     for car, station in zip(row, stations, strict=True):
         left = station - car.station_m

@@ -20,12 +20,12 @@ from me2e_compress.simulator.traffic.network import (
 from me2e_compress.simulator.traffic.stage import Script, Stage
 
 CRAWL_S = 14.0
-"""How long whoever cut in crawls: long enough for a driver at 4 m/s to reach them."""
+"""How long a car that cut in crawls: a driver at 4 m/s can reach it meanwhile."""
 AWAY_MPS = 10.0
 
 
 def hard_brake(stage: Stage, street: Street) -> Script:
-    """The car ahead keeps its distance, then brakes to a stop and waits."""
+    """Keep the car ahead at its distance, then brake it to a stop and wait."""
     gap = stage.uniform("gap_m", 13.0, 18.0)
     where = stage.uniform("brake_m", 35.0, 60.0)
     hardest = stage.uniform("brake_mps2", 5.0, 7.0)
@@ -47,7 +47,7 @@ def hard_brake(stage: Stage, street: Street) -> Script:
 
 
 def pull_out(stage: Stage, street: Street) -> Script:
-    """A parked car pulls out before the ego and crawls."""
+    """Move a parked car out in front of the ego, at a crawl."""
     s = stage.uniform("pull_out_m", 55.0, 75.0)
     lead_s = stage.uniform("lead_s", 3.0, 3.6)
     for aside in (-13.0, -6.5, 14.0, 20.5):
@@ -61,7 +61,7 @@ def pull_out(stage: Stage, street: Street) -> Script:
 
 
 def queue_cut_in(stage: Stage, street: Street) -> Script:
-    """Out of a standing queue in the next lane, somebody moves over."""
+    """Move a car out of a standing queue in the next lane."""
     s = stage.uniform("cut_in_m", 55.0, 75.0)
     lead_s = stage.uniform("lead_s", 3.0, 3.6)
     lane = street.other_lane()
@@ -82,7 +82,7 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
 
 
 def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
-    """A car from the on-ramp merges right before the ego and crawls."""
+    """Merge a car from the on-ramp right in front of the ego, at a crawl."""
     gap = stage.uniform("gap_m", 9.0, 13.0)
     car = stage.car(ramp.ramp, 75.0, float(stage.ego.speed))
     stand_off = 0.0
@@ -99,7 +99,7 @@ def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
 
 
 def slow_queue(stage: Stage, lane: list[LaneIndex], merge_m: float) -> Script:
-    """The lane that the ego must enter is full of crawling cars.
+    """Fill the lane that the ego must enter with crawling cars.
 
     They speed up a while after the ego has come in among or behind them.
     """
@@ -123,7 +123,7 @@ def slow_queue(stage: Stage, lane: list[LaneIndex], merge_m: float) -> Script:
 
 
 def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
-    """The light has turned green, but the queue before the ego still sleeps."""
+    """Hold a queue ahead of the ego at a light that has turned green."""
     line = crossing.signals["back"].line_s or crossing.approach_m
     count = stage.integer("queue", 1, 3)
     chain = crossing.way("back", crossing.move)
@@ -142,7 +142,7 @@ def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
 
 
 def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
-    """A truck stands where the ego wants to leave the junction."""
+    """Block the ego's way out of the junction with a truck."""
     chain = crossing.way("back", crossing.move)
     into = stage.uniform("into_m", 1.0, 5.0)
     truck = stage.car(chain[2:], into + 2.0, 0.0, kind=ActorKind.TRUCK)
@@ -179,12 +179,12 @@ def _cut_in(
 
 
 def _s_along(stage: Stage, lanes: list[LaneIndex], pose: Pose) -> float:
-    """Arc length along a chain nearest to a pose, on its first lane."""
+    """Return the arc length nearest to a pose on the first lane of a chain."""
     lane = stage.network.lane(lanes[0])
     return float(lane.local_coordinates([pose.x, -pose.y])[0])
 
 
 def _park(stage: Stage, s_m: float) -> None:
-    """A parked car in the lane beside the route's."""
+    """Park a car in the lane beside the route's."""
     side = -(LANE_WIDTH_M / 2 + 1.25)
-    stage.thing(ActorKind.PARKED, stage.route_pose(s_m, side))
+    stage.static_object(ActorKind.PARKED, stage.route_pose(s_m, side))

@@ -13,48 +13,50 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 
 
 def free_side(stage: Stage) -> float:
-    """+1 if the lane to pass by lies to the left of the route, -1 to the right."""
+    """Return +1 if the lane to pass by is left of the route, -1 if right."""
     here = round(float(stage.parameters.get("obstacle_m", 60.0)))
     left = float(stage.path.oncoming_m[here])
     return 1.0 if left > LANE_WIDTH_M else -1.0
 
 
 def crashed_cars(stage: Stage) -> Script:
-    """Two cars stand askew in the lane after an accident, a police van before them."""
+    """Place two crashed cars askew in the lane, and a police van before them."""
     s = stage.uniform("obstacle_m", 62.0, 80.0)
     for k, name in enumerate(("first", "second")):
         askew = stage.uniform(f"{name}_askew_rad", -0.35, 0.35)
         aside = -0.4 * free_side(stage)
         place = stage.route_pose(s + 8.0 + 7.0 * k, aside)
-        stage.thing(ActorKind.PARKED, place.turned(askew))
-    stage.thing(ActorKind.EMERGENCY, stage.route_pose(s))
+        stage.static_object(ActorKind.PARKED, place.turned(askew))
+    stage.static_object(ActorKind.EMERGENCY, stage.route_pose(s))
     yield from met(stage, s, "crashed_cars")
 
 
 def construction(stage: Stage) -> Script:
-    """Cones lead to barriers that close the lane for a few metres."""
+    """Close the lane for a few metres with cones and barriers."""
     s = stage.uniform("obstacle_m", 62.0, 80.0)
     length = stage.uniform("works_m", 8.0, 14.0)
     for k in range(4):
-        stage.thing(ActorKind.CONE, stage.route_pose(s + 2.0 * k, -1.4 + 0.8 * k))
+        stage.static_object(
+            ActorKind.CONE, stage.route_pose(s + 2.0 * k, -1.4 + 0.8 * k)
+        )
     for along in (9.0, 9.0 + length):
-        stage.thing(ActorKind.BARRIER, stage.route_pose(s + along))
+        stage.static_object(ActorKind.BARRIER, stage.route_pose(s + along))
     for k in range(int(length // 3)):
-        stage.thing(ActorKind.CONE, stage.route_pose(s + 10.5 + 3.0 * k, 1.3))
+        stage.static_object(ActorKind.CONE, stage.route_pose(s + 10.5 + 3.0 * k, 1.3))
     yield from met(stage, s, "construction")
 
 
 def parked_car(stage: Stage) -> Script:
-    """A car or van stands in the lane, its hazard lights on."""
+    """Stop a car or van in the lane, its hazard lights on."""
     s = stage.uniform("obstacle_m", 62.0, 85.0)
     kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
     aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
-    stage.thing(kind, stage.route_pose(s, aside))
+    stage.static_object(kind, stage.route_pose(s, aside))
     yield from met(stage, s, "parked_car")
 
 
 def slow_cyclists(stage: Stage, street: Street) -> Script:
-    """Cyclists ride in a row, on the right part of the lane."""
+    """Drive cyclists in a row, on the right part of the lane."""
     count = stage.integer("cyclists", 2, 4)
     speed = stage.uniform("cyclist_mps", 1.8, 2.4)
     first = stage.uniform("cyclist_gap_m", 26.0, 34.0)
@@ -73,33 +75,33 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
 
 
 def opening_door(stage: Stage) -> Script:
-    """One of a row of parked cars opens its door into the lane."""
+    """Open the door of one of a row of parked cars into the lane."""
     s = stage.uniform("door_m", 60.0, 80.0)
     side = -(LANE_WIDTH_M / 2 + 1.05)
     for k in range(-2, 3):
-        stage.thing(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
+        stage.static_object(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
     lead_s = stage.uniform("door_lead_s", 2.8, 3.4)
     while stage.arrival_s(s) > lead_s:
         yield
     hinge = side + 1.95 / 2
-    door = stage.thing(
+    door = stage.static_object(
         ActorKind.DOOR, stage.route_pose(s + 0.6, hinge + 0.6), (0.2, 1.2, 1.2)
     )
     stage.fire("opening_door", door)
 
 
 def spun_car(stage: Stage) -> Script:
-    """A slick patch: the tyres lose grip, and somebody stands across the lane.
+    """Lower the grip before a car that stands across the lane.
 
-    Stands in for Bench2Drive's ControlLoss, which adds noise to the controls: that
-    would punish the simulator's user for what the simulator does.
+    Substitutes for Bench2Drive's ControlLoss, which adds noise to the controls: that
+    would penalise what no driver did.
     """
     s = stage.uniform("spun_m", 80.0, 92.0)
     grip = stage.uniform("grip_mps2", 3.0, 4.0)
     begin = s - stage.uniform("slick_m", 35.0, 45.0)
     askew = stage.uniform("askew_rad", 0.4, 0.7)
     place = stage.route_pose(s, -0.7 * free_side(stage))
-    car = stage.thing(ActorKind.PARKED, place.turned(askew))
+    car = stage.static_object(ActorKind.PARKED, place.turned(askew))
     dry = stage.ego.grip_mps2
     while stage.ahead_m(begin) > 0:
         yield
@@ -111,7 +113,7 @@ def spun_car(stage: Stage) -> Script:
 
 
 def neighbours(stage: Stage, street: Street) -> Script:
-    """Ordinary cars in the lane beside the ego's: one ahead, one well behind."""
+    """Drive a car ahead and one well behind in the lane beside the ego's."""
     chain = street.ahead(street.other_lane())
     for name, low, high in (("ahead", 35.0, 50.0), ("behind", -45.0, -30.0)):
         s = street.start_m + stage.uniform(f"{name}_m", low, high)
@@ -122,7 +124,7 @@ def neighbours(stage: Stage, street: Street) -> Script:
 
 
 def oncoming_cars(stage: Stage, street: Street) -> Script:
-    """A few cars come the other way, then nobody."""
+    """Drive a few cars the other way, and then none."""
     count = stage.integer("oncoming", 1, 3)
     chain = street.road.oncoming()
     total = sum(stage.network.length(index) for index in chain)

@@ -1,4 +1,4 @@
-"""Lights, signs, and those who come anyway."""
+"""Lights, signs, and vehicles that take or demand priority."""
 
 from me2e_compress.simulator.scenarios.layouts.crossings import Crossing
 from me2e_compress.simulator.scenarios.layouts.streets import Street
@@ -20,7 +20,7 @@ ALL_RED_S = 1.0
 
 
 def red_light(stage: Stage, crossing: Crossing) -> Script:
-    """Red until the ego has waited at the line; a few cars cross meanwhile."""
+    """Keep the light red until the ego has waited; a few cars cross meanwhile."""
     light = crossing.signals["back"]
     line_s = light.line_s or crossing.approach_m
     ways = (("left", "right"), ("right", "left"))
@@ -44,13 +44,13 @@ def red_light(stage: Stage, crossing: Crossing) -> Script:
 
 
 def stop_sign(stage: Stage, crossing: Crossing) -> Script:
-    """A stop sign and nobody there: only the stop counts."""
+    """Wait for the ego at a stop sign without traffic: only the stop counts."""
     sign = crossing.signals["back"]
     yield from met(stage, sign.line_s or crossing.approach_m, "stop_sign")
 
 
 def invader(stage: Stage, street: Street) -> Script:
-    """An oncoming car drives partly in the ego's lane."""
+    """Drive an oncoming car partly in the ego's lane."""
     chain = street.road.oncoming()
     total = sum(stage.network.length(index) for index in chain)
     where = stage.uniform("meet_m", 55.0, 75.0)
@@ -80,7 +80,7 @@ def invader(stage: Stage, street: Street) -> Script:
 
 
 def emergency_behind(stage: Stage, street: Street) -> Script:
-    """An emergency vehicle comes from behind and wants to pass.
+    """Drive an emergency vehicle up from behind that wants to pass.
 
     Judged as scenario_runner does (YieldToEmergencyVehicleTest): at the end of the
     route it must be ahead of the ego.

@@ -23,7 +23,7 @@ TOUCH_M = 1.0
 def on_chain(
     network: Network, chain: Sequence[LaneIndex], s_m: float
 ) -> tuple[list[LaneIndex], float]:
-    """The rest of a chain from an arc length on, and the arc length in its head."""
+    """Return the rest of a chain from an arc length on, and that in its first lane."""
     lanes = list(chain)
     while len(lanes) > 1 and s_m > network.length(lanes[0]):
         s_m -= network.length(lanes.pop(0))
@@ -31,7 +31,7 @@ def on_chain(
 
 
 def chain_points(network: Network, chain: Sequence[LaneIndex]) -> tuple[Floats, Floats]:
-    """Centre line [N, 2] of a chain and the arc length [N] of each point."""
+    """Return the centre line [N, 2] of a chain and the arc length [N] of each point."""
     points, stations, done = list[Floats](), list[Floats](), 0.0
     for index in chain:
         centre, length = network.centre(index), network.length(index)
@@ -42,7 +42,7 @@ def chain_points(network: Network, chain: Sequence[LaneIndex]) -> tuple[Floats, 
 
 
 def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> tuple[float, float]:
-    """Where a chain of lanes meets the ego's route.
+    """Find where a chain of lanes meets the ego's route.
 
     Returns:
         Arc length on the route and on the chain of the first crossing, or of the
@@ -64,7 +64,7 @@ def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> tuple[float, float]:
 def nearest_station(
     stage: Stage, chain: Sequence[LaneIndex], x: float, y: float
 ) -> float:
-    """Arc length on a chain nearest to a point."""
+    """Return the arc length on a chain nearest to a point."""
     points, stations = chain_points(stage.network, chain)
     away = (points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2
     return float(stations[int(away.argmin())])
@@ -84,6 +84,7 @@ def arrive_together(
     ego's; then it keeps to the time foreseen at that moment, whatever the ego does, and
     drives on by IDM afterwards.
     """
+    # adapt to the ego
     while (
         stage.arrival_s(route_s) > COMMIT_S
         and stage.ahead_m(route_s) - stage.ego.LENGTH / 2 > COMMIT_M
@@ -91,11 +92,13 @@ def arrive_together(
         due = stage.ahead_m(route_s) / max(stage.ego.speed, 2.0)
         _hurry(car, station_m, due, 1.0, top_mps)
         yield
+    # commit to the time foreseen now
     stage.fire(name, car)
     due = stage.time_s + stage.ahead_m(route_s) / max(stage.ego.speed, 3.0)
     while due - stage.time_s > 0.25 and car.station_m < station_m:
         _hurry(car, station_m, due - stage.time_s, 2.5, top_mps)
         yield
+    # drive on by IDM
     car.forced_mps2 = None
     car.target_speed = max(car.speed, 6.0)
     car.behaviour = replace(car.behaviour, sees_ego=True)
@@ -110,13 +113,13 @@ def _hurry(
 
 
 def steps_out(stage: Stage, walker: Walker, route_s: float, reach_m: float) -> Script:
-    """Send somebody off so that they and the ego's front reach the same place.
+    """Start a walker so that it and the ego's front reach the same place together.
 
     Args:
         stage: The stage.
-        walker: Who.
-        route_s: Where they cross the ego's route.
-        reach_m: How far they walk to get there.
+        walker: The pedestrian or cyclist.
+        route_s: Where it crosses the ego's route.
+        reach_m: How far it walks to get there.
     """
     needed = reach_m / walker.top_speed_mps + 0.25
     while stage.arrival_s(route_s) > needed:

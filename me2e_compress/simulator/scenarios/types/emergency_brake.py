@@ -1,4 +1,4 @@
-"""Emergency_Brake: somebody comes suddenly."""
+"""Emergency_Brake: another road user appears suddenly."""
 
 from me2e_compress.simulator.scenarios.layouts.crossings import (
     crosswalk_on,
@@ -79,7 +79,7 @@ def parking_crossing_pedestrian(stage: Stage) -> None:
 
 
 def static_cut_in(stage: Stage) -> None:
-    """Somebody leaves a standing queue."""
+    """A car leaves a standing queue."""
     stage.play(queue_cut_in(stage, multilane(stage)))
 
 

@@ -1,4 +1,4 @@
-"""Traffic_Signs: obey what stands at the junction."""
+"""Traffic_Signs: obey the lights and signs at the junction."""
 
 from me2e_compress.simulator.scenarios.layouts.crossings import (
     junction,
@@ -36,7 +36,7 @@ def vanilla_non_signalized_turn(stage: Stage) -> None:
 def vanilla_signalized_turn_green(stage: Stage) -> None:
     """Turn at a green light behind a queue that has not started yet.
 
-    Bench2Drive's type has the green light alone, which a blind driver passes.
+    Bench2Drive's type has the green light alone, which demands nothing.
     """
     crossing = signal_junction(stage, stage.choice("move", TURNS))
     stage.play(queue_at_light(stage, crossing))
