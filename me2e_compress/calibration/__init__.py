@@ -1,1 +1,1 @@
-"""What is measured on frames: recorded inputs, observers, the ranges that follow."""
+"""Calibration: recorded frames, probes, observers, and the ranges that follow."""

@@ -49,7 +49,7 @@ class CalibrationSet:
 
     @property
     def places(self) -> range:
-        """Where the frames stand in the recording: all of them, in order."""
+        """Indices of the frames in the recording: all of them, in order."""
         return range(len(self.files))
 
     def __iter__(self) -> Iterator[Frame]:
@@ -197,7 +197,7 @@ def _scenes(path: Path, count: int) -> tuple[int, ...]:
     """Read where scenes begin."""
     if not path.is_file():
         raise FramesError(
-            f'{path}: missing; {{"scenes": [0]}} says that the frames are one scene'
+            f'{path}: missing; {{"scenes": [0]}} if the frames are one scene'
         )
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -19,7 +19,7 @@ class Probe(Protocol):
 
     @property
     def width(self) -> int:
-        """How many numbers a tensor gives."""
+        """Count of the numbers that are read of a tensor."""
         ...
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:

@@ -1,4 +1,4 @@
-"""What calibration found, and for which graph and frames it holds."""
+"""Ranges of tensors, and the graph and frames that they were measured on."""
 
 import dataclasses
 from pathlib import Path
@@ -68,7 +68,7 @@ class Ranges:
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """Name the tensors that were zero in every frame."""
+        """The tensors that were zero in every frame."""
         return tuple(name for name, each in self.tensors.items() if each == (0.0, 0.0))
 
     def save(self, path: Path) -> None:

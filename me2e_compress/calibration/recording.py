@@ -36,7 +36,7 @@ def write_recording(
     Raises:
         FramesError: No frames, or the folder holds something else.
     """
-    _refuse_foreign(folder)
+    _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
     try:
@@ -58,7 +58,7 @@ def write_recording(
     return folder
 
 
-def _refuse_foreign(folder: Path) -> None:
+def _check_replaceable(folder: Path) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
@@ -67,7 +67,7 @@ def _refuse_foreign(folder: Path) -> None:
     if not names:
         return
     if INDEX not in names:
-        raise FramesError(f"{folder} is not empty and not ours: it has {names[0]}")
+        raise FramesError(f"{folder} is not empty, and no recording: it has {names[0]}")
     for name in names:
         if name != INDEX and not (name.endswith(".npz") and name[:-4].isdigit()):
             raise FramesError(f"{folder} holds frames but also {name}: not replaced")

@@ -19,7 +19,7 @@ _STATE = "state/"
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationState:
-    """How far one pass over the frames has come.
+    """Progress of one pass over the frames.
 
     Attributes:
         done: frames seen.

@@ -1,4 +1,4 @@
-"""What was measured of every tensor on every frame: enough for any range, in MB."""
+"""Statistics of every tensor on every frame: enough for any range, in a few MB."""
 
 import dataclasses
 import functools
@@ -32,7 +32,7 @@ Floats: TypeAlias = npt.NDArray[np.float32]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Statistics:
-    """What a calibration collected; shards of one recording can be merged.
+    """Statistics that a calibration collected; shards of one recording can be merged.
 
     Attributes:
         model: digest of the graph.

@@ -22,16 +22,16 @@ Readings: TypeAlias = npt.NDArray[np.float32]
 
 
 class FrameSource(Protocol):
-    """Frames that can say which they are, and be read from any place on."""
+    """Frames with a fingerprint, readable from any index on."""
 
     @property
     def fingerprint(self) -> str:
-        """A number that changes with the content of the whole recording."""
+        """A digest that changes with the content of the whole recording."""
         ...
 
     @property
     def places(self) -> Sequence[int]:
-        """Where in the whole recording these frames stand."""
+        """Indices of these frames in the whole recording."""
         ...
 
     def __len__(self) -> int:

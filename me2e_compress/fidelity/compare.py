@@ -1,4 +1,4 @@
-"""How close one model stays to another: signal to noise, and metres of the plan."""
+"""Compare two models on the same frames: signal to noise, metres of the plan."""
 
 import dataclasses
 import itertools
@@ -34,7 +34,7 @@ class OutputFidelity:
 
 @dataclasses.dataclass(frozen=True)
 class Displacement:
-    """How far waypoints moved, Euclidean, over all frames and waypoints.
+    """Displacement of the waypoints, Euclidean, over all frames and waypoints.
 
     Attributes:
         mean_m: mean, metres.
@@ -47,7 +47,7 @@ class Displacement:
 
 @dataclasses.dataclass(frozen=True)
 class Fidelity:
-    """What comparing two models over a recording found.
+    """The result of comparing two models over a recording.
 
     Attributes:
         outputs: those that both models have, in the first model's order.
@@ -66,7 +66,7 @@ class Fidelity:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reference:
-    """What the model to be true to answered, for holding many others against it.
+    """Answers of a reference model, to compare many others with.
 
     Attributes:
         session: the model.
@@ -84,7 +84,7 @@ class Reference:
         return cls(session, frames, tuple(replay(session, frames)))
 
     def compare(self, other: Session) -> Fidelity:
-        """Hold another model against it, as :func:`compare` does."""
+        """Compare another model with it, as :func:`compare` does."""
         return _compare(self.session, iter(self.answers), other, self.frames)
 
 
@@ -100,8 +100,8 @@ def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
 
     Raises:
         EvaluationError: no common output, no frame, an output changes its shape, or
-            is not a number; the message names it.
-        FramesError: a frame fits one of the models not.
+            is not finite; the message names it.
+        FramesError: a frame does not fit one of the models.
     """
     here, there = itertools.tee(frames)
     return _compare(a, replay(a, here), b, there)

@@ -1,4 +1,4 @@
-"""Does the plan depend on what a camera sees?"""
+"""Measure whether the plan depends on what a camera sees."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from me2e_compress.runtime.session import Session, replay
 def plan_reaction(
     session: Session, frame: Frame, other: Frame, *, image: str = "img", camera: int = 0
 ) -> float:
-    """Exchange one camera's image and measure how far the plan moves.
+    """Measure how far the plan moves when one camera's image is exchanged.
 
     A network whose plan ignores its cameras scores perfectly in every comparison; this
     tells it apart.

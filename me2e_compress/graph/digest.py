@@ -1,4 +1,4 @@
-"""One number that changes when a graph does."""
+"""Digests: a number that changes when a graph does."""
 
 import hashlib
 import weakref

@@ -82,7 +82,7 @@ def save(model: ir.Model, path: Path, *, external: bool | None = None) -> None:
 
 
 def is_external(model: ir.Model) -> bool:
-    """Say whether some of the weights lie in a file of their own."""
+    """Return whether some of the weights lie in a file of their own."""
     return any(True for _ in _external(model))
 
 

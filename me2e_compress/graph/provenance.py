@@ -17,7 +17,7 @@ MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """What is known of a node's past.
+    """The provenance of a node.
 
     Attributes:
         module: the ME2E module it belongs to, e.g. ``bev_encoder``.
@@ -31,7 +31,7 @@ class Provenance:
 
 
 def read(node: ir.Node) -> Provenance | None:
-    """Read a node's past; None if it has none.
+    """Read a node's provenance; None if it has none.
 
     Raises:
         GraphError: what stands there is not what :func:`stamp` wrote.
@@ -50,18 +50,18 @@ def _names(node: ir.Node, key: str) -> tuple[str, ...]:
         names = None
     if not isinstance(names, list) or not all(type(name) is str for name in names):
         raise GraphError(
-            f"node {node.name}: its metadata {key} is {text[:40]!r}, no list of names"
+            f"node {node.name}: its metadata {key} is {text[:40]!r}, not a name list"
         )
     return tuple(names)
 
 
 def module_of(node: ir.Node) -> str:
-    """Name the module a node belongs to; empty if nobody has said."""
+    """Return the module that a node belongs to; empty if that is not known."""
     return node.metadata_props.get(MODULE, "")
 
 
 def stamp(node: ir.Node, past: Provenance) -> None:
-    """Write a node's past."""
+    """Write a node's provenance."""
     node.metadata_props[MODULE] = past.module
     node.metadata_props[ORIGINS] = json.dumps(past.origins)
     if past.passes:
@@ -69,7 +69,7 @@ def stamp(node: ir.Node, past: Provenance) -> None:
 
 
 def inherit(node: ir.Node, sources: Iterable[ir.Node], *, by: str) -> None:
-    """Make a new (or changed) node the heir of the nodes it replaces.
+    """Write the provenance of a new or changed node: that of the nodes it replaces.
 
     Origins are united in order; the module is the first source's, the rule being
     that the node whose value lives on is named first.
@@ -89,7 +89,7 @@ def inherit(node: ir.Node, sources: Iterable[ir.Node], *, by: str) -> None:
 
 
 def missing(model: ir.Model) -> list[str]:
-    """Name the nodes of the main graph that have lost their past."""
+    """List the nodes of the main graph without provenance."""
     return [
         node.name or node.op_type
         for node in _nodes_of(model.graph)
@@ -98,13 +98,13 @@ def missing(model: ir.Model) -> list[str]:
 
 
 def sign(before: ir.Model, after: ir.Model, by: str) -> None:
-    """Put a pass's name on every node that it made or changed, where it is missing."""
+    """Add a pass's name to every node that it made or changed, where it is missing."""
     for node in _unsigned(before, after, by):
         inherit(node, [node], by=by)
 
 
 def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
-    """Name the nodes that a pass made or changed without putting its name on them.
+    """List the nodes that a pass made or changed without adding its name.
 
     A node is changed where its operator or an attribute is another; reading another
     value of the same meaning is no change of its own. Empty where the graph before
@@ -121,9 +121,9 @@ def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
 
 
 def foreign(before: ir.Model, after: ir.Model) -> list[str]:
-    """Name the nodes that claim to stand for nodes which the graph before never knew.
+    """List the nodes whose origins the graph before did not have.
 
-    Empty where the graph before says nothing of its nodes: somebody must say it first.
+    Empty where the graph before has no provenance itself.
     """
     if missing(before):
         return []
@@ -164,7 +164,7 @@ def _nodes_of(graph: ir.Graph) -> Iterator[ir.Node]:
 
 
 def _same(old: ir.Node | None, new: ir.Node) -> bool:
-    """Whether two nodes compute the same of what they read."""
+    """Return whether two nodes compute the same from what they read."""
     if old is None or (old.domain, old.op_type) != (new.domain, new.op_type):
         return False
     if old.attributes.keys() != new.attributes.keys():

@@ -1,4 +1,4 @@
-"""Give a graph back what a foreign tool made it forget."""
+"""Restore the metadata and provenance that a foreign tool has dropped."""
 
 from collections.abc import Iterable, Sequence
 
@@ -10,20 +10,20 @@ from me2e_compress.graph import provenance
 def restore(
     model: ir.Model, like: ir.Model, *, by: str, node_names: bool = False
 ) -> None:
-    """Bring metadata and provenance back into a graph that a tool has rewritten.
+    """Restore metadata and provenance in a graph that a tool has rewritten.
 
     onnxsim and onnx-graphsurgeon drop the metadata of models, functions, nodes and
     values. Here a node is known again by the name of its first output, then by its own
-    name. One of the same operator gets all its metadata back; one that another operator
-    stands for now is the heir of that and of the nodes that vanished above it; one that
-    nobody knows is the heir of its nearest neighbour: the producer that comes last in
+    name. One of the same operator gets all its metadata back; one of another operator
+    now inherits from that and from the nodes that vanished above it; one that is new
+    inherits from its nearest neighbour: the producer that comes last in
     the graph, else the consumer that comes first. Linear in nodes.
 
     Args:
-        model: what the tool gave, in graph order; changed in place.
-        like: what the tool was given, its nodes with their past.
-        by: the pass to name in the past of what is new.
-        node_names: give known nodes of the same operator their old names too.
+        model: the tool's result, in graph order; changed in place.
+        like: the tool's input, its nodes with their provenance.
+        by: the pass to name in the provenance of new nodes.
+        node_names: restore the names of known nodes of the same operator too.
     """
     _merge(model.metadata_props, like.metadata_props)
     _merge(model.graph.metadata_props, like.graph.metadata_props)

@@ -1,4 +1,4 @@
-"""What shapes are known, and how to know more."""
+"""Shapes: read those that are known, and infer the others."""
 
 import onnx
 import onnx_ir as ir
@@ -8,14 +8,14 @@ INLINE_BYTES = 1024
 
 
 def static_shape(value: ir.Value | None) -> tuple[int, ...] | None:
-    """Give a value's shape if every dimension is a known number."""
+    """Return a value's shape if every dimension is a known number."""
     if value is None or value.shape is None or not value.shape.is_static():
         return None
     return tuple(int(dim) for dim in value.shape.numpy())
 
 
 def open_shape(value: ir.Value | None) -> tuple[int | None, ...] | None:
-    """Give a value's shape, None for every dimension that is open; None if unknown."""
+    """Return a value's shape, None for every open dimension; None if unknown."""
     if value is None or value.shape is None:
         return None
     return tuple(dim if isinstance(dim, int) else None for dim in value.shape)
@@ -27,7 +27,7 @@ def rank_of(value: ir.Value | None) -> int | None:
 
 
 def infer_shapes(model: ir.Model) -> None:
-    """Let ONNX infer types and shapes, data propagation included, in place.
+    """Infer types and shapes by ONNX, data propagation included, in place.
 
     A node of an unknown domain stops nothing: what it gives keeps the shape that the
     file records, or none. A graph that ONNX cannot infer at all stays as it is, and

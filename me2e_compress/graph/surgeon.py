@@ -1,4 +1,4 @@
-"""The door to onnx-graphsurgeon: out, and back in without losing anything.
+"""Convert to onnx-graphsurgeon, and back without losing anything.
 
 ``gs.Graph`` holds no metadata, so a graph that was out is restored from the one that
 it was made of. In graphsurgeon, call ``fold_constants(recurse_functions=False)`` and
@@ -15,7 +15,7 @@ from me2e_compress.graph.restore import restore
 
 
 def to_graphsurgeon(model: ir.Model) -> gs.Graph:
-    """Give a model as a ``gs.Graph`` of its own; the model stays as it is.
+    """Return a model as a ``gs.Graph`` of its own; the model stays as it is.
 
     Weights are read into memory. graphsurgeon knows no overloads, so the second
     function of a name is called ``name__overload`` there.
@@ -33,12 +33,12 @@ def to_graphsurgeon(model: ir.Model) -> gs.Graph:
 def from_graphsurgeon(
     gs_graph: gs.Graph, like: ir.Model, *, by: str = "graphsurgeon"
 ) -> ir.Model:
-    """Make a model of a ``gs.Graph``, with the metadata of the one it came from.
+    """Return the model of a ``gs.Graph``, with the metadata of the one it came from.
 
     Args:
         gs_graph: the graph; its nodes may be in any order.
-        like: what :func:`to_graphsurgeon` was given.
-        by: what the past of new nodes says made them.
+        like: the model that was given to :func:`to_graphsurgeon`.
+        by: the pass to name in the provenance of new nodes.
 
     Raises:
         GraphError: the graph has a cycle, or an input or output without a type.

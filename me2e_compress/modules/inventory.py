@@ -14,7 +14,7 @@ _NOT_WEIGHTS = (*_INTEGERS, ir.DataType.STRING)
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """What one module weighs.
+    """The nodes, weights and cost of one module.
 
     Attributes:
         module: its name.
@@ -39,7 +39,7 @@ def itemise(
     module_of: Callable[[ir.Node], str],
     macs: Callable[[ir.Node], int | None] | None = None,
 ) -> tuple[Item, ...]:
-    """Weigh each module, in the order of the map; modules without nodes are zeros.
+    """Count each module, in the order of the map; modules without nodes are zeros.
 
     An initializer counts once: for the module that its name says, else for the first
     node that reads it. One that nothing reads and nothing names counts nowhere.

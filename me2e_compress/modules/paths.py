@@ -26,7 +26,7 @@ class Pattern:
 
     @functools.cached_property
     def components(self) -> tuple[str, ...]:
-        """What is written out, without the leading ``*.`` of an anywhere pattern."""
+        """The components that are written out, without a leading ``*.``."""
         parts = tuple(self.text.split("."))
         return parts[1:] if self.anywhere else parts
 

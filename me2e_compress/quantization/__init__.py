@@ -1,1 +1,1 @@
-"""What becomes int8 and why: scheme, rules, plan, overrides."""
+"""Quantization: what becomes int8 and why (scheme, rules, plan, overrides)."""

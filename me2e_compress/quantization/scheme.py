@@ -1,4 +1,4 @@
-"""Which modules become int8."""
+"""Schemes: which modules become int8."""
 
 import dataclasses
 from typing import Self
@@ -29,7 +29,7 @@ class QuantScheme:
 
     @classmethod
     def named(cls, name: str, modules: ModuleMap) -> Self:
-        """Read a scheme off the roles of a module map.
+        """Return the modules of a map whose roles a scheme names.
 
         Raises:
             RecipeError: no such scheme, int4 and fp8 among them.
@@ -50,7 +50,7 @@ class QuantScheme:
 
     @classmethod
     def of(cls, chosen: tuple[str, ...], modules: ModuleMap) -> Self:
-        """Take modules by their names.
+        """Return the scheme of modules chosen by name.
 
         Raises:
             ModuleMapError: the map has no such module.

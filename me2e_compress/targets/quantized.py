@@ -69,7 +69,7 @@ def _comes_from(value: ir.Value | None, op: str) -> bool:
 
 
 def _grid(model: ir.Model) -> str:
-    """Name the element types of all pairs, and whether they are symmetric."""
+    """Return the element types of all pairs, and whether they are symmetric."""
     pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIR]
     zeros = [graph.input_at(node, 2) for node in pairs]
     types = dict.fromkeys(_type(zero) for zero in zeros)
@@ -80,5 +80,5 @@ def _grid(model: ir.Model) -> str:
 
 
 def _type(zero: ir.Value | None) -> str:
-    """Name what a zero point is; uint8 is what ONNX takes where there is none."""
+    """Return the type of a zero point; where there is none, ONNX takes uint8."""
     return "uint8" if zero is None or zero.dtype is None else zero.dtype.name.lower()

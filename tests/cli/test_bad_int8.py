@@ -158,7 +158,7 @@ def test_formats_that_are_not_made(refused: Refused, dense: Path, wanted: str) -
     assert f"no target '{wanted}'; " in refused(*how, "--target", wanted)
     assert f"no calibration method '{wanted}'; " in refused(*how, "--method", wanted)
     line = refused(*how, "--overrides", dense / "o.toml")
-    assert f"dtype {wanted}: int8 and float are what there is" in line
+    assert f"dtype {wanted}: only int8 and float are supported" in line
 
 
 @pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])

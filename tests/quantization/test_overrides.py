@@ -89,9 +89,15 @@ def test_names_of_the_source_file_match_too() -> None:
             '[[override]]\nop = "Softmax"\ndtype = "int8"',
             "override op 'Softmax': /head/Softmax cannot be int8: Softmax in|is no",
         ),
-        ('[[override]]\ndtype = "float"', "names no nodes, module, op or reads"),
-        ('[[override]]\nop = "Conv"\ndtype = "fp8"', "dtype fp8: int8 and float are"),
-        ('[[override]]\nop = "Conv"\ndtype = "int4"', "dtype int4: int8 and float"),
+        (
+            '[[override]]\ndtype = "float"',
+            "none of nodes, module, op and reads is given",
+        ),
+        (
+            '[[override]]\nop = "Conv"\ndtype = "fp8"',
+            "dtype fp8: only int8 and float are",
+        ),
+        ('[[override]]\nop = "Conv"\ndtype = "int4"', "dtype int4: only int8 and"),
         ('[[overide]]\nop = "Conv"\ndtype = "int8"', "overide: Extra inputs"),
         ("[[override", "not TOML"),
     ],

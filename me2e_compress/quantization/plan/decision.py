@@ -186,7 +186,7 @@ class PlanDifference:
     new: Decision | None
 
     def __str__(self) -> str:
-        """Show both decisions on one line."""
+        """Return both decisions on one line."""
         either = self.new or self.old
         name = "" if either is None else either.node or either.output
         return f"{name}: {_short(self.old)} -> {_short(self.new)}"

@@ -93,7 +93,7 @@ def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
 
 @dataclasses.dataclass(frozen=True)
 class SharingCost:
-    """What one scale for a group costs.
+    """Cost of one scale for a group.
 
     Attributes:
         group: which.

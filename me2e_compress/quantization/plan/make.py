@@ -63,7 +63,7 @@ def make_plan(
 
 
 def tensors_of(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-    """Name the activations that the plan reads in int8, in graph order."""
+    """Return the names of the activations that are read in int8, in graph order."""
     nodes = {node.outputs[0].name: node for node in model.graph}
     names: dict[str, None] = {}
     for decision in plan.chosen:

@@ -1,4 +1,4 @@
-"""What the user decides: a TOML file of exceptions to a plan.
+"""Overrides: a TOML file of exceptions to a plan, which the user decides.
 
 TOML::
 
@@ -32,7 +32,7 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan.decision import FLOAT, INT8, Decision
 
-_UNSUPPORTED = "int8 and float are what there is (no int4, fp8 or mixed 16 bit)"
+_UNSUPPORTED = "only int8 and float are supported (no int4, fp8 or mixed 16 bit)"
 
 
 class _Strict(pydantic.BaseModel):
@@ -54,7 +54,7 @@ class Override(_Strict):
         if self.dtype not in (INT8, FLOAT):
             raise ValueError(f"dtype {self.dtype}: {_UNSUPPORTED}")
         if not self._given():
-            raise ValueError("it names no nodes, module, op or reads")
+            raise ValueError("none of nodes, module, op and reads is given")
         return self
 
     def matches(self, node: ir.Node) -> bool:
@@ -67,7 +67,7 @@ class Override(_Strict):
         )
 
     def __str__(self) -> str:
-        """Show what it matches by."""
+        """Return the patterns that it matches by."""
         return ", ".join(f"{key} {value!r}" for key, value in self._given().items())
 
     def _given(self) -> dict[str, str]:
@@ -89,7 +89,7 @@ class ConcatScale(_Strict):
 
 @dataclasses.dataclass(frozen=True)
 class Pin:
-    """What was decided for one node: ``int8`` or ``float``, and why."""
+    """The user's decision for one node: ``int8`` or ``float``, and why."""
 
     dtype: str
     reason: str

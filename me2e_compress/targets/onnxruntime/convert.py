@@ -43,7 +43,7 @@ def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
 
 
 def unranged(model: ir.Model) -> tuple[str, ...]:
-    """Name the tensors whose range is needed and does not stand in the graph.
+    """Return the tensors whose range is needed and does not stand in the graph.
 
     They are what convolutions answer where no pair follows: before a residual Add, and
     where a float node reads them.
@@ -67,7 +67,7 @@ def int8_layers(model: ir.Model) -> tuple[ir.Node, ...]:
 
 
 def _dequantized(value: ir.Value | None) -> bool:
-    """Look for a DequantizeLinear before a value, through changes of layout."""
+    """Return whether a DequantizeLinear makes a value, changes of layout aside."""
     node = producer_of(value)
     while node is not None and node.op_type in ("Reshape", "Transpose"):
         node = producer_of(node.inputs[0])

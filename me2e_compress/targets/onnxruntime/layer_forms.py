@@ -22,7 +22,7 @@ Floats = npt.NDArray[np.float32]
 def write_layer(
     writer: Writer, node: ir.Node, weight: QuantizedWeight, step: np.float32
 ) -> None:
-    """Let a layer read its int8 weight, and an int32 bias.
+    """Rewrite a layer to read its int8 weight and an int32 bias.
 
     ==================  ==============================================================
     Conv                stays one: QLinearConv
@@ -136,7 +136,7 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
 
 
 class _Place:
-    """Where new nodes stand, and whose heirs they are."""
+    """The place of new nodes, and the nodes whose provenance they inherit."""
 
     def __init__(
         self, writer: Writer, before: ir.Node, sources: Sequence[ir.Node]

@@ -40,8 +40,8 @@ def lower(draft: Draft) -> ir.Model:
     if missing := [name for name in region.ranged if name not in draft.reach]:
         raise FramesError(
             f"{len(missing)} tensors have no range, the first is {missing[0]}:"
-            " onnxruntime's convolutions answer uint8, so what they answer is"
-            " calibrated too"
+            " onnxruntime's convolutions write uint8, so their outputs are calibrated"
+            " too"
         )
     grids = {
         value: Grid.of(origin, draft.reach[str(origin.name)])
@@ -62,7 +62,7 @@ def lower(draft: Draft) -> ir.Model:
 def _write_pairs(
     writer: Writer, region: Region, grids: Mapping[ir.Value, Grid]
 ) -> None:
-    """Put a pair behind every uint8 tensor, and let the kernels of a region read it.
+    """Write a pair behind every uint8 tensor, for the kernels of a region to read.
 
     Whoever else reads such a tensor keeps the float one, unless there is none.
 

@@ -29,7 +29,7 @@ def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
 
 
 def tensors(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-    """Name the activations whose range lowering needs: read by, or out of, a layer."""
+    """Return the activations whose range lowering needs: read or made by layers."""
     return _region(plan, model).ranged
 
 

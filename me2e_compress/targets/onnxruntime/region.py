@@ -1,4 +1,4 @@
-"""Which tensors become uint8, on which grid, and who reads them so."""
+"""The int8 part of a graph: which tensors become uint8, on which grid."""
 
 import dataclasses
 from collections.abc import Collection
@@ -42,7 +42,7 @@ class Region:
 
     @property
     def ranged(self) -> tuple[str, ...]:
-        """Name the tensors whose range must be known."""
+        """The tensors whose range must be known."""
         return tuple(dict.fromkeys(str(each.name) for each in self.grids.values()))
 
     def reads(self, node: ir.Node, index: int) -> bool:

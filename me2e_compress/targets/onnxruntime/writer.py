@@ -43,7 +43,7 @@ class Writer:
         sources: Sequence[ir.Node],
         attributes: dict[str, int] | None = None,
     ) -> ir.Node:
-        """Make a node, and its output; it stands nowhere yet.
+        """Build a node and its output; it stands nowhere yet.
 
         Args:
             op: a standard operator.

@@ -28,7 +28,7 @@ BY = "quantize-int8"
 
 
 def tensors(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-    """Name the activations that :func:`place` needs a range of."""
+    """Return the activations that :func:`place` needs a range of."""
     return tensors_of(plan, model)
 
 
@@ -73,7 +73,7 @@ class _Writer:
     def apply(
         self, node: ir.Node, decision: Decision, weight: QuantizedWeight | None
     ) -> None:
-        """Let one node read int8."""
+        """Rewrite one node to read int8."""
         for index in decision.activations:
             value = node.inputs[index]
             if value is not None:

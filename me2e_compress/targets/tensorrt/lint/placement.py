@@ -1,4 +1,4 @@
-"""Where pairs stand: channels, branches of Adds, outputs, half-quantized layers."""
+"""Placement of pairs: channels, branches of Adds, outputs, half-quantized layers."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""What TensorRT takes: its ONNX parser's operators, and plugins of driving stacks.
+"""Tables: the operators that TensorRT's ONNX parser takes, and known plugins.
 
 Operators are those of the support matrix of onnx-tensorrt, ``docs/operators.md``, of
 TensorRT 10.15; what it takes that 10.1 (opset 20) did not is listed apart. An operator
@@ -87,7 +87,7 @@ _PLUGIN_INT8 = _PLUGIN_HALF | {ir.DataType.INT8}
 
 @dataclasses.dataclass(frozen=True)
 class Plugin:
-    """What a plugin accepts.
+    """The inputs and attributes of a plugin.
 
     Attributes:
         source: which library has it.

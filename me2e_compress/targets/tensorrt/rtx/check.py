@@ -187,6 +187,6 @@ def read_kernels(plan: bytes) -> tuple[Kernel, ...]:
 
 
 def without_int8(nodes: Iterable[str], kernels: Iterable[Kernel]) -> tuple[str, ...]:
-    """Name the nodes that no int8 kernel of the plan computes."""
+    """Return the nodes that no int8 kernel of the plan computes."""
     done = {name for kernel in kernels if kernel.is_int8 for name in kernel.nodes}
     return tuple(name for name in nodes if name not in done)

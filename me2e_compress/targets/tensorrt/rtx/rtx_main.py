@@ -11,14 +11,14 @@ import tensorrt_rtx as trt
 
 
 class _Log(trt.ILogger):  # type: ignore[misc]
-    """Keeps what is said at warning level and above."""
+    """Keeps the messages of warning level and above."""
 
     def __init__(self) -> None:
         trt.ILogger.__init__(self)
         self.lines: list[str] = []
 
     def log(self, severity: trt.ILogger.Severity, message: str) -> None:
-        """Take one line."""
+        """Keep one line."""
         if severity <= trt.ILogger.Severity.WARNING:
             self.lines.append(f"{severity.name.lower()}: {message}")
 
