@@ -52,8 +52,17 @@ class Probe:
         return cls(list(synthetic(model, seed=seed, count=count)), "synthetic")
 
     def run(self, model: ir.Model) -> list[Outputs]:
-        """Run a graph over the frames, recurrent state fed forward."""
-        return list(replay(Session(model), self.frames))
+        """Run a graph over the frames, recurrent state fed forward.
+
+        Raises:
+            GraphError: onnxruntime cannot run it, or an output is no tensor.
+        """
+        found = list(replay(Session(model), self.frames))
+        for outputs in found:
+            for name, value in outputs.items():
+                if not isinstance(value, np.ndarray):
+                    raise GraphError(f"output {name} is no tensor: not compared")
+        return found
 
     def nudged(self, seed: int) -> "Probe":
         """Move every float of the inputs by a few units in its last place."""

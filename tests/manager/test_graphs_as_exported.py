@@ -29,3 +29,13 @@ def test_a_graph_is_imported_as_exporters_leave_it(
         provenance.stamp(node, provenance.Provenance("backbone", (str(node.name),)))
     report = PassManager((ImportNormalize(),)).run(model, context)
     assert report.steps[0].changes > 0
+
+
+def test_an_output_that_is_a_sequence_is_not_compared(context: Context) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[1,8] x) => (seq(float[1,4]) y) <int64[2] parts = {4, 4}> {"
+        ' ["/backbone/a"] y = SplitToSequence<axis = 1>(x, parts) }'
+    )
+    (check,) = PassManager((ImportNormalize(),)).run(model, context).verifications
+    assert check.skipped == "output y is no tensor: not compared"
