@@ -1,5 +1,5 @@
 """Checks that anybody's additions can run in their own tests."""
 
-from me2e_compress.testing.check_pass import check_pass, context_for, prepare
+from me2e_compress.testing.check_pass import check_pass
 
-__all__ = ["check_pass", "context_for", "prepare"]
+__all__ = ["check_pass"]

@@ -10,25 +10,11 @@ from me2e_compress.errors import Me2eError, VerificationError
 from me2e_compress.graph import provenance
 from me2e_compress.manager import equivalence
 from me2e_compress.manager.pass_manager import attempt
-from me2e_compress.modules import ModuleMap, detect
+from me2e_compress.modules import map_of
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
 
 _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
-
-
-def context_for(model: ir.Model, modules: ModuleMap | None = None) -> Context:
-    """Make the context that a pass runs in: the given map, or the detected one."""
-    return Context(modules if modules is not None else detect(model))
-
-
-def prepare(model: ir.Model, context: Context) -> ir.Model:
-    """Give a copy of a graph as a pass sees it: imported, shapes inferred."""
-    copy = model.clone()
-    graph.infer_shapes(copy)
-    if provenance.missing(copy):
-        copy = ImportNormalize().run(copy, context).model
-    return copy
 
 
 def check_pass(
@@ -37,32 +23,43 @@ def check_pass(
     """Hold a pass to everything the manager and the documents promise of passes.
 
     It is a frozen dataclass with a kebab-case name and a docstring that shows
-    *Given* and *Result*; it leaves its input alone (run on a clone), keeps the
-    interface and every node's past, tells the truth about having changed something,
-    leaves valid ONNX, gives the same bytes twice, changes nothing the second time
-    if it is exact, and then gives the same outputs.
+    *Given* and *Result* and names every option. It leaves its input alone (it is given
+    a copy), keeps the interface, reports whether it changed anything, leaves valid
+    ONNX and makes the same graph twice. Every node keeps its past; one that is new or
+    changed names the pass and, as its origins, nodes that were there. If the pass is
+    exact, a second run changes nothing and the outputs are the same.
 
     Args:
         current: the pass.
         model: a graph to try it on; static input shapes let exact passes be run.
-        context: module map, frames, seed; None detects the map.
+        context: module map, frames, seed; None detects the map, and takes a graph of
+            no known stack as one module.
 
     Returns:
-        What the pass gave.
+        What the pass returned.
 
     Raises:
         VerificationError: it broke a promise; the message says which.
         Me2eError: it refused the graph.
     """
     _check_form(current)
-    context = context if context is not None else context_for(model)
-    ready = prepare(model, context)
+    context = context if context is not None else Context(map_of(model, None))
+    ready = _prepare(model, context)
     first, again = (_run(current, ready, context) for _ in range(2))
     if graph.digest(first.model) != graph.digest(again.model):
         raise VerificationError(f"{current.name} gives two graphs on two runs")
     if current.exact:
         _check_exact(current, ready, first.model, context)
     return first
+
+
+def _prepare(model: ir.Model, context: Context) -> ir.Model:
+    """Copy a graph as a pass sees it: imported, shapes inferred."""
+    copy = model.clone()
+    graph.infer_shapes(copy)
+    if provenance.missing(copy):
+        copy = ImportNormalize().run(copy, context).model
+    return copy
 
 
 def _check_form(current: Pass) -> None:
