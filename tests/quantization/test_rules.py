@@ -13,7 +13,7 @@ from me2e_compress.graph import static_shape
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
-from me2e_compress.quantization.rules import RULE_SETS, Facts, Rule, RuleSet
+from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
 from me2e_compress.quantization.rules.stages import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.installed import install
@@ -258,7 +258,7 @@ class OnlySmall(Rule):
     name: ClassVar[str] = "only-small"
     columns: int = 8
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         shape = static_shape(node.outputs[0])
         return "too wide" if shape and shape[-1] > self.columns else None
 

@@ -23,7 +23,7 @@ from me2e_compress.quantization.plan.decision import (
 )
 from me2e_compress.quantization.plan.groups import find_groups
 from me2e_compress.quantization.plan.overrides import NONE, Overrides, Pins
-from me2e_compress.quantization.rules import RULE_SETS, Facts, Rule, RuleSet
+from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 
 
@@ -49,7 +49,7 @@ def make_plan(
     """
     asked = RULE_SETS.parse("paper") if rules is None else rules
     in_order = asked.rules()
-    facts = Facts.of(model, scheme.modules)
+    facts = RuleFacts(model, scheme.modules)
     pins = overrides.bind(model)
     main = model.graph
     decided = {
@@ -75,7 +75,7 @@ def tensors_of(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
 
 
 def _decide(
-    node: ir.Node, facts: Facts, rules: Sequence[Rule], pins: Pins, main: ir.Graph
+    node: ir.Node, facts: RuleFacts, rules: Sequence[Rule], pins: Pins, main: ir.Graph
 ) -> Decision:
     decision = functools.partial(
         Decision,
@@ -113,7 +113,7 @@ def _decide(
 
 
 def _int8(
-    node: ir.Node, facts: Facts
+    node: ir.Node, facts: RuleFacts
 ) -> tuple[str, str, tuple[tuple[int, ...], int | None]]:
     """Return rule, reason, and which inputs become activations and weight."""
     constant = node.inputs[1] in facts.constants
@@ -125,7 +125,7 @@ def _int8(
     return "layer", f"{node.op_type} with a constant weight", layout
 
 
-def _borderline(node: ir.Node, facts: Facts, rules: Sequence[Rule]) -> str:
+def _borderline(node: ir.Node, facts: RuleFacts, rules: Sequence[Rule]) -> str:
     remarks = (rule.borderline(node, facts) for rule in rules)
     return next((remark for remark in remarks if remark), "")
 
@@ -142,7 +142,7 @@ def _scale_axis(node: ir.Node) -> int | None:
 
 
 def _residuals(
-    graph: ir.Graph, decided: Mapping[ir.Node, Decision], facts: Facts, pins: Pins
+    graph: ir.Graph, decided: Mapping[ir.Node, Decision], facts: RuleFacts, pins: Pins
 ) -> dict[ir.Node, Decision]:
     """Decide the Adds that end a residual block: which branch is read as int8.
 

@@ -6,15 +6,15 @@ To add a rule or a set of rules: write its class, then add it to its table in ``
 from me2e_compress.quantization.rules.base import (
     RULE_SETS,
     RULES,
-    Facts,
     Rule,
+    RuleFacts,
     RuleSet,
 )
 
 __all__ = [
     "RULES",
     "RULE_SETS",
-    "Facts",
     "Rule",
+    "RuleFacts",
     "RuleSet",
 ]

@@ -2,8 +2,9 @@
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Collection, Mapping
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -14,33 +15,32 @@ from me2e_compress.registry import Registry
 from me2e_compress.runtime.constant_values import constant_values
 
 
-@dataclasses.dataclass(frozen=True)
-class Facts:
-    """What rules may know besides the node.
+class RuleFacts:
+    """What rules may know besides the node; each fact is found when first asked for.
 
-    Attributes:
+    Args:
+        model: the graph, shapes inferred, in topological order.
         modules: which are to be int8.
-        constants: the values that no input changes: weights, and what is computed
-            from weights alone.
-        attention: the nodes that take part in an attention.
-        coordinates: the products that positions come from, and which positions.
     """
 
-    modules: frozenset[str]
-    constants: Collection[ir.Value]
-    attention: Mapping[ir.Node, Attention]
-    coordinates: Mapping[ir.Node, str] = dataclasses.field(default_factory=dict)
+    def __init__(self, model: ir.Model, modules: Collection[str]) -> None:
+        self.model = model
+        self.modules = frozenset(modules)
 
-    @classmethod
-    def of(cls, model: ir.Model, modules: Collection[str]) -> Self:
-        """Look at a graph: a few sweeps, each linear in its nodes."""
-        constants = constant_values(model)
-        return cls(
-            frozenset(modules),
-            constants,
-            find_attention(model, constants),
-            find_coordinates(model, constants),
-        )
+    @functools.cached_property
+    def constants(self) -> Collection[ir.Value]:
+        """The values that no input changes: weights, and what follows from them."""
+        return constant_values(self.model)
+
+    @functools.cached_property
+    def attention(self) -> Mapping[ir.Node, Attention]:
+        """The nodes that take part in an attention, each with that attention."""
+        return find_attention(self.model, self.constants)
+
+    @functools.cached_property
+    def coordinates(self) -> Mapping[ir.Node, str]:
+        """The layers that positions come from, each with the reason."""
+        return find_coordinates(self.model, self.constants)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Rule(abc.ABC):
     firm: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Return why this node stays in float; None if it need not."""
 
-    def borderline(self, node: ir.Node, facts: Facts) -> str | None:
+    def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Return what is close about a node, for a reader to look at; None if nothing.
 
         It may have decided for either side.

@@ -13,7 +13,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import CONVOLUTIONS, static_shape
 from me2e_compress.graph.layers import extent
-from me2e_compress.quantization.rules.base import Facts, Rule
+from me2e_compress.quantization.rules.base import Rule, RuleFacts
 from me2e_compress.quantization.rules.positions import Coordinates
 from me2e_compress.quantization.rules.stages import PaperRules
 
@@ -29,7 +29,7 @@ class SmallProduct(Rule):
     minimum: int = 16
     name: ClassVar[str] = "small-product"
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object if K or N is below the minimum."""
         if node.op_type in CONVOLUTIONS:
             return None
@@ -58,7 +58,7 @@ class NarrowConvolution(Rule):
     packing: int = 8
     name: ClassVar[str] = "narrow-convolution"
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object to narrow convolutions without a kernel."""
         shape = static_shape(node.inputs[1])
         if node.op_type not in CONVOLUTIONS or shape is None:

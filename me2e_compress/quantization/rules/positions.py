@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.quantization.rules.base import Facts, Rule
+from me2e_compress.quantization.rules.base import Rule, RuleFacts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +19,6 @@ class Coordinates(Rule):
 
     name: ClassVar[str] = "coordinates"
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object to what :func:`~me2e_compress.quantization.coordinates` found."""
         return facts.coordinates.get(node)

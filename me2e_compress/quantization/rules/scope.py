@@ -7,7 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import WEIGHTED, is_standard, provenance
 from me2e_compress.quantization.find_attention import FUSED
-from me2e_compress.quantization.rules.base import Facts, Rule
+from me2e_compress.quantization.rules.base import Rule, RuleFacts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,7 +17,7 @@ class WeightedOperator(Rule):
     name: ClassVar[str] = "operator"
     firm: ClassVar[bool] = True
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object to every other operator."""
         if is_standard(node) and node.op_type in WEIGHTED:
             return None
@@ -38,7 +38,7 @@ class ModuleScope(Rule):
 
     name: ClassVar[str] = "module"
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object to a node of another module, or of none."""
         module = provenance.module_of(node)
         if module in facts.modules:
@@ -53,7 +53,7 @@ class WeightOperand(Rule):
     name: ClassVar[str] = "weight"
     firm: ClassVar[bool] = True
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object to computed weights, constants on the left, other element types."""
         left, right = node.inputs[0], node.inputs[1]
         types = {each.dtype for each in (left, right) if each is not None}

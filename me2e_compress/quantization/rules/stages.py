@@ -7,7 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import CONVOLUTIONS
 from me2e_compress.graph.layers import extent
-from me2e_compress.quantization.rules.base import Facts, Rule, RuleSet
+from me2e_compress.quantization.rules.base import Rule, RuleFacts, RuleSet
 from me2e_compress.quantization.rules.scope import (
     ModuleScope,
     WeightedOperator,
@@ -29,7 +29,7 @@ class AttentionLength(Rule):
     limit: int = 512
     name: ClassVar[str] = "attention-length"
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object if queries or keys are more than the limit, or unknown in number."""
         attention = facts.attention.get(node)
         if attention is None:
@@ -43,7 +43,7 @@ class AttentionLength(Rule):
             f" more than {self.limit}"
         )
 
-    def borderline(self, node: ir.Node, facts: Facts) -> str | None:
+    def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Return what is close about a node: a reader may want to decide it otherwise.
 
         Within an eighth of the limit; or only one of queries and keys is beyond it, so
@@ -67,7 +67,7 @@ class MatrixVector(Rule):
 
     name: ClassVar[str] = "gemv"
 
-    def objection(self, node: ir.Node, facts: Facts) -> str | None:
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object if one side of the product is a single row or column."""
         if node.op_type in CONVOLUTIONS:
             return None
