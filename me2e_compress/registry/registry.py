@@ -123,10 +123,15 @@ class Registry(Generic[T]):
         values = {each.name: getattr(item, each.name) for each in fields_of(type(item))}
         return self.make(type(item), {**values, **options})
 
-    def parse(self, text: str) -> T:
+    def parse(self, text: str, cls: type[T] | None = None) -> T:
         """Make an item from ``name``, ``name{option=value, ...}`` or ``name:value``.
 
         What follows a colon is the value of the first option.
+
+        Args:
+            text: of the item.
+            cls: what to make of it, where that need not be registered; None finds the
+                class by the name.
 
         Raises:
             error: the text is not of that form, or see :meth:`build`.
@@ -137,7 +142,7 @@ class Registry(Generic[T]):
             if not name_in(text):
                 raise self._unknown(text) from error
             raise self.error(f"{self.kind}: {error}") from error
-        return self._built(item)
+        return self._built(item, cls or self.get(item.name))
 
     def parse_all(self, text: str) -> tuple[T, ...]:
         """Make the items that a text lists, parted by commas.
@@ -149,7 +154,7 @@ class Registry(Generic[T]):
             items = read_all(text)
         except TextError as error:
             raise self.error(f"{self.kind}: {error}") from error
-        return tuple(self._built(item) for item in items)
+        return tuple(self._built(item, self.get(item.name)) for item in items)
 
     def text(self, item: T, *, defaults: bool = False) -> str:
         """Write an item so that :meth:`parse` makes an equal one.
@@ -191,8 +196,7 @@ class Registry(Generic[T]):
         there = ", ".join(self.names()) or "none"
         return self.error(f"no {self.kind} {name!r}; there are {there}")
 
-    def _built(self, item: ParsedItem) -> T:
-        cls = self.get(item.name)
+    def _built(self, item: ParsedItem, cls: type[T]) -> T:
         if item.value is None:
             return self.make(cls, item.options)
         first = next((each for each in fields_of(cls) if not each.kw_only), None)

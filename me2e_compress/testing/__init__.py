@@ -1,5 +1,15 @@
 """Checks that anybody's additions can run in their own tests."""
 
+from me2e_compress.testing.check_evaluator import check_evaluator
+from me2e_compress.testing.check_observer import check_observer
 from me2e_compress.testing.check_pass import check_pass
+from me2e_compress.testing.check_policy import check_policy
+from me2e_compress.testing.form import check_form
 
-__all__ = ["check_pass"]
+__all__ = [
+    "check_evaluator",
+    "check_form",
+    "check_observer",
+    "check_pass",
+    "check_policy",
+]

@@ -28,7 +28,10 @@ class Observer(abc.ABC):
 
     @abc.abstractmethod
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Return the low and the high bound of every tensor's range."""
+        """Return the low and the high bound of every tensor's range.
+
+        Both are finite, and within what was seen of the tensor: see :func:`within`.
+        """
 
 
 def check_option(name: str, option: str, value: float, largest: float) -> None:

@@ -1,0 +1,49 @@
+"""Hold an evaluator to what scores are computed from."""
+
+from collections import Counter
+
+from me2e_compress.driving.contract import Evaluator
+from me2e_compress.errors import VerificationError
+from me2e_compress.evaluators import EVALUATORS
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.testing.form import check_form
+
+
+def check_evaluator(
+    evaluator: Evaluator, again: Evaluator | None = None
+) -> tuple[Episode, ...]:
+    """Check that an evaluator yields each route once, and always the same.
+
+    It has the form of :func:`check_form`; it yields at least one episode, no route
+    twice; and a second evaluation yields equal episodes in the same order.
+
+    Args:
+        evaluator: the evaluator.
+        again: one of equal options that drives anew, i.e. with another folder where
+            results are kept; None asks the same evaluator twice.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        VerificationError: it broke a promise; the message says which.
+        EvaluationError: it cannot evaluate.
+    """
+    check_form(evaluator, EVALUATORS)
+    name = evaluator.name
+    first = tuple(evaluator.episodes())
+    if not first:
+        raise VerificationError(f"{name} yields no episode")
+    strange = [each for each in first if not isinstance(each, Episode)]
+    if strange:
+        raise VerificationError(f"{name} yields {strange[0]!r}, no episode")
+    route, count = Counter(each.route for each in first).most_common(1)[0]
+    if count > 1:
+        raise VerificationError(f"{name} yields route {route} {count} times")
+    second = tuple((evaluator if again is None else again).episodes())
+    if [each.route for each in second] != [each.route for each in first]:
+        raise VerificationError(f"{name} yields other routes, or in another order")
+    for one, other in zip(first, second, strict=True):
+        if one != other:
+            raise VerificationError(f"{name} yields two episodes for {one.route}")
+    return first

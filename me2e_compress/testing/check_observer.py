@@ -1,0 +1,117 @@
+"""Hold an observer to what calibration needs of it."""
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer
+from me2e_compress.calibration.statistics import BINS, Statistics
+from me2e_compress.errors import FramesError, VerificationError
+from me2e_compress.testing.form import check_form
+
+FRAMES, ELEMENTS = 6, 500
+
+
+def check_observer(observer: Observer, seed: int = 0) -> tuple[Bounds, Bounds]:
+    """Check that an observer makes ranges that int8 can be put on.
+
+    It has the form of :func:`check_form`; it asks for histograms exactly if it reads
+    them; the same statistics give the same ranges; these are two finite float32
+    arrays [tensors], the low bound at most the high one, within what was seen; and
+    the range of a tensor does not depend on the other tensors.
+
+    Args:
+        observer: the observer.
+        seed: of the values that the statistics are of: normal, one-sided,
+            heavy-tailed, constant and zero.
+
+    Returns:
+        Low and high bounds of those five tensors.
+
+    Raises:
+        VerificationError: it broke a promise; the message says which.
+    """
+    check_form(observer, OBSERVERS)
+    tensors = _tensors(seed)
+    _check_counts(observer, tensors)
+    seen = _statistics(tensors, observer.counts)
+    lows, highs = observer.ranges(seen)
+    if not _equal((lows, highs), observer.ranges(seen)):
+        raise VerificationError(f"{observer.name} gives two ranges for one tensor")
+    _check_bounds(observer.name, seen, lows, highs)
+    turned = observer.ranges(_statistics(tensors[::-1], observer.counts))
+    if not _equal((lows[::-1], highs[::-1]), turned):
+        raise VerificationError(
+            f"{observer.name}: the range of a tensor depends on the other tensors"
+        )
+    return lows, highs
+
+
+def _check_counts(observer: Observer, tensors: list[npt.NDArray[np.float32]]) -> None:
+    try:
+        observer.ranges(_statistics(tensors, histograms=False))
+    except FramesError as error:
+        if not observer.counts:
+            raise VerificationError(
+                f"{observer.name} reads histograms, and counts is False"
+            ) from error
+        return
+    if observer.counts:
+        raise VerificationError(
+            f"{observer.name} reads no histograms, and counts is True: a second pass"
+            " over the frames for nothing"
+        )
+
+
+def _check_bounds(name: str, seen: Statistics, lows: Bounds, highs: Bounds) -> None:
+    for bounds in (lows, highs):
+        if bounds.shape != (len(seen.tensors),) or bounds.dtype != np.float32:
+            raise VerificationError(
+                f"{name}: a bound is {bounds.dtype} {list(bounds.shape)}, it must be"
+                f" float32 [{len(seen.tensors)}]"
+            )
+        if not np.isfinite(bounds).all():
+            raise VerificationError(f"{name}: a bound is not finite")
+    if (lows > highs).any():
+        raise VerificationError(f"{name}: a low bound is above the high one")
+    if (lows < seen.lows.min(axis=0)).any() or (highs > seen.highs.max(axis=0)).any():
+        raise VerificationError(
+            f"{name}: a range reaches beyond what was seen, where steps are wasted"
+        )
+
+
+def _equal(one: tuple[Bounds, Bounds], other: tuple[Bounds, Bounds]) -> bool:
+    return all(
+        np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True)
+    )
+
+
+def _tensors(seed: int) -> list[npt.NDArray[np.float32]]:
+    """Draw five tensors: float32 [frames, elements]."""
+    draws = np.random.default_rng(seed)
+    shape = FRAMES, ELEMENTS
+    return [
+        np.asarray(values, np.float32)
+        for values in (
+            draws.normal(1.0, 2.0, shape),
+            np.maximum(draws.normal(0.0, 1.0, shape), 0),
+            draws.standard_cauchy(shape),
+            np.full(shape, -0.3),
+            np.zeros(shape),
+        )
+    ]
+
+
+def _statistics(tensors: list[npt.NDArray[np.float32]], histograms: bool) -> Statistics:
+    """Measure the tensors as a calibration does."""
+    each = [(x.min(axis=1), x.max(axis=1), np.square(x).mean(axis=1)) for x in tensors]
+    measured = np.asarray(each, np.float32).transpose(2, 0, 1)
+    names = tuple(f"t{at}" for at in range(len(tensors)))
+    places = tuple(range(FRAMES))
+    seen = Statistics("model", "source", names, places, measured)
+    if not histograms:
+        return seen
+    counts = [
+        np.histogram(np.abs(x), BINS, (0.0, 2.0**exponent))[0]
+        for x, exponent in zip(tensors, seen.exponents, strict=True)
+    ]
+    return Statistics("model", "source", names, places, measured, np.array(counts))

@@ -1,0 +1,43 @@
+"""Hold anything that a registry names to what all of it has in common."""
+
+import re
+from typing import TypeVar
+
+from me2e_compress.errors import VerificationError
+from me2e_compress.registry import Item, Registry, options_of
+
+_KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+
+T = TypeVar("T", bound=Item)
+
+
+def check_form(item: T, registry: Registry[T]) -> None:
+    """Check that an item is data that text can say.
+
+    It is a frozen dataclass with a name-like-this and a docstring that tells what
+    every option means, and its text makes an equal item.
+
+    Args:
+        item: a pass, rule, observer, driver, ...; it need not be installed.
+        registry: of its kind, e.g. ``calibration.observers.OBSERVERS``.
+
+    Raises:
+        VerificationError: it is not; the message says in what.
+    """
+    cls = type(item)
+    # of its own: an undecorated class inherits that of its base
+    parameters = vars(cls).get("__dataclass_params__")
+    if parameters is None or not parameters.frozen:
+        raise VerificationError(f"{cls.__name__} is not a frozen dataclass")
+    if _KEBAB.fullmatch(item.name) is None:
+        raise VerificationError(f"{item.name!r} is not a name-like-this")
+    if cls.__doc__ is None or cls.__doc__.startswith(f"{cls.__name__}("):
+        raise VerificationError(f"{cls.__name__} has no docstring")
+    for option in options_of(cls):
+        if not option.doc:
+            raise VerificationError(
+                f"{cls.__name__}'s docstring lacks {option.name} under Attributes:"
+            )
+    text = registry.text(item, defaults=True)
+    if registry.parse(text, cls) != item:
+        raise VerificationError(f"{text} is read back as something else")

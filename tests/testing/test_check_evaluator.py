@@ -1,0 +1,71 @@
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from me2e_compress.errors import VerificationError
+from me2e_compress.evaluators.highway.evaluation_options import Highway
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.simulator.routes import save_routes
+from me2e_compress.testing import check_evaluator
+from tests.evaluators.highway.drivers import EXIT
+from tests.metrics.drives import drive
+
+RUNS = itertools.count()
+
+
+@dataclass(frozen=True)
+class Made:
+    """Yields episodes made by hand.
+
+    Attributes:
+        way: In which it errs.
+    """
+
+    name: ClassVar[str] = "made"
+    way: str = ""
+
+    def episodes(self) -> Iterator[Episode]:
+        run = next(RUNS)
+        routes = {"none": [], "twice": ["a", "b", "a"]}.get(self.way, ["a", "b"])
+        if self.way == "order" and run % 2:
+            routes = routes[::-1]
+        for route in routes:
+            if self.way == "no episode":
+                yield route  # type: ignore[misc]
+            moved = float(run) if self.way == "drifts" else 100.0
+            yield drive(route=route, completion=moved)
+
+
+def test_what_errs_in_no_way_holds() -> None:
+    assert [each.route for each in check_evaluator(Made())] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("way", "message"),
+    [
+        ("none", "made yields no episode"),
+        ("no episode", "made yields 'a', no episode"),
+        ("twice", "made yields route a 2 times"),
+        ("order", "made yields other routes, or in another order"),
+        ("drifts", "made yields two episodes for a"),
+    ],
+)
+def test_a_wrong_evaluator_is_caught(way: str, message: str) -> None:
+    with pytest.raises(VerificationError, match=message):
+        check_evaluator(Made(way))
+
+
+def test_ours_holds(tmp_path: Path) -> None:
+    save_routes([EXIT], tmp_path / "routes.json")
+    first, again = (
+        Highway("blind", tmp_path / folder, str(tmp_path / "routes.json"))
+        for folder in ("first", "again")
+    )
+
+    (episode,) = check_evaluator(first, again)
+
+    assert episode.route == "exit"
