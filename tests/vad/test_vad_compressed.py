@@ -4,13 +4,14 @@ import math
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.fidelity.compare import compare
+from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.reaction import plan_reaction
 from me2e_compress.graph import provenance
 from me2e_compress.modules import ModuleMap
@@ -21,6 +22,7 @@ from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import onnxruntime
 from me2e_compress.targets.lint import lint
@@ -33,6 +35,14 @@ pytestmark = pytest.mark.xdist_group("vad-run")
 
 WEIGHT_MB = 159.5
 """39,865,999 float32 parameters."""
+
+HEADS_MOVE, FEATURES_MOVE = 0.05, 0.5
+"""By what share of the plan's length int8 may move a waypoint.
+
+The plan of these random weights is 2.34 m long. Measured: int8 heads move it by 0.03 m
+(0.014 of it), an int8 backbone by 0.88 m (0.38), both by 0.86 m, on onnxruntime by
+0.81 m; on the other frame, a plan of 1.70 m, by 1.04 m at most. At 1 it would be noise,
+and there the files of other tools stand (docs/benchmarks.md)."""
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +71,19 @@ def folded(vad_tiny: Path, context: Context) -> ir.Model:
 
 
 @pytest.fixture(scope="module")
-def reference(folded: ir.Model) -> Session:
-    return Session(folded, threads=2)
+def reference(folded: ir.Model, frames: CalibrationSet) -> Reference:
+    """Run the float graph over the frame with the longer plan."""
+    return Reference.of(Session(folded, threads=2), [frames[1]])
+
+
+@pytest.fixture(scope="module")
+def plan_m(reference: Reference, frames: CalibrationSet) -> float:
+    """How far the float graph plans ahead: its farthest waypoint, metres."""
+    session = reference.session
+    adapter = PlanAdapter.of(session.metadata, list(session.outputs))
+    assert adapter is not None
+    plan = adapter.plan(reference.answers[0], frames[1].arrays)
+    return float(np.linalg.norm(plan, axis=1).max())
 
 
 @pytest.fixture(scope="module")
@@ -92,27 +113,32 @@ def seeing(result: ir.Model, context: Context) -> Session:
 
 
 @pytest.mark.parametrize(
-    ("scheme", "layers", "saved"),
+    ("scheme", "layers", "saved", "share"),
     # int8 stores a quarter: three bytes saved a parameter of the modules, less those
     # that no layer holds (embeddings, biases, what stays float)
-    [("feature-ext", 85, 70.0), ("prediction", 110, 15.0), ("full", 195, 90.0)],
+    [
+        ("feature-ext", 85, 70.0, FEATURES_MOVE),
+        ("prediction", 110, 15.0, HEADS_MOVE),
+        ("full", 195, 90.0, FEATURES_MOVE),
+    ],
 )
 def test_schemes_shrink_the_file_and_keep_the_plan(
     scheme: str,
     layers: int,
     saved: float,
+    share: float,
     folded: ir.Model,
-    reference: Session,
+    reference: Reference,
+    plan_m: float,
     context: Context,
-    frames: CalibrationSet,
     ranges: Path,
 ) -> None:
     result = QuantizeInt8(scheme=scheme, ranges=ranges).run(folded.clone(), context)
     session = seeing(result.model, context)
-    found = compare(reference, session, [frames[0]])
+    found = reference.compare(session)
 
     assert found.plan is not None
-    assert found.plan.max_m < 3.0
+    assert found.plan.max_m < share * plan_m
     assert not any(math.isnan(each.sqnr_db) for each in found.outputs)
     int8 = [n for n in result.model.graph if n.op_type == "DequantizeLinear"]
     assert len(int8) >= layers
@@ -122,9 +148,9 @@ def test_schemes_shrink_the_file_and_keep_the_plan(
 
 def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     folded: ir.Model,
-    reference: Session,
+    reference: Reference,
+    plan_m: float,
     context: Context,
-    frames: CalibrationSet,
     ranges: Path,
     tmp_path: Path,
 ) -> None:
@@ -134,14 +160,14 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     rewritten = tmp_path / "rewritten.onnx"
     session = Session(result, threads=2, rewritten=rewritten)
     kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
-    found = compare(reference, session, [frames[0]])
+    found = reference.compare(session)
 
     # ResNet-50 has 53, the neck two
     assert kernels["QLinearConv"] == 55
     assert kernels["Conv"] + kernels["FusedConv"] == 0
     assert kernels["QGemm"] + kernels["MatMulIntegerToFloat"] >= 140
     assert found.plan is not None
-    assert found.plan.max_m < 3.0
+    assert found.plan.max_m < FEATURES_MOVE * plan_m
     assert lint(result, "onnxruntime") == ()
 
 
