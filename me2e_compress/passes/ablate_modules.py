@@ -1,21 +1,23 @@
-"""Take whole modules out of a graph."""
+"""Remove whole modules from a graph."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
-from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.means import load_means, token_means
+from me2e_compress.errors import FramesError, PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Substitute
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.glue import hand_over
-from me2e_compress.passes.means import means_of
 from me2e_compress.passes.substitutes import (
     constant_like,
     depends,
+    layout_of,
     module_of,
     replace_readers,
     result_of,
@@ -23,6 +25,12 @@ from me2e_compress.passes.substitutes import (
     within,
     zeros_like,
 )
+from me2e_compress.runtime.frames import Array
+
+_LAYOUT = frozenset(
+    {"Cast", "Flatten", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
+)
+"""Operators that only lay out anew what another node made."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +91,7 @@ class AblateModules(Pass):
         for pattern in self.keep:
             result_of(model, pattern)
         before = graph.node_count(model)
-        hand_over(model, self._goes)
+        _hand_over(model, self._goes)
         gone = self._cut_outputs(model)
         notes = [f"output removed: {name}" for name in gone]
         if self.fill == "substitute":
@@ -113,7 +121,7 @@ class AblateModules(Pass):
         """Put constants in the place of all that leaves the dropped modules."""
         where, exits = model.graph, self._exits(model)
         if self.fill == "means":
-            means, how = means_of(model, exits, context.frames, self.means)
+            means, how = _means_of(model, exits, context.frames, self.means)
             for value in exits:
                 mean = means[str(value.name)]
                 replace_readers(value, constant_like(where, value, mean))
@@ -151,19 +159,19 @@ class AblateModules(Pass):
     def _substitute(self, model: ir.Model, wanted: Substitute) -> str:
         old = result_of(model, wanted.scope)
         if self._dropped(old):
-            return f"{wanted.scope} is dropped itself: nothing stands in for it"
+            return f"{wanted.scope} is dropped itself: nothing is substituted"
         if wanted.by is None:
             replace_readers(old, self._zeros(model.graph, old))
             return f"{wanted.scope} reads as zeros"
         new = result_of(model, wanted.by, like=old)
         if self._dropped(new):
             raise PreconditionError(
-                f"{wanted.by} cannot stand in for {wanted.scope}: it is of module"
+                f"{wanted.by} cannot substitute for {wanted.scope}: it is of module"
                 f" {module_of(new)}, which is dropped too"
             )
         if depends(new, old):
             raise PreconditionError(
-                f"{wanted.by} cannot stand in for {wanted.scope}: it reads its result"
+                f"{wanted.by} cannot substitute for {wanted.scope}: it reads its result"
             )
         readers = self._readers(old)
         replace_readers(old, shaped_like(model.graph, new, old, readers, self.name))
@@ -177,3 +185,70 @@ def _require_nodes(model: ir.Model, drop: tuple[str, ...]) -> None:
             raise PreconditionError(
                 f"no node belongs to module {name}; the graph has {', '.join(present)}"
             )
+
+
+def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
+    """Move layout nodes of modules that go into the modules that read them.
+
+    An exporter that finds the same cast of the same value in two modules writes it
+    once, with the scope of the first. It computes nothing of that module's own: if the
+    first goes, the second must not lose its input.
+
+    Args:
+        model: the graph, sorted; modules of nodes change in place.
+        goes: whether a node belongs to a module that goes.
+
+    Returns:
+        How many nodes changed their module.
+    """
+    carriers = dict[ir.Node, None]()
+    for node in model.graph:
+        makers = [value.producer() for value in node.inputs if value is not None]
+        outside = all(
+            maker is None or maker in carriers or not goes(maker) for maker in makers
+        )
+        if node.op_type in _LAYOUT and goes(node) and outside:
+            carriers[node] = None
+    count = 0
+    for node in reversed(carriers):
+        readers = [reader for reader in node.outputs[0].consumers() if not goes(reader)]
+        past = provenance.read(node)
+        if readers and past is not None:
+            module = provenance.module_of(readers[0])
+            provenance.stamp(node, dataclasses.replace(past, module=module))
+            count += 1
+    return count
+
+
+def _means_of(
+    model: ir.Model,
+    values: Sequence[ir.Value],
+    frames: CalibrationSet | None,
+    file: Path | None,
+) -> tuple[dict[str, Array], str]:
+    """Read means from a file, or measure them on frames.
+
+    Args:
+        model: the graph that makes the values.
+        values: of its main graph.
+        frames: the recording; None if there is none.
+        file: an ``.npz`` by value name, which goes before frames; None for frames.
+
+    Returns:
+        The means by value name, and where they are from in words.
+
+    Raises:
+        FramesError: neither frames nor a file, or they are of another graph.
+        PreconditionError: a value has no static shape, or is itself a shape.
+    """
+    for value in values:
+        layout_of(value)
+    names = [str(value.name) for value in values]
+    if file is not None:
+        return load_means(file, names), f"its mean in {file}"
+    if frames is None:
+        raise FramesError(
+            "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"
+            " a mean is never made up"
+        )
+    return token_means(model, frames, names), f"its mean over {len(frames)} frames"

@@ -76,7 +76,7 @@ class Pass(abc.ABC):
         return False
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
-        """Name the tensors that it reads a range of, on a graph of inferred shapes."""
+        """Return the names of the tensors whose range it reads, shapes inferred."""
         return ()
 
     def files(self) -> tuple[Path, ...]:
@@ -97,7 +97,7 @@ class Pass(abc.ABC):
 
     @classmethod
     def option_names(cls) -> tuple[str, ...]:
-        """Name the options, in order."""
+        """Return the names of the options, in order."""
         return tuple(field.name for field in dataclasses.fields(cls))
 
     def with_options(self, options: Mapping[str, object]) -> Self:

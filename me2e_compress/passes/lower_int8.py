@@ -1,4 +1,4 @@
-"""Int8 made for TensorRT, for onnxruntime."""
+"""Rewrite int8 that was placed for TensorRT so that onnxruntime is fast with it."""
 
 import dataclasses
 from pathlib import Path
@@ -69,5 +69,5 @@ class LowerInt8(Pass):
         )
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
-        """Name the tensors that the graph tells no range of."""
+        """Return the names of the tensors whose range is not in the graph."""
         return onnxruntime.unranged(model)

@@ -30,13 +30,13 @@ _SHOWN = 5
 
 @dataclasses.dataclass(frozen=True)
 class QuantizeInt8(Pass):
-    """Let layers and short attentions of some modules read int8.
+    """Quantize the layers and short attentions of some modules to int8.
 
     Given:   y = Conv(x, w, b)
     Result:  y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
 
-    Which nodes, and why the others not, is the plan's to say
-    (:mod:`me2e_compress.quantization.plan`), and the graph carries it in its metadata:
+    The plan (:mod:`me2e_compress.quantization.plan`) decides which nodes, and says why
+    not the others; the graph carries it in its metadata:
     attention of more than ``attention_limit`` tokens and matrix-vector products stay
     float. Ranges are measured on the context's frames, or read from a file; there is no
     calibration on made-up data.
@@ -123,7 +123,7 @@ class QuantizeInt8(Pass):
         return make_plan(model, self._scheme(context), self._rules(), overrides)
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
-        """Name what its target reads in int8."""
+        """Return the names of what its target reads in int8."""
         plan = self._placeable(model, context)
         return TARGETS.parse(self.target).tensors(plan, model)
 
@@ -163,7 +163,7 @@ def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
 
 
 def _kept_float(plan: QuantPlan, target: str) -> tuple[str, ...]:
-    """Say which of the plan's nodes the target leaves in float, a line a reason."""
+    """List the plan's nodes that the target leaves in float, a line a reason."""
     reasons = dict.fromkeys(each.reason for each in plan.kept_float)
     nodes = {
         reason: [

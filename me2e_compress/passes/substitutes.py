@@ -1,4 +1,4 @@
-"""What a value can be read as once those who make it are gone."""
+"""What can be read in the place of a value whose makers are removed."""
 
 import math
 from collections.abc import Sequence
@@ -16,27 +16,27 @@ _INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
 
 
 def module_of(value: ir.Value) -> str:
-    """Name the module that makes a value; empty for inputs and initializers."""
+    """Return the module that makes a value; empty for inputs and initializers."""
     producer = value.producer()
     return "" if producer is None else provenance.module_of(producer)
 
 
 def within(node: ir.Node, scope: str) -> bool:
-    """Say whether a node was made in a scope, e.g. ``*.lane_encoder``."""
+    """Return whether a node was made in a scope, e.g. ``*.lane_encoder``."""
     path = tuple(part for part in scope_of(node).split(".") if part)
     return Pattern(scope).reach(path) is not None
 
 
 def result_of(model: ir.Model, scope: str, like: ir.Value | None = None) -> ir.Value:
-    """Give what a scope returns: the last value that leaves it.
+    """Return what a scope returns: the last value that leaves it.
 
-    A decoder gives its queries and, last, the reference points it refined; so the last
-    value *that fits* is taken where it is known what it must fit.
+    A decoder returns its queries and, last, the reference points it refined; so the
+    last value *that fits* is taken where it is known what it must fit.
 
     Args:
         model: the graph, its nodes still scoped.
         scope: pattern as in a module map, e.g. ``*.motion_decoder``.
-        like: what it is to stand in for: same type, same shape up to dimensions of
+        like: what it is to substitute for: same type, same shape up to dimensions of
             size 1.
 
     Raises:
@@ -62,7 +62,7 @@ def _fits(value: ir.Value, like: ir.Value) -> bool:
 
 
 def depends(value: ir.Value, on: ir.Value) -> bool:
-    """Say whether a value is computed from another (or is it)."""
+    """Return whether a value is computed from another (or is it)."""
     queue, seen = [value], {value}
     while queue:
         current = queue.pop()
@@ -77,7 +77,7 @@ def depends(value: ir.Value, on: ir.Value) -> bool:
 
 
 def is_shape_arithmetic(value: ir.Value) -> bool:
-    """Say whether integers come from shapes and constants alone, not from data."""
+    """Return whether integers come from shapes and constants alone, not from data."""
     queue, seen = [value], {value}
     while queue:
         current = queue.pop()
@@ -94,7 +94,7 @@ def is_shape_arithmetic(value: ir.Value) -> bool:
 
 
 def replace_readers(old: ir.Value, new: ir.Value) -> None:
-    """Let the nodes that read one value read another; graph outputs keep theirs."""
+    """Replace a value in the nodes that read it; graph outputs keep theirs."""
     maker = new.producer()
     for node, index in tuple(old.uses()):
         if node is not maker:
@@ -123,7 +123,7 @@ def constant_like(where: ir.Graph, value: ir.Value, array: Array) -> ir.Value:
 
 
 def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
-    """Give the shape and the type that a stand-in must have.
+    """Return the shape and the type that a substitute must have.
 
     Raises:
         PreconditionError: the shape is not static, or the value is itself a shape.
@@ -171,14 +171,14 @@ def shaped_like(
     readers: Sequence[ir.Node],
     by: str,
 ) -> ir.Value:
-    """Give a value another's shape; they differ in dimensions of size 1 at most."""
+    """Reshape a value to another's shape; they differ in dimensions of size 1 only."""
     want = graph.static_shape(old)
     if graph.static_shape(new) == want:
         return new
     size = rewrite.add_constant(where, np.array(want, np.int64), f"{old.name}_shape")
     node = ir.node("Reshape", [new, size])
     provenance.inherit(node, readers, by=by)
-    return _finished(where, node, old, f"{old.name}_stand_in")
+    return _finished(where, node, old, f"{old.name}_substitute")
 
 
 def _bare(shape: tuple[int, ...]) -> tuple[int, ...]:

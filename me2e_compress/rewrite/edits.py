@@ -22,7 +22,7 @@ def value_names(graph: ir.Graph) -> set[str]:
 
 
 def fresh_name(name: str, names: set[str]) -> str:
-    """Take ``name``, or ``name_1``, ... where that is taken, and enter it."""
+    """Return ``name``, or ``name_1``, ... where that is taken, and enter it."""
     unique, count = name, 0
     while unique in names:
         count += 1
@@ -69,7 +69,7 @@ def can_replace(old: ir.Value, new: ir.Value) -> bool:
 
 
 def replace_value(old: ir.Value, new: ir.Value) -> None:
-    """Let every reader of one value read another; a graph output keeps its name.
+    """Replace a value in all its readers; a graph output keeps its name.
 
     Where ``old`` is a graph output, ``new`` takes its place and its name, so that the
     interface stays as it was.
@@ -91,7 +91,7 @@ def replace_value(old: ir.Value, new: ir.Value) -> None:
 
 
 def bypass(old: ir.Value, new: ir.Value) -> bool:
-    """Let the readers of one value read another, if the interface allows it."""
+    """Replace a value in its readers where that keeps the interface; else False."""
     if not can_replace(old, new):
         return False
     replace_value(old, new)
@@ -122,7 +122,7 @@ def put(
     """
     graph, result = old.graph, old.outputs[0]
     if not isinstance(graph, ir.Graph):
-        raise GraphError(f"node {old.name} stands in no graph: nothing to replace")
+        raise GraphError(f"node {old.name} is not in a graph")
     if read := [value.name for value in old.outputs[1:] if is_read(value)]:
         raise GraphError(f"node {old.name} cannot be replaced: {read[0]} is read too")
     new = ir.node(op_type, inputs, attributes, name=old.name, num_outputs=1)
@@ -166,3 +166,43 @@ def sweep(model: ir.Model) -> None:
     """Drop the nodes, weights and functions that nothing reads any more."""
     common.RemoveUnusedNodesPass()(model)
     common.RemoveUnusedFunctionsPass()(model)  # type: ignore[no-untyped-call]
+
+
+def lift_constants(model: ir.Model) -> int:
+    """Turn Constant nodes of the graph and its subgraphs into initializers.
+
+    Those that are outputs themselves stay, and so do those in function bodies, which
+    have no initializers. Counts the nodes that went.
+    """
+    before = _constants(model)
+    for node in before:
+        _spell_strings(node)
+    common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)(model)
+    return len(before) - len(_constants(model))
+
+
+def _constants(model: ir.Model) -> list[ir.Node]:
+    return [
+        node
+        for node in model.graph.all_nodes()
+        if node.op_type == "Constant"
+        and node.domain == ""
+        and not node.outputs[0].is_graph_output()
+    ]
+
+
+def _spell_strings(node: ir.Node) -> None:
+    # onnx_ir encodes the short forms as ASCII; the tensor form holds any text.
+    one = node.attributes.get("value_string")
+    many = node.attributes.get("value_strings")
+    if one is None and many is None:
+        return
+    texts = [one.as_string()] if one is not None else []
+    texts += list(many.as_strings()) if many is not None else []
+    tensor = ir.StringTensor(
+        [text.encode() for text in texts],
+        shape=ir.Shape([] if one is not None else [len(texts)]),
+        name=node.outputs[0].name,
+    )
+    node.attributes.clear()
+    node.attributes["value"] = ir.AttrTensor("value", tensor)

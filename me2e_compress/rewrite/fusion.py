@@ -77,7 +77,7 @@ class Kit:
         *,
         behind: Sequence[ir.Node] = (),
     ) -> None:
-        """Let one standard operator take the place of all that matched.
+        """Replace all that matched by one standard operator.
 
         Args:
             op_type: the operator.
@@ -125,9 +125,9 @@ class Fusion:
     Attributes:
         name: what the report counts it as.
         pattern: the expression.
-        rewrite: edits the graph; or gives a reason and leaves it alone, where only
+        rewrite: edits the graph; or returns a reason and leaves it alone, where only
             the computed result tells (weights that would overflow).
-        check: gives the reason why a match may not be fused, which the report counts;
+        check: returns the reason why a match may not be fused, which is reported;
             None if it may.
         where: whether a match is one at all; what it leaves out is not counted.
     """

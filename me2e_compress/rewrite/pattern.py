@@ -76,7 +76,7 @@ class Variable(Pattern):
     computed: bool = False
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
-        """Take the value as it is."""
+        """Accept the value as it is."""
         if not (self.computed and array_of(value) is not None):
             yield Way()
 
@@ -100,7 +100,7 @@ class Constant(Pattern):
             yield Way()
 
     def agree(self, known: ir.Value, value: ir.Value) -> bool:
-        """Take any value for a given number: files hold many ones and halves."""
+        """Accept any value for a given number: files hold many ones and halves."""
         given = self.close_to is not None and any(True for _ in self.ways(value))
         return given or known is value
 
@@ -190,7 +190,7 @@ class Product(Pattern):
 
 
 def var(name: str, *, computed: bool = False) -> Variable:
-    """Build the pattern of any value, or of any that is no constant."""
+    """Build the pattern of any value, or of any value that is not a constant."""
     return Variable(name, computed)
 
 

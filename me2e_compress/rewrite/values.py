@@ -37,8 +37,8 @@ def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
 def sole_reader(value: ir.Value) -> ir.Node | None:
     """Return the one node that reads a value, once; None if others do, or outputs.
 
-    Nor is it one where it stands in another graph than the value's maker, in the body
-    of an If or Loop: that runs seldom, or often, and what it makes stays inside.
+    None too if it is in another graph than the value's maker, in the body of an If or
+    Loop: that runs seldom, or often, and what it makes stays inside.
     """
     uses = value.uses()
     if len(uses) != 1 or value.is_graph_output():

@@ -59,8 +59,8 @@ def context(substitutes: str = "") -> Context:
 
 
 def substitute(scope: str, by: str | None = None) -> str:
-    stand_in = "" if by is None else f', by = "{by}"'
-    return f'substitutes = [{{ scope = "{scope}"{stand_in} }}]'
+    substitute = "" if by is None else f', by = "{by}"'
+    return f'substitutes = [{{ scope = "{scope}"{substitute} }}]'
 
 
 @pytest.fixture
@@ -148,7 +148,7 @@ def test_a_substitute_of_the_same_elements_is_reshaped(stack: ir.Model) -> None:
         ("*.nowhere", "*.meet", r"no value leaves a scope \*\.nowhere"),
         ("*.look", "*.nowhere", r"no value leaves a scope \*\.nowhere"),
         ("*.look", "map", "nothing that leaves map fits ego_map"),
-        ("agents", "*.meet", "cannot stand in for agents: it reads its result"),
+        ("agents", "*.meet", "cannot substitute for agents: it reads its result"),
     ],
 )
 def test_a_substitute_that_does_not_fit_is_refused(

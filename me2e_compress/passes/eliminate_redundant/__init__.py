@@ -2,17 +2,28 @@
 
 import dataclasses
 from collections import Counter
+from collections.abc import Mapping
 from typing import ClassVar
 
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
+from me2e_compress.graph import array_of, provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant import sharing
-from me2e_compress.passes.eliminate_redundant.branches import inline_branch
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
 from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
-from me2e_compress.rewrite import bypass, graphs_of, is_read, remove_dead
+from me2e_compress.passes.fold_constants.inference import branch_fits
+from me2e_compress.rewrite import (
+    bypass,
+    can_replace,
+    fresh_name,
+    graphs_of,
+    is_read,
+    remove_dead,
+    replace_value,
+    value_names,
+)
 
 __all__ = ["EliminateRedundant"]
 
@@ -76,7 +87,7 @@ class EliminateRedundant(Pass):
             site.graph.remove(node, safe=True)
             tally["unread"] += 1
             return makers
-        inlined = inline_branch(node, site.opsets, self.name)
+        inlined = _inline_branch(node, site.opsets, self.name)
         if inlined is not None:
             tally["branches"] += 1
             return inlined
@@ -108,3 +119,60 @@ def _count_declared(model: ir.Model) -> int:
 def _notes(tally: Counter[str]) -> tuple[str, ...]:
     found = [f"{count} {what}" for what, count in tally.items() if count]
     return ("removed: " + ", ".join(found),) if found else ()
+
+
+def _inline_branch(
+    node: ir.Node, opsets: Mapping[str, int], by: str
+) -> list[ir.Node] | None:
+    """Put the branch of an If whose condition is known in its place.
+
+    The If stays where its branch passes a value from outside on as a graph output, and
+    where a reader would refuse the branch's shape, which the If had kept from it.
+
+    Returns:
+        The nodes of the branch; None if the If stays.
+    """
+    graph = node.graph
+    chosen = array_of(node.inputs[0]) if node.inputs else None
+    if node.op_type != "If" or chosen is None or not isinstance(graph, ir.Graph):
+        return None
+    branch = node.attributes[
+        "then_branch" if chosen.reshape(-1)[0] else "else_branch"
+    ].as_graph()
+    results = list(branch.outputs)
+    if len(set(results)) < len(results):
+        return None
+    for old, new in zip(node.outputs, results, strict=True):
+        if old.is_graph_output() and new.producer() is None:
+            return None
+        outside = new.producer() is not None and new.graph is not branch
+        if outside and not can_replace(old, new):
+            return None
+    if not branch_fits(node, branch, opsets):
+        return None
+    nodes = list(branch)
+    _move(branch, node, graph, by)
+    for old, new in zip(node.outputs, results, strict=True):
+        replace_value(old, new)
+    graph.remove(node, safe=True)
+    return nodes
+
+
+def _move(branch: ir.Graph, node: ir.Node, graph: ir.Graph, by: str) -> None:
+    names = value_names(graph)
+    weights = list(branch.initializers.values())
+    nodes = list(branch)
+    branch.outputs.clear()
+    branch.initializers.clear()
+    branch.remove(nodes)
+    for value in weights:
+        value.name = fresh_name(value.name or "weight", names)
+        if value.const_value is not None:
+            value.const_value.name = value.name
+        graph.register_initializer(value)
+    for inner in nodes:
+        for value in inner.outputs:
+            if value.name:
+                value.name = fresh_name(value.name, names)
+        provenance.inherit(inner, (inner, node), by=by)
+    graph.insert_before(node, nodes)

@@ -1,7 +1,7 @@
-"""Nodes that give back what they are given.
+"""Find nodes that return their input unchanged.
 
-Each rule names the value that a node's first output equals, bit for bit, or None.
-Adding +0.0 is no identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
+Each rule returns the value that a node's first output equals, bit for bit, or None.
+Adding +0.0 is not an identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
 subtracting +0.0.
 """
 
@@ -20,7 +20,7 @@ OLDEST_OPSET = 7
 
 
 def identity_of(node: ir.Node, opset: int) -> ir.Value | None:
-    """Name the value that a node only repeats; None if it does something."""
+    """Return the value that a node only repeats; None if it does something."""
     if not is_standard(node) or opset < OLDEST_OPSET or not node.outputs:
         return None
     rule = RULES.get(node.op_type)
@@ -30,7 +30,7 @@ def identity_of(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def same_shape(one: ir.Value | None, other: ir.Value | None) -> bool:
-    """Say whether two values surely have the same shape."""
+    """Return whether two values surely have the same shape."""
     shape = static_shape(one)
     return shape is not None and shape == static_shape(other)
 
@@ -83,7 +83,7 @@ def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def moves_nothing(node: ir.Node) -> bool:
-    """Say whether a Transpose only moves axes of size 1, as a Reshape would."""
+    """Return whether a Transpose only moves axes of size 1, as a Reshape would."""
     shape = static_shape(node.inputs[0])
     if shape is None:
         return False
@@ -156,7 +156,7 @@ def _neutral(test: Callable[[Array], bool], *, either: bool) -> Rule:
 
 
 def _spreads(source: ir.Value, array: Array, node: ir.Node) -> bool:
-    """Say whether broadcasting the array leaves the other operand's shape."""
+    """Return whether broadcasting the array leaves the other operand's shape."""
     if same_shape(source, node.outputs[0]):
         return True
     return (

@@ -1,7 +1,7 @@
-"""Two nodes in a row that one node can do, exactly.
+"""Merge two nodes in a row into one that does the same, exactly.
 
-Each rule rewrites the graph around a node and gives the node to look at again (where
-it came to nothing: itself, unread now), or None where nothing was to do.
+Each rule rewrites the graph around a node and returns the node to look at again (the
+node itself, now unread, where nothing is left of it), or None where it does not apply.
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ class MergeSite:
         return self.opsets.get("", self.opsets.get("ai.onnx", 0))
 
     def shape(self, sizes: tuple[int, ...], reader: ir.Node) -> ir.Value:
-        """Give the initializer that holds a shape; one for every equal shape.
+        """Return the initializer that holds a shape; one for every equal shape.
 
         It is named after its first reader: value names are unique in the whole
         model, subgraphs included.
@@ -96,7 +96,7 @@ def merge(node: ir.Node, site: MergeSite) -> ir.Node | None:
 
 
 def _before(node: ir.Node, index: int = 0) -> ir.Node | None:
-    """Give the standard node that makes an input, in the same graph."""
+    """Return the standard node that makes an input, in the same graph."""
     value = node.inputs[index]
     inner = None if value is None else value.producer()
     if inner is None or not is_standard(inner) or inner.graph is not node.graph:
@@ -205,7 +205,7 @@ def _slices(node: ir.Node, site: MergeSite) -> ir.Node | None:
 
 
 def _window(node: ir.Node) -> list[list[int]] | None:
-    """Give starts, ends, axes (from the front) and steps, if all are constant."""
+    """Return starts, ends, axes (from the front) and steps, if all are constant."""
     rank = 0 if node.outputs[0].shape is None else len(node.outputs[0].shape)
     given: list[list[int] | None] = []
     for value in node.inputs[1:]:

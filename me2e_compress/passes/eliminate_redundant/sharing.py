@@ -1,4 +1,4 @@
-"""What is there twice: equal nodes and equal initializers."""
+"""Merge what is there twice: equal nodes and equal initializers."""
 
 import hashlib
 
@@ -26,7 +26,7 @@ EDGE_BYTES = 64
 
 
 def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
-    """Let equal nodes be one, the first; count those that went.
+    """Merge equal nodes into the first of them; count those that went.
 
     Nodes are equal if operator, attributes and inputs are; those of different
     modules are told apart unless ``across_modules``, so that a module can still be
@@ -67,7 +67,7 @@ def _key(node: ir.Node, module: str) -> object:
 
 
 def share_initializers(graph: ir.Graph) -> int:
-    """Let equal initializers be one, the first; count those that went."""
+    """Merge equal initializers into the first; count those that went."""
     groups: dict[object, list[ir.Value]] = {}
     for value in graph.initializers.values():
         if value.const_value is not None and not value.is_graph_input():

@@ -1,19 +1,31 @@
 """Compute once what does not depend on the inputs."""
 
 import dataclasses
+import hashlib
 from collections import Counter
+from collections.abc import Mapping
 from typing import ClassVar
 
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph as graphs
+from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fold_constants import commit, evaluation
-from me2e_compress.passes.fold_constants.choice import choose
+from me2e_compress.passes.fold_constants import evaluation
+from me2e_compress.passes.fold_constants.choice import FoldChoice, choose
+from me2e_compress.passes.fold_constants.inference import branch_fits
 from me2e_compress.passes.fold_constants.knowledge import Sweep
-from me2e_compress.passes.fold_constants.ranges import seat_ranges
-from me2e_compress.passes.import_normalize import constants
-from me2e_compress.rewrite import Array, graphs_of, remove_dead
+from me2e_compress.rewrite import (
+    Array,
+    add_constant,
+    graphs_of,
+    lift_constants,
+    put,
+    remove_dead,
+    replace_value,
+    value_names,
+)
 
 __all__ = ["FoldConstants"]
 
@@ -56,9 +68,9 @@ class FoldConstants(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
-        tally = _Tally(lifted=constants.lift(model))
+        tally = _Tally(lifted=lift_constants(model))
         for body in graphs_of(model.graph):
-            tally.seated += seat_ranges(body, model.opset_imports, self.name)
+            tally.seated += _seat_ranges(body, model.opset_imports, self.name)
         before = -1
         while tally.changes > before:
             before = tally.changes
@@ -92,7 +104,7 @@ class FoldConstants(Pass):
             if not choice.gone:
                 tally.kept += choice.kept
                 return
-            fresh.update(commit.commit(body, choice, known.arrays, self.name))
+            fresh.update(_commit(body, choice, known.arrays, self.name))
             tally.folded += sum(len(one.nodes) for one in choice.gone)
             tally.stored += len(choice.values)
             tally.growth_bytes += choice.growth_bytes
@@ -123,3 +135,108 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
         what = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))
         notes.append(f"onnxruntime cannot evaluate {what}: left as they are")
     return tuple(notes)
+
+
+def _commit(
+    graph: ir.Graph, choice: FoldChoice, arrays: dict[ir.Value, Array], name: str
+) -> list[ir.Value]:
+    """Put initializers in the place of the chosen values and drop their makers.
+
+    A folded tensor takes the name of the value it replaces. A graph output cannot be
+    an initializer for every runtime: an Identity passes it on.
+
+    Returns:
+        The initializers.
+    """
+    leave = {
+        value.name for one in choice.gone for n in one.nodes for value in n.outputs
+    }
+    stored = _Store(graph, value_names(graph) - leave)
+    place = {
+        value: (one, index)
+        for one in choice.gone
+        for index, value in enumerate(one.nodes[0].outputs)
+    }
+    for value in choice.values:
+        one, index = place[value]
+        answers = any(node.outputs[index].is_graph_output() for node in one.nodes)
+        label = f"{value.name}_value" if answers else value.name or ""
+        weight = stored.add(arrays[value], label)
+        for node in one.nodes:
+            equal = node.outputs[index]
+            if equal.is_graph_output():
+                _answer(graph, node, equal, weight, name)
+            else:
+                equal.replace_all_uses_with(weight)
+    for one in reversed(choice.gone):
+        graph.remove([node for node in one.nodes if node.graph is graph], safe=True)
+    return list(stored.known.values())
+
+
+class _Store:
+    """Registers one initializer for equal arrays."""
+
+    def __init__(self, graph: ir.Graph, names: set[str]) -> None:
+        self.graph = graph
+        self.names = names
+        self.known: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
+
+    def add(self, array: Array, name: str) -> ir.Value:
+        data = np.ascontiguousarray(array).tobytes()
+        content = hashlib.blake2b(data, digest_size=16)
+        key = (str(array.dtype), array.shape, content.digest())
+        if key not in self.known:
+            self.known[key] = add_constant(self.graph, array, name, self.names)
+        return self.known[key]
+
+
+def _answer(
+    graph: ir.Graph, node: ir.Node, value: ir.Value, weight: ir.Value, name: str
+) -> None:
+    if len(node.outputs) == 1:
+        put(node, "Identity", [weight], by=name)
+        return
+    label = f"{node.name}_{node.outputs.index(value)}"
+    answer = ir.node("Identity", [weight], num_outputs=1, name=label)
+    graph.insert_after(node, answer)
+    provenance.inherit(answer, [node], by=name)
+    new = answer.outputs[0]
+    new.name, new.type, new.shape = value.name, value.type, value.shape
+    replace_value(value, new)
+
+
+def _seat_ranges(graph: ir.Graph, opsets: Mapping[str, int], by: str) -> int:
+    """Make scalars of bounds of a Range that an If passes on as vectors; count them.
+
+    ONNX's own function bodies pass a vector of one element through an If to a Range,
+    which takes scalars. Runtimes accept it while the If hides the shape; folding
+    would show it.
+
+    Given:   If -> n of shape [1] -> Range(0, n, 1)
+    Result:  If -> n -> Reshape to a scalar -> Range(0, n, 1)
+    """
+    choices = [node for node in graph if node.op_type == "If"]
+    return sum(_seat(node, graph, opsets, by) for node in choices)
+
+
+def _seat(choice: ir.Node, graph: ir.Graph, opsets: Mapping[str, int], by: str) -> int:
+    branches = [attribute.as_graph() for attribute in choice.attributes.values()]
+    if all(branch_fits(choice, branch, opsets) for branch in branches):
+        return 0
+    bounds = [
+        (use.node, use.idx, value)
+        for value in choice.outputs
+        for use in value.uses()
+        if use.node.op_type == "Range" and use.node.graph is graph
+    ]
+    for node, index, value in bounds:
+        shape = add_constant(graph, np.zeros(0, np.int64), f"{value.name}_shape")
+        scalar = ir.node("Reshape", [value, shape], name=f"{node.name}_bound_{index}")
+        scalar.outputs[0].name = f"{value.name}_scalar_{node.name}_{index}"
+        scalar.outputs[0].type = value.type
+        scalar.outputs[0].shape = ir.Shape([])
+        provenance.inherit(scalar, [node], by=by)
+        graph.insert_before(node, scalar)
+        node.replace_input_with(index, scalar.outputs[0])
+        provenance.inherit(node, [node], by=by)
+    return len(bounds)

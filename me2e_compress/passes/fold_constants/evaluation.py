@@ -20,7 +20,7 @@ SILENT = 4
 def evaluate(
     values: Sequence[ir.Value], known: Knowledge, opsets: Mapping[str, int]
 ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
-    """Compute values; give them, and the nodes that the runtime would not run.
+    """Compute values; return them, and the nodes that the runtime would not run.
 
     One session over everything that leads to the values; where that fails, a session
     a node, so that one unsupported operator does not spoil the rest.

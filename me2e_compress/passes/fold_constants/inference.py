@@ -24,7 +24,7 @@ def infer_node(
 
 
 def branch_fits(node: ir.Node, branch: ir.Graph, opsets: Mapping[str, int]) -> bool:
-    """Say whether an If's readers would be valid if they read a branch directly.
+    """Return whether an If's readers would be valid if they read a branch directly.
 
     They may not: an If keeps the shapes of its branches from its readers, and one that
     only ever runs by luck (a Range up to a vector of one element) is refused without.

@@ -68,7 +68,7 @@ class Knowledge:
     first: dict[ir.Value, ir.Value]
 
     def canonical(self, value: ir.Value) -> ir.Value:
-        """Give the first value equal to this one."""
+        """Return the first value equal to this one."""
         return self.first.get(value, value)
 
 
@@ -226,7 +226,7 @@ def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
 
 
 def _is_answer(node: ir.Node) -> bool:
-    """Say whether a node only hands an initializer on to a graph output."""
+    """Return whether a node only passes an initializer on to a graph output."""
     if node.op_type != "Identity" or not node.outputs[0].is_graph_output():
         return False
     return node.inputs[0] is not None and node.inputs[0].is_initializer()

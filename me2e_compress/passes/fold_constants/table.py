@@ -1,6 +1,6 @@
 """ONNX's small integer and shape arithmetic, in numpy.
 
-Each rule reads a call (the node, its inputs as arrays, the opset) and gives the
+Each rule reads a call (the node, its inputs as arrays, the opset) and returns the
 first output, or None where it would not be sure of ONNX's meaning; the runtime is
 asked then.
 """
@@ -37,7 +37,7 @@ class Call:
     opset: int
 
     def array(self, index: int) -> Any:
-        """Give an input; None where it is left out."""
+        """Return an input; None where it is left out."""
         return self.inputs[index] if index < len(self.inputs) else None
 
     def ints(self, name: str, index: int | None = None) -> list[int] | None:

@@ -1,5 +1,121 @@
-"""onnxsim as an optional folding engine, at arm's length."""
+"""onnxsim as an optional folding engine, in a process of its own."""
 
-from me2e_compress.passes.fold_with_onnxsim.fold import FoldWithOnnxsim
+import dataclasses
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import ClassVar
 
-__all__ = ["FoldWithOnnxsim"]
+import onnx_ir as ir
+
+from me2e_compress.errors import PassError
+from me2e_compress.graph import digest, load, node_count, save
+from me2e_compress.graph.restore import restore
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.fold_with_onnxsim import onnxsim_main
+from me2e_compress.rewrite import lift_constants, sweep
+
+__all__ = ["FoldWithOnnxsim", "onnxsim_main"]
+
+_OWN_METADATA = "onnxsim."
+
+
+@dataclasses.dataclass(frozen=True)
+class FoldWithOnnxsim(Pass):
+    """Fold constants with onnxsim (its optimizer off) in a process of its own.
+
+    onnxsim is native code: a crash or an endless loop there ends that process and not
+    this one. Modules, origins and names, which it drops, come back; its own entries
+    in the model's metadata do not.
+
+    Given:
+        s = Shape(w)  ;  y = Reshape(x, s)      with w a weight
+    Result:
+        y = Reshape(x, [2, 3])
+
+    Attributes:
+        timeout_s: seconds that onnxsim may take.
+    """
+
+    name: ClassVar[str] = "fold-with-onnxsim"
+    exact: ClassVar[bool] = True
+
+    timeout_s: float = 600.0
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Fold a copy.
+
+        Raises:
+            PassError: onnxsim crashed, refused the model, or took too long.
+        """
+        with tempfile.TemporaryDirectory(prefix="me2e-onnxsim-") as folder:
+            given, folded = Path(folder, "given.onnx"), Path(folder, "folded.onnx")
+            save(model, given)
+            _simplify(given, folded, self.timeout_s)
+            result = load(folded)
+            _own_weights(result, model)
+        for key in [key for key in result.metadata_props if _OWN_METADATA in key]:
+            del result.metadata_props[key]
+        restore(result, model, by=self.name, node_names=True)
+        lift_constants(result)
+        sweep(result)
+        _restore_header(result, model)
+        if digest(result) == digest(model):
+            return PassResult(model, 0)
+        return PassResult(result, max(1, node_count(model) - node_count(result)))
+
+
+def _simplify(given: Path, folded: Path, timeout_s: float) -> None:
+    command = [sys.executable, "-P", onnxsim_main.__file__, str(given), str(folded)]
+    try:
+        subprocess.run(
+            command, check=True, capture_output=True, text=True, timeout=timeout_s
+        )
+    except subprocess.TimeoutExpired as error:
+        message = f"fold-with-onnxsim: onnxsim took longer than {timeout_s:g} s"
+        raise PassError(message) from error
+    except subprocess.CalledProcessError as error:
+        raise PassError(f"fold-with-onnxsim: onnxsim {_end_of(error)}") from error
+
+
+def _end_of(error: subprocess.CalledProcessError) -> str:
+    if error.returncode < 0:
+        return f"was killed by signal {-error.returncode}"
+    lines = [line.strip() for line in str(error.stderr).splitlines() if line.strip()]
+    said = lines[-1] if lines else "nothing"
+    return f"ended with code {error.returncode} and said: {said}"
+
+
+def _own_weights(result: ir.Model, model: ir.Model) -> None:
+    """Share what is unchanged with the model; take the rest out of the files."""
+    ours = model.graph.initializers
+    for graph in (result.graph, *result.graph.subgraphs()):
+        for name, value in graph.initializers.items():
+            tensor = value.const_value
+            known = ours[name].const_value if name in ours else None
+            if tensor is None:
+                continue
+            if known is not None and _same(tensor, known):
+                value.const_value = known
+            elif isinstance(tensor, ir.ExternalTensor):
+                value.const_value = ir.Tensor(
+                    tensor.numpy().copy(), dtype=tensor.dtype, name=name
+                )
+
+
+def _same(one: ir.TensorProtocol, other: ir.TensorProtocol) -> bool:
+    return (
+        one.dtype == other.dtype
+        and one.shape == other.shape
+        and one.tobytes() == other.tobytes()
+    )
+
+
+def _restore_header(result: ir.Model, model: ir.Model) -> None:
+    result.producer_name, result.producer_version = (
+        model.producer_name,
+        model.producer_version,
+    )
+    result.domain, result.doc_string = model.domain, model.doc_string
+    result.model_version = model.model_version

@@ -1,6 +1,156 @@
-"""The pass that makes a graph from anywhere one that the other passes can work on."""
+"""Make a graph from anywhere one that the other passes can work on."""
 
-from me2e_compress.passes.import_normalize.normalize import ImportNormalize
-from me2e_compress.passes.import_normalize.plugins import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
+import dataclasses
+import functools
+from collections.abc import Iterator
+from typing import ClassVar
+
+import onnx
+import onnx_ir as ir
+
+from me2e_compress.graph import provenance
+from me2e_compress.modules import assign
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.import_normalize import doubles
+from me2e_compress.rewrite import lift_constants
 
 __all__ = ["ORIGINAL_DOMAIN", "PLUGIN_DOMAIN", "ImportNormalize"]
+
+PLUGIN_DOMAIN = "me2e.plugin"
+"""Where plugins live in our graphs: the checker and functions need a domain."""
+
+ORIGINAL_DOMAIN = "me2e.domain"
+"""Node metadata with the domain that a plugin had in the file it came from."""
+
+_FUNCTIONS_SINCE_IR = 8
+"""The first ONNX IR version whose models may hold functions (onnx/docs/IR.md)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportNormalize(Pass):
+    """Give every node a name and a past, and write four things in one way only.
+
+    1. Nodes without a name, or with one that is taken, get one.
+    2. Every node is told its module and its origin, before anything renames it.
+    3. Plugin nodes of the default domain move to ``me2e.plugin``; the domain that
+       they had stays in their metadata, for the way back to TensorRT.
+    4. float64 that leaked into a graph of float32 becomes float32.
+    5. Constant nodes become initializers.
+    6. A model with functions declares at least IR version 8, and every domain in use
+       is imported.
+
+    Subgraphs and function bodies are covered. Unknown operators are carried through.
+
+    Given:
+        n = RotateTRT(x)  ;  c = Constant<double>()  ;  y = Mul(n, c)
+    Result:
+        n = me2e.plugin.RotateTRT(x)  ;  y = Mul(n, c)   with c a float32 initializer
+    """
+
+    name: ClassVar[str] = "import-normalize"
+    exact: ClassVar[bool] = True
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Rewrite the model in place.
+
+        Raises:
+            ModuleMapError: the module map does not fit the graph.
+        """
+        changes = _name_nodes(model, self.name) + _stamp(model, context)
+        changes += _isolate_plugins(model, self.name)
+        demoted, note = doubles.demote(model, self.name)
+        changes += demoted + lift_constants(model) + _declare(model)
+        return PassResult(model, changes, (note,) if note else ())
+
+
+def _bodies(model: ir.Model) -> Iterator[ir.Graph | ir.Function]:
+    """Walk the main graph, then the functions; subgraphs are within their nodes."""
+    yield model.graph
+    yield from model.functions.values()
+
+
+def _name_nodes(model: ir.Model, by: str) -> int:
+    """Name every node of the graph, its subgraphs and its functions; count the new.
+
+    A node keeps its name unless an earlier one bears it. New names are the operator's
+    (or the taken name) with the first number that is free, so they depend on the
+    order of the nodes alone. A node with a past takes the pass's name into it.
+    """
+    count = 0
+    for body in _bodies(model):
+        nodes = list(body.all_nodes())
+        reserved = {node.name for node in nodes if node.name}
+        taken: set[str] = set()
+        counters: dict[str, int] = {}
+        for node in nodes:
+            if node.name and node.name not in taken:
+                taken.add(node.name)
+                continue
+            stem = node.name or node.op_type
+            number = counters.get(stem, 0)
+            while f"{stem}_{number}" in reserved:
+                number += 1
+            counters[stem] = number + 1
+            node.name = f"{stem}_{number}"
+            reserved.add(node.name)
+            taken.add(node.name)
+            provenance.inherit(node, [node], by=by)
+            count += 1
+    return count
+
+
+def _stamp(model: ir.Model, context: Context) -> int:
+    if not provenance.missing(model):
+        return 0
+    count = 0
+    for node, place in assign(model, context.modules).placements.items():
+        if provenance.read(node) is None:
+            past = provenance.Provenance(place.module, (node.name or "",))
+            provenance.stamp(node, past)
+            count += 1
+    return count
+
+
+def _isolate_plugins(model: ir.Model, by: str) -> int:
+    """Move default-domain nodes that ONNX has no operator for; count them.
+
+    Such nodes come from ``OperatorExportTypes.ONNX_FALLTHROUGH`` (BEVFormer_tensorrt,
+    DL4AGX uniad-trt: ``MultiScaleDeformableAttnTRT``, ``RotateTRT``, ``InverseTRT``)
+    or from a plugin symbolic without a domain (``MSDAPlugin``). A node that calls a
+    function of the model is none of them.
+    """
+    count = 0
+    for body in _bodies(model):
+        moved = [
+            node
+            for node in body.all_nodes()
+            if node.domain == ""
+            and not _is_standard(node.op_type)
+            and node.op_identifier() not in model.functions
+        ]
+        for node in moved:
+            node.metadata_props.setdefault(ORIGINAL_DOMAIN, node.domain)
+            node.domain = PLUGIN_DOMAIN
+            provenance.inherit(node, [node], by=by)
+        if moved:
+            body.opset_imports.setdefault(PLUGIN_DOMAIN, 1)
+        count += len(moved)
+    return count
+
+
+@functools.cache
+def _is_standard(op_type: str) -> bool:
+    return bool(onnx.defs.has(op_type, domain=""))
+
+
+def _declare(model: ir.Model) -> int:
+    count = 0
+    if model.functions and model.ir_version < _FUNCTIONS_SINCE_IR:
+        model.ir_version = _FUNCTIONS_SINCE_IR
+        count += 1
+    for body in _bodies(model):
+        for node in body.all_nodes():
+            if node.domain not in body.opset_imports:
+                body.opset_imports[node.domain] = 1
+                count += 1
+    return count

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import provenance
-from me2e_compress.passes.import_normalize.bodies import bodies
+from me2e_compress.graph import nodes_of, provenance
 
 _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
 """Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
@@ -20,7 +19,7 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
     """Turn double into float32 everywhere: weights, attributes, value types.
 
     Left alone where the outside wants double: an input or output of the graph, or a
-    value that an operator we know nothing of reads or gives. Finite numbers beyond
+    value that an unknown operator reads or makes. Finite numbers beyond
     float32's range become its largest ones, so that a mask of ``-1.8e308`` stays
     finite.
 
@@ -34,7 +33,7 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
     if keeper:
         return 0, f"float64 stays: {keeper} is double"
     count = _demote_weights(model)
-    for node in _nodes(model):
+    for node in nodes_of(model):
         if found := _demote_attributes(node):
             provenance.inherit(node, [node], by=by)
             count += found
@@ -49,7 +48,7 @@ def _doubles(model: ir.Model) -> Iterator[object]:
     for value in _values(model):
         if value.type is not None and _is_double(value.type):
             yield value
-    for node in _nodes(model):
+    for node in nodes_of(model):
         for attribute in node.attributes.values():
             if _names_double(node, attribute) or _holds_double(node, attribute):
                 yield attribute
@@ -63,7 +62,7 @@ def _keeper(model: ir.Model) -> str:
         for value in values:
             if value.type is not None and _is_double(value.type):
                 return f"{kind} {value.name}"
-    for node in _nodes(model):
+    for node in nodes_of(model):
         known = node.domain == "" and node.op_type not in _BY_WIDTH
         if known or node.op_identifier() in model.functions:
             continue
@@ -143,16 +142,11 @@ def _single(kind: ir.TypeProtocol) -> ir.TypeProtocol:
     return ir.TensorType(ir.DataType.FLOAT)
 
 
-def _nodes(model: ir.Model) -> Iterator[ir.Node]:
-    for body in bodies(model):
-        yield from body.all_nodes()
-
-
 def _values(model: ir.Model) -> Iterator[ir.Value]:
     for graph in (model.graph, *model.graph.subgraphs()):
         yield from graph.inputs
         yield from graph.initializers.values()
     for function in model.functions.values():
         yield from function.inputs
-    for node in _nodes(model):
+    for node in nodes_of(model):
         yield from node.outputs
