@@ -1,11 +1,11 @@
-"""Use any pass written for onnx-ir."""
+"""Run any pass written for onnx-ir as a pass of ours."""
 
 import dataclasses
 from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph import digest
+from me2e_compress.graph import digest, provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 
 __all__ = ["OnnxIrPass"]
@@ -15,9 +15,11 @@ __all__ = ["OnnxIrPass"]
 class OnnxIrPass(Pass):
     """Run an onnx-ir pass and count its changes by the graph itself.
 
+    Nodes that it changes name this pass. It gives new nodes no past: the manager
+    refuses onnx-ir passes that make nodes without copying metadata.
+
     Given:   OnnxIrPass(onnx_ir.passes.common.IdentityEliminationPass())
-    Result:  the same as a pass of this package; new nodes get no past, so that the
-             manager refuses onnx-ir passes that make nodes without copying metadata
+    Result:  a pass that removes Identity nodes
 
     Attributes:
         inner: the pass; it must keep the outputs, as those in ``onnx_ir.passes.common``
@@ -29,7 +31,8 @@ class OnnxIrPass(Pass):
     inner: ir.passes.PassBase
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Delegate."""
-        before = digest(model)
+        """Run the inner pass, in place if it works so."""
+        before = model.clone()
         after = self.inner(model).model
-        return PassResult(after, int(digest(after) != before))
+        provenance.sign(before, after, self.name)
+        return PassResult(after, int(digest(after) != digest(before)))

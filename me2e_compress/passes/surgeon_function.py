@@ -1,4 +1,4 @@
-"""A user's graphsurgeon function as a pass."""
+"""Run a user's graphsurgeon function as a pass."""
 
 import dataclasses
 from collections import Counter
@@ -8,7 +8,7 @@ import onnx_graphsurgeon as gs
 import onnx_ir as ir
 
 from me2e_compress.errors import PassError
-from me2e_compress.graph import digest
+from me2e_compress.graph import digest, provenance
 from me2e_compress.graph.surgeon import from_graphsurgeon, to_graphsurgeon
 from me2e_compress.passes.base import Context, Pass, PassResult
 
@@ -61,6 +61,7 @@ class SurgeonFunction(Pass):
         )
         if digest(result) == digest(model):
             return PassResult(model, 0)
+        provenance.sign(model, result, self.name)
         before, after = _nodes(model), _nodes(result)
         edited = (before - after).total() + (after - before).total()
         return PassResult(result, max(1, edited))

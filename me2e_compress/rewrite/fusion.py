@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import graphs_of, is_standard, provenance
+from me2e_compress.graph import graphs_of, input_at, is_standard, opset_of, provenance
 from me2e_compress.rewrite.edits import (
     add_constant,
     put,
@@ -60,7 +60,7 @@ class Kit:
 
         An initializer that nothing else reads keeps its name.
         """
-        old = node.inputs[index] if index < len(node.inputs) else None
+        old = input_at(node, index)
         if old is not None and old.is_initializer() and sole_reader(old) is node:
             flat = np.ascontiguousarray(array).reshape(array.shape)
             old.const_value = ir.tensor(flat, name=old.name)
@@ -180,7 +180,7 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
         fusions: those that come first are tried first.
         by: the pass's name.
     """
-    run = _Run(_facts(model), by, value_names(model.graph), _by_root(fusions))
+    run = _Run(Facts(opset_of(model)), by, value_names(model.graph), _by_root(fusions))
     fused = Fused()
     for body in graphs_of(model.graph):
         refused: Counter[str] = Counter()
@@ -243,11 +243,6 @@ def _clear(found: Match, body: ir.Graph) -> None:
         if node.graph is body and not any(is_read(each) for each in node.outputs)
     ]:
         body.remove(dead, safe=True)
-
-
-def _facts(model: ir.Model) -> Facts:
-    opsets = model.opset_imports
-    return Facts(opsets.get("", opsets.get("ai.onnx", 0)))
 
 
 def _by_root(fusions: Sequence[Fusion]) -> _Table:

@@ -12,6 +12,7 @@ from me2e_compress.graph.provenance import Provenance
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.surgeon_function import SurgeonFunction
+from me2e_compress.testing import check_pass
 
 CONTEXT = Context(
     ModuleMap.parse('[modules.neck]\nrole = "feature"\npatterns = ["neck"]', "one")
@@ -71,6 +72,21 @@ def test_a_returned_graph_counts_and_new_nodes_join_their_neighbours(
     by_name = {node.name: provenance.read(node) for node in result.model.graph}
     assert by_name["mine"] == Provenance("det", ("n_b",), ("insert-abs",))
     assert by_name["n_y"] == Provenance("planner", ("n_y",))
+
+
+def test_a_node_with_another_attribute_names_the_pass() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 8, opset_import: ["": 17]>'
+        "g (float[2,2] x) => (float[2,2] y) { a = Relu(x) y = Softmax<axis = 0>(a) }"
+    )
+
+    def turn(surgeon: gs.Graph) -> None:
+        surgeon.nodes[1].attrs["axis"] = 1
+
+    relu, softmax = check_pass(SurgeonFunction(turn, name="turn"), model).model.graph
+
+    pasts = [provenance.read(node) for node in (relu, softmax)]
+    assert [past and past.passes for past in pasts] == [(), ("turn",)]
 
 
 def test_a_function_that_does_nothing_changes_nothing(model: ir.Model) -> None:

@@ -13,7 +13,7 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import static_shape
+from me2e_compress.graph import bias_of, channel_axis, static_shape
 from me2e_compress.rewrite import (
     Facts,
     Fusion,
@@ -111,7 +111,8 @@ def _rewrite(match: Match, kit: Kit) -> str | None:
     if affine is None or bias is None or not holds_numbers(match[WEIGHT]):
         return f"{what} whose weights are computed"
     weight, stored = match.numbers(WEIGHT), match.array(WEIGHT)
-    channels = _channels(layer, weight)
+    groups = layer.attributes.get_int("group", 1) if what == "ConvTranspose" else 1
+    channels = weight.shape[channel_axis(layer)] * groups
     scale = np.broadcast_to(affine.scale, (channels,))
     weight = weight * _shaped(layer, weight, scale)
     bias = np.broadcast_to(bias * scale + affine.shift, (channels,))
@@ -134,21 +135,13 @@ def _rewrite(match: Match, kit: Kit) -> str | None:
 
 def _bias(layer: ir.Node) -> Numbers | None:
     """Return the bias as a vector (zero if there is none); None if it is not one."""
-    if len(layer.inputs) < 3 or layer.inputs[2] is None:
+    if bias_of(layer) is None:
         return np.zeros(1)
-    bias = numbers_of(layer.inputs[2])
+    bias = numbers_of(bias_of(layer))
     if bias is None or any(size != 1 for size in bias.shape[:-1]):
         return None
     beta = layer.attributes.get_float("beta", 1.0)
     return bias.reshape(-1) * (beta if layer.op_type == "Gemm" else 1.0)
-
-
-def _channels(layer: ir.Node, weight: Numbers) -> int:
-    if layer.op_type == "Conv":
-        return int(weight.shape[0])
-    if layer.op_type == "ConvTranspose":
-        return int(weight.shape[1]) * layer.attributes.get_int("group", 1)
-    return int(weight.shape[0 if layer.attributes.get_int("transB", 0) else 1])
 
 
 def _shaped(layer: ir.Node, weight: Numbers, scale: Numbers) -> Numbers:
