@@ -29,8 +29,6 @@ from benchmarks.driver_records import (
     scores_csv,
 )
 from me2e_compress import recipe
-from me2e_compress.cli.commands.frames import record
-from me2e_compress.cli.models import model_path
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.passes import PASSES, Pass
@@ -46,8 +44,10 @@ from me2e_compress.study import (
     run_study,
 )
 from me2e_compress.study.tables import all_tables
-from me2e_compress.study.workplace import Workplace
-from me2e_compress.study.write import MARKDOWN, write
+from me2e_compress.study.workspace import MARKDOWN, Workspace
+from me2e_compress.study.write import write
+from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.paths import model_path
 
 DRIVER = "highway"
 MODULES = ("track", "map", "motion", "occ")
@@ -167,11 +167,11 @@ STUDIES: Mapping[str, Callable[[Bench], Study]] = {
 
 def same_bytes(bench: Bench) -> str:
     """Hold the two drives of the same model against each other, file by file."""
-    workplace = Workplace(bench.out)
+    workspace = Workspace(bench.out)
     first, again = (
         {
             path.name: path.read_bytes()
-            for path in (workplace.results(scheme, IDEAL) / "routes").glob("*.json")
+            for path in (workspace.results(scheme, IDEAL) / "routes").glob("*.json")
         }
         for scheme in determinism(bench).schemes
     )
@@ -197,7 +197,7 @@ def told() -> Listener:
 
 def slowed(bench: Bench) -> str:
     """Hold fewer decisions a second against no latency, and against the most."""
-    conditions, place = (IDEAL, *SLOWER), Workplace(bench.out)
+    conditions, place = (IDEAL, *SLOWER), Workspace(bench.out)
     tables = (
         among_conditions(place, bench.float, conditions, to) for to in conditions[:2]
     )
@@ -211,7 +211,7 @@ def one_more(bench: Bench) -> str:
         for pair in combinations(MODULES, 2)
         for name in pair
     ]
-    return among_schemes(Workplace(bench.out), couples, IDEAL).markdown()
+    return among_schemes(Workspace(bench.out), couples, IDEAL).markdown()
 
 
 BESIDES: Mapping[str, Callable[[Bench], str]] = {
@@ -253,7 +253,7 @@ def frames_of(
     if given is not None or (made / "scenes.json").is_file():
         return given or made
     count, seed = what
-    return record(str(model), made, count, seed)
+    return record_frames(model, made, FramesOptions(count, seed))
 
 
 def main() -> None:

@@ -17,13 +17,11 @@ from time import process_time
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.cli.commands.frames import record
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.reaction import plan_reaction
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
-from me2e_compress.passes import Context
 from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.zoo.export import export
 
 STACK, CAMERAS = "vad-tiny", 6
@@ -42,23 +40,23 @@ def main(argv: Sequence[str] | None = None) -> None:
         folder = options.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         source = export(STACK, folder / f"{STACK}.onnx")
-        seen = record(STACK, folder / "frames", options.calibration, 0, 4)
-        held_out = record(STACK, folder / "held-out", options.held_out, 1, 1)
-        frames, others = CalibrationSet(seen), CalibrationSet(held_out)
+        seen, held_out = (
+            record_frames(STACK, folder / name, FramesOptions(count, seed, length))
+            for name, count, seed, length in (
+                ("frames", options.calibration, 0, 4),
+                ("held-out", options.held_out, 1, 1),
+            )
+        )
+        others = CalibrationSet(held_out)
         print(HEAD)
         reference = Session(source, threads=2, release=True)
         report("source", source, reference, others, 0.0)
         for name in RECIPES:
             start = process_time()
             target = folder / f"{name}.onnx"
-            squeeze(source, name, frames, target)
+            unchecked = CompressOptions(module_map="vad", verify_frames=0)
+            compress(source, target, name, seen, unchecked)
             report(name, target, reference, others, process_time() - start)
-
-
-def squeeze(source: Path, name: str, frames: CalibrationSet, target: Path) -> None:
-    manager = PassManager(recipe.load(name), verify_frames=0)
-    context = Context(ModuleMap.load("vad"), frames)
-    graph.save(manager.run(graph.load(source), context).model, target)
 
 
 def report(

@@ -10,9 +10,10 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study import Condition, Scheme, StudyResult
-from me2e_compress.study.cells import Cell, Table, estimate_cell
+from me2e_compress.study.cells import estimate_cell
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.workplace import Workplace
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.workflows.result import Cell, Table
 
 Value = float | int | str | None
 Row = Mapping[str, Value]
@@ -46,21 +47,21 @@ def routes_csv(outcome: StudyResult) -> str:
 
 
 def among_conditions(
-    workplace: Workplace, scheme: Scheme, conditions: Iterable[Condition], to: Condition
+    workspace: Workspace, scheme: Scheme, conditions: Iterable[Condition], to: Condition
 ) -> Table:
     """One driver under several conditions minus itself under another one.
 
     Args:
-        workplace: Where it was driven.
+        workspace: Where it was driven.
         scheme: The driver.
         conditions: All of them were driven.
         to: The one that is subtracted.
     """
-    reference = _episodes(workplace, scheme, to)
+    reference = _episodes(workspace, scheme, to)
     rows = [
         (Cell(each.name), *_cells(difference(episodes, reference)))
         for each in conditions
-        if each != to and (episodes := _episodes(workplace, scheme, each))
+        if each != to and (episodes := _episodes(workspace, scheme, each))
     ]
     return Table(
         f"{scheme.name}: difference to {to.name} on the same routes",
@@ -71,20 +72,20 @@ def among_conditions(
 
 
 def among_schemes(
-    workplace: Workplace, pairs: Iterable[tuple[Scheme, Scheme]], condition: Condition
+    workspace: Workspace, pairs: Iterable[tuple[Scheme, Scheme]], condition: Condition
 ) -> Table:
     """Each first driver minus the second, under one condition.
 
     Args:
-        workplace: Where they were driven.
+        workspace: Where they were driven.
         pairs: Both of each were driven, or the row is left out.
         condition: Of all.
     """
     rows = [
         (Cell(f"{one.name} minus {two.name}"), *_cells(difference(more, less)))
         for one, two in pairs
-        if (more := _driven(workplace, one, condition))
-        and (less := _driven(workplace, two, condition))
+        if (more := _driven(workspace, one, condition))
+        and (less := _driven(workspace, two, condition))
     ]
     return Table(
         "One more module away",
@@ -117,19 +118,19 @@ def _cells(found: PairedDifference) -> tuple[Cell, ...]:
 
 
 def _episodes(
-    workplace: Workplace, scheme: Scheme, condition: Condition
+    workspace: Workspace, scheme: Scheme, condition: Condition
 ) -> list[Episode]:
-    folder = ResultsFolder.open(workplace.results(scheme, condition))
+    folder = ResultsFolder.open(workspace.results(scheme, condition))
     return list(folder.episodes().values())
 
 
 def _driven(
-    workplace: Workplace, scheme: Scheme, condition: Condition
+    workspace: Workspace, scheme: Scheme, condition: Condition
 ) -> list[Episode]:
     """Give the episodes; none where nobody drove."""
-    if not workplace.results(scheme, condition).is_dir():
+    if not workspace.results(scheme, condition).is_dir():
         return []
-    return _episodes(workplace, scheme, condition)
+    return _episodes(workspace, scheme, condition)
 
 
 def _scores(outcome: StudyResult, drive: Drive) -> Row:

@@ -15,11 +15,9 @@ import numpy as np
 
 from benchmarks import bev_head, resnet50
 from benchmarks.subject import Subject, at
-from me2e_compress import graph, recipe
-from me2e_compress.cli.commands.frames import record
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap
-from me2e_compress.passes import Context
+from me2e_compress import graph
+from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.zoo.export import export
 
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
@@ -53,14 +51,13 @@ def _export(subject: Subject) -> None:
         maker.export(subject.source)
         text = maker.MAP
     subject.map.write_text(text, encoding="utf-8")
-    context = Context(ModuleMap.load(str(subject.map)))
-    manager = PassManager(recipe.load("exact"), verify_frames=0)
-    graph.save(manager.run(graph.load(subject.source), context).model, subject.model)
+    unchecked = CompressOptions(module_map=subject.map, verify_frames=0)
+    compress(subject.source, subject.model, "exact", options=unchecked)
 
 
 def _record(name: str, folder: Path, count: int, seed: int) -> None:
     if name == "vad-tiny":
-        record(name, folder, count, seed, SCENE)
+        record_frames(name, folder, FramesOptions(count, seed, SCENE))
     elif name == "bev-head":
         bev_head.record(folder, count, seed)
     else:

@@ -10,7 +10,9 @@
   x VerificationError    the graph after a pass is not a valid successor
   x EvaluationError      a route, a policy or a results folder is not usable
   x StudyError           a study is malformed, or names what it does not have
+  x TrainingError        a driver cannot be trained as asked
   x MissingExtraError    an optional package is not installed
+  x MissingPackageError  one that none of our extras brings
 
 Every message says what was found, what there is, and names the culprit, on one line.
 """
@@ -67,3 +69,10 @@ class MissingExtraError(Me2eError):
         super().__init__(
             f"{package} is not installed: pip install 'me2e-compress[{extra}]'"
         )
+
+
+class MissingPackageError(Me2eError):
+    """A package that none of our extras brings is not installed."""
+
+    def __init__(self, package: str) -> None:
+        super().__init__(f"{package} is not installed: pip install {package}")

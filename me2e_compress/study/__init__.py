@@ -4,7 +4,7 @@ from me2e_compress.study.definition import Condition, Scheme, Study, Timing
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
-from me2e_compress.study.workplace import Listener
+from me2e_compress.workflows.listener import Listener
 
 __all__ = [
     "Condition",

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,8 +11,6 @@ from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
-from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.simulator.routes import Route
 
 TRACE = "trace"
@@ -176,7 +174,7 @@ class Study:
             (scheme.name, each.name)
             for scheme in self.schemes
             for each in scheme.passes
-            if _needs_frames(each)
+            if each.needs_frames
         ]
         if needy and self.frames is None:
             raise StudyError(
@@ -191,6 +189,14 @@ class Study:
                 "on held-out frames, and there are none (held_out = FRAMES)"
             )
 
+    def inputs(self) -> Iterator[str | Path]:
+        """List the files and folders that it reads."""
+        yield from filter(None, (self.frames, self.held_out))
+        for each in self.schemes:
+            named = (each.policy, each.module_map, each.adapter, each.trace)
+            yield from filter(None, named)
+            yield from (file for step in each.passes for file in step.files())
+
     @property
     def reference(self) -> Scheme:
         """The baseline."""
@@ -202,13 +208,6 @@ def _check_name(kind: str, name: str) -> None:
         raise StudyError(
             f"{kind} {name!r}: a name is made of letters, digits, '_', '+' and '-'"
         )
-
-
-def _needs_frames(current: Pass) -> bool:
-    """Whether a pass measures on frames, whatever the graph is."""
-    if isinstance(current, AblateModules):
-        return current.fill == "means" and current.means is None
-    return isinstance(current, QuantizeInt8) and current.ranges is None
 
 
 def _unique(kind: str, names: Iterable[str]) -> None:

@@ -16,7 +16,8 @@ from me2e_compress.study.definition import Condition, Study
 from me2e_compress.study.prepared import PreparedScheme
 from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
-from me2e_compress.study.workplace import Listener, Workplace
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.workflows.listener import Listener
 
 
 @dataclass(frozen=True)
@@ -59,14 +60,14 @@ class Road:
     Args:
         study: Schemes, conditions, routes.
         clock: Latencies of the models.
-        workplace: Where results go.
+        workspace: Where results go.
         engine: Where routes are driven.
         listener: Who is told.
     """
 
     study: Study
     clock: Clock
-    workplace: Workplace
+    workspace: Workspace
     engine: Engine
     listener: Listener
 
@@ -108,7 +109,7 @@ class Road:
         evaluator = HighwayEvaluator(
             job,
             self.study.routes,
-            self.workplace.results(contender.scheme, condition),
+            self.workspace.results(contender.scheme, condition),
             self.study.set_size,
             self.engine,
             self._teller(f"{contender.scheme.name}, {condition.name}"),

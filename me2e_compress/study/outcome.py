@@ -12,7 +12,9 @@ from me2e_compress.study.drives import Drive
 from me2e_compress.study.plan_fidelity import Faithfulness, measure_json
 from me2e_compress.study.prepared import PreparedScheme
 from me2e_compress.study.side_by_side import Contrast
+from me2e_compress.study.tables import all_tables
 from me2e_compress.study.timing import Clock
+from me2e_compress.workflows.result import Result, Table
 
 LATENCY_PERCENTILES = (50, 99)
 
@@ -73,8 +75,8 @@ class SchemeOutcome:
         }
 
 
-@dataclass(frozen=True)
-class StudyResult:
+@dataclass(frozen=True, repr=False)
+class StudyResult(Result):
     """Everything that a study found, and what it was made with.
 
     Attributes:
@@ -99,6 +101,45 @@ class StudyResult:
     def timed(self) -> bool:
         """Whether the latency of any scheme is known."""
         return any(each.latency_ms[50].value is not None for each in self.schemes)
+
+    @property
+    def headline(self) -> str:
+        """Title, schemes, conditions, routes."""
+        study = self.study
+        return (
+            f"{study.title}: {len(study.schemes)} schemes under"
+            f" {len(study.conditions)} conditions on {len(study.routes)} of"
+            f" {study.set_size} routes"
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return every table, in the order of reading."""
+        return all_tables(self)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a drive."""
+        return [self._record(each) for each in self.drives]
+
+    def _record(self, drive: Drive) -> dict[str, object]:
+        scores, of = drive.scores, self.scheme(drive.scheme)
+        found = (
+            {}
+            if scores is None
+            else {
+                "driving_score": scores.driving_score.value,
+                "success_rate": scores.success_rate.value,
+                "efficiency": scores.efficiency.value,
+                "comfort": scores.comfort.value,
+            }
+        )
+        return {
+            "scheme": drive.scheme,
+            "condition": drive.condition,
+            **found,
+            "size_mb": of.size_mb.value,
+            **{f"p{p}_ms": each.value for p, each in of.latency_ms.items()},
+            "plan_mean_m": of.fidelity.mean_m.value,
+        }
 
     def under(self, condition: Condition) -> tuple[Drive, ...]:
         """Return the drives under one condition."""

@@ -14,7 +14,7 @@ from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.study.definition import Study
 from me2e_compress.study.prepared import PreparedScheme
-from me2e_compress.study.workplace import Listener
+from me2e_compress.workflows.listener import Listener
 
 EXACT = "no noise: equal to the bit"
 """Why a plan that did not move has no signal to noise."""

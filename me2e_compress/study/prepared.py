@@ -1,8 +1,7 @@
 """The file that drives: given, or made by passes once and kept."""
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
@@ -13,14 +12,14 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.manager import PassManager
-from me2e_compress.modules import ModuleMap, map_of
-from me2e_compress.passes import Context, Pass
+from me2e_compress.modules import ModuleMap
 from me2e_compress.recipe import to_text
-from me2e_compress.runtime.atomic import write_json
 from me2e_compress.study.definition import Scheme, Study
-from me2e_compress.study.workplace import Listener, Workplace
+from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
+from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.compress_result import beside
+from me2e_compress.workflows.listener import Listener
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class PreparedScheme:
 
 
 def prepare_scheme(
-    study: Study, scheme: Scheme, workplace: Workplace, listener: Listener
+    study: Study, scheme: Scheme, workspace: Workspace, listener: Listener
 ) -> PreparedScheme:
     """Find or make a scheme's driver, and open it once.
 
@@ -64,7 +63,7 @@ def prepare_scheme(
     if not source.is_file():
         raise StudyError(f"scheme {scheme.name}: {source}: no such model")
     if scheme.passes:
-        model = _compressed(study, scheme, workplace, listener)
+        model = _compressed(study, scheme, workspace, listener)
     driver = replace(driver, path=model)
     driver.open()
     sha256 = graph.sha256_of(model)
@@ -94,13 +93,9 @@ def _unaltered(model: Path) -> bool:
 
 def _report_of(model: Path) -> "_Report | None":
     try:
-        return _Report.model_validate_json(_report_path(model).read_bytes())
+        return _Report.model_validate_json(beside(model, "report").read_bytes())
     except (OSError, ValidationError):
         return None
-
-
-def _report_path(model: Path) -> Path:
-    return model.with_name(f"{model.stem}.report.json")
 
 
 class _File(BaseModel):
@@ -115,7 +110,7 @@ class _Report(BaseModel):
 
 
 def _compressed(
-    study: Study, scheme: Scheme, workplace: Workplace, listener: Listener
+    study: Study, scheme: Scheme, workspace: Workspace, listener: Listener
 ) -> Path:
     """Apply the passes, unless the same was done before; the report is written last.
 
@@ -123,24 +118,18 @@ def _compressed(
     """
     source = Path(scheme.policy)
     frames = None if study.frames is None else CalibrationSet(study.frames)
-    path = workplace.model(scheme, _key(scheme, source, frames, study.seed))
-    if path.is_file() and _report_path(path).is_file():
+    path = workspace.model(scheme, _key(scheme, source, frames, study.seed))
+    if path.is_file() and beside(path, "report").is_file():
         if _unaltered(path):
             return path
         listener.on_warning(f"{path}: not what its report is of: made again")
-    loaded = graph.load(source)
-    if frames is not None:
-        frames.check(loaded)
-    context = Context(map_of(loaded, scheme.module_map), frames, study.seed)
-    manager = PassManager(scheme.passes, reproducers=path.parent)
     stage = f"compress {scheme.name}"
-    report = manager.run(
-        loaded,
-        context,
-        lambda done, total, words: listener.on_progress(stage, done, total, words),
-    )
-    graph.save(report.model, path)
-    write_json(_report_path(path), report.record(source, path), indent=2)
+
+    def told(_: str, done: int, total: int, words: str) -> None:
+        listener.on_progress(stage, done, total, words)
+
+    options = CompressOptions(module_map=scheme.module_map, seed=study.seed)
+    compress(source, path, scheme.passes, study.frames, options, Listener(told))
     return path
 
 
@@ -154,18 +143,9 @@ def _key(scheme: Scheme, source: Path, frames: CalibrationSet | None, seed: int)
         "" if frames is None else frames.fingerprint,
         "" if modules is None else repr(ModuleMap.load(modules)),
         str(seed),
-        *(_content(scheme, file) for file in _files_of(scheme.passes)),
+        *(_content(scheme, file) for each in scheme.passes for file in each.files()),
     )
     return hashlib.sha256("\n".join(decisive).encode()).hexdigest()
-
-
-def _files_of(passes: tuple[Pass, ...]) -> Iterator[Path]:
-    """List the files that passes read, in the order of their options."""
-    for current in filter(is_dataclass, passes):
-        for field in fields(current):
-            value = getattr(current, field.name)
-            if isinstance(value, Path):
-                yield value
 
 
 def _content(scheme: Scheme, file: Path) -> str:

@@ -12,7 +12,9 @@ from me2e_compress.study.plan_fidelity import judge
 from me2e_compress.study.prepared import PreparedScheme, prepare_scheme
 from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.timing import Clock, time_all
-from me2e_compress.study.workplace import SILENT, Listener, Workplace
+from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_folder
 
 
 def run_study(
@@ -35,17 +37,19 @@ def run_study(
         pictures: On how many routes two drives are shown side by side.
 
     Raises:
+        GraphError: The folder is a file or an input.
         Me2eError: A model cannot drive, a pass refused its graph, frames do not fit,
             or the folder is of another study; one line that names the culprit.
     """
     check_recordings(study)
-    workplace = Workplace(folder)
+    check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
+    workspace = Workspace(folder)
     contenders = [
-        prepare_scheme(study, scheme, workplace, listener) for scheme in study.schemes
+        prepare_scheme(study, scheme, workspace, listener) for scheme in study.schemes
     ]
-    clock = time_all(study, contenders, workplace, listener)
+    clock = time_all(study, contenders, workspace, listener)
     schemes = _schemes(study, contenders, clock, listener)
-    road = Road(study, clock, workplace, engine or LocalEngine(), listener)
+    road = Road(study, clock, workspace, engine or LocalEngine(), listener)
     drives = [
         drive
         for condition in study.conditions

@@ -175,7 +175,7 @@ def _picture(
     time_us: int,
 ) -> Path:
     name = contender.scheme.name
-    path = road.workplace.picture(contender.scheme, condition, route.id, time_us)
+    path = road.workspace.picture(contender.scheme, condition, route.id, time_us)
     job = road.job(contender, condition)
     if path.is_file() or job is None:
         return path

@@ -1,26 +1,24 @@
 """The tables of a study: one content for the terminal, Markdown and HTML."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.study.cells import (
-    MISSING,
-    Cell,
-    Table,
-    estimate_cell,
-    measure_cell,
-)
+from me2e_compress.study.cells import MISSING, estimate_cell, measure_cell
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.outcome import SchemeOutcome, StudyResult
+from me2e_compress.workflows.result import Cell, Table
+
+if TYPE_CHECKING:
+    from me2e_compress.study.outcome import SchemeOutcome, StudyResult
 
 SCORES = ("DS", "SR %", "DE %", "DC")
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
-def scoreboards(outcome: StudyResult) -> tuple[Table, ...]:
+def scoreboards(outcome: "StudyResult") -> tuple[Table, ...]:
     """Show how every scheme drives, and what it weighs and takes.
 
     One table a condition; one scheme alone has one table of all its conditions.
@@ -37,7 +35,7 @@ def scoreboards(outcome: StudyResult) -> tuple[Table, ...]:
     )
 
 
-def _scoreboard(outcome: StudyResult, condition: Condition) -> Table:
+def _scoreboard(outcome: "StudyResult", condition: Condition) -> Table:
     return Table(
         f"Scoreboard, {_condition(outcome, condition)}",
         ("scheme", *SCORES, *COSTS),
@@ -50,7 +48,7 @@ def _scoreboard(outcome: StudyResult, condition: Condition) -> Table:
     )
 
 
-def differences(outcome: StudyResult) -> Table:
+def differences(outcome: "StudyResult") -> Table:
     """Show every scheme minus the baseline, paired by route."""
     baseline, rows = outcome.study.baseline, []
     several = len(outcome.study.conditions) > 1
@@ -68,7 +66,7 @@ def differences(outcome: StudyResult) -> Table:
     )
 
 
-def abilities(outcome: StudyResult) -> tuple[Table, ...]:
+def abilities(outcome: "StudyResult") -> tuple[Table, ...]:
     """Show the success rate by ability: tables as those of the scoreboard."""
     if len(outcome.schemes) > 1:
         return tuple(
@@ -107,7 +105,7 @@ def _abilities(
     )
 
 
-def all_tables(outcome: StudyResult) -> tuple[Table, ...]:
+def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
     """Every table of a study, in the order of reading."""
     compared = [differences(outcome)] if len(outcome.schemes) > 1 else []
     return (*scoreboards(outcome), *compared, *abilities(outcome))
@@ -121,7 +119,7 @@ def _scores(drive: Drive) -> tuple[Cell, ...]:
     return (*map(estimate_cell, shown), estimate_cell(scores.comfort))
 
 
-def _costs(scheme: SchemeOutcome) -> tuple[Cell, ...]:
+def _costs(scheme: "SchemeOutcome") -> tuple[Cell, ...]:
     return (
         measure_cell(scheme.size_mb, ".2f"),
         measure_cell(scheme.latency_ms[50], ".1f"),
@@ -140,7 +138,7 @@ def _difference(found: PairedDifference) -> tuple[Cell, ...]:
     )
 
 
-def _condition(outcome: StudyResult, condition: Condition) -> str:
+def _condition(outcome: "StudyResult", condition: Condition) -> str:
     if condition.latency == "none":
         return f"{condition.name}: decisions cost no time"
     if not condition.traced:
@@ -151,7 +149,7 @@ def _condition(outcome: StudyResult, condition: Condition) -> str:
     return f"{condition.name}: each model's own latency, {device}"
 
 
-def _routes_note(outcome: StudyResult) -> str:
+def _routes_note(outcome: "StudyResult") -> str:
     driven, whole = len(outcome.study.routes), outcome.study.set_size
     share = f"{driven} routes" if driven == whole else f"{driven} of {whole} routes"
     return (
@@ -160,7 +158,7 @@ def _routes_note(outcome: StudyResult) -> str:
     )
 
 
-def _costs_note(outcome: StudyResult) -> str:
+def _costs_note(outcome: "StudyResult") -> str:
     notes = []
     if outcome.timed:
         kind = "on this machine"

@@ -14,7 +14,8 @@ from me2e_compress.runtime.interleaved import machine_in_turn, traces_in_turn
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.study.definition import Condition, Scheme, Study
 from me2e_compress.study.prepared import PreparedScheme
-from me2e_compress.study.workplace import Listener, Workplace
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.workflows.listener import Listener
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Clock:
 def time_all(
     study: Study,
     contenders: Sequence[PreparedScheme],
-    workplace: Workplace,
+    workspace: Workspace,
     listener: Listener,
 ) -> Clock:
     """Take the traces that are given or kept, and measure the others in turn.
@@ -72,19 +73,19 @@ def time_all(
     seen = None if frames is None else frames.fingerprint
     traces = dict[str, LatencyTrace]()
     for each in contenders:
-        kept = _kept(study, each, seen, workplace, listener)
+        kept = _kept(study, each, seen, workspace, listener)
         if kept is not None:
             traces[each.scheme.name] = kept
     if frames is None:
         return Clock(traces, _scale(study, traces), "no held-out frames were given")
     baseline = next(each for each in contenders if each.scheme is study.reference)
     yardstick = None if baseline.scheme.trace else traces.get(study.baseline)
-    missing = _missing(contenders, traces, yardstick, workplace, listener)
+    missing = _missing(contenders, traces, yardstick, workspace, listener)
     measured = _measured(study, frames, missing, baseline, yardstick, listener)
     # the baseline last: a kill before leaves none that old ones could stand beside
     for each in sorted(missing, key=lambda one: one is baseline):
         trace = replace(measured[each.scheme.name], frames=seen)
-        trace.save(workplace.trace(each.scheme))
+        trace.save(workspace.trace(each.scheme))
         traces[each.scheme.name] = trace
     return Clock(traces, _scale(study, traces), "not a model")
 
@@ -93,7 +94,7 @@ def _missing(
     contenders: Sequence[PreparedScheme],
     traces: Mapping[str, LatencyTrace],
     yardstick: LatencyTrace | None,
-    workplace: Workplace,
+    workspace: Workspace,
     listener: Listener,
 ) -> list[PreparedScheme]:
     """List what is to be measured: all, where new traces cannot stand beside old."""
@@ -103,7 +104,7 @@ def _missing(
         return missing
     for each in ours:
         if each not in missing:
-            path = workplace.trace(each.scheme)
+            path = workspace.trace(each.scheme)
             listener.on_warning(
                 f"{path}: no trace of the baseline is kept beside it: measured again"
             )
@@ -151,12 +152,12 @@ def _kept(
     study: Study,
     each: PreparedScheme,
     frames: str | None,
-    workplace: Workplace,
+    workspace: Workspace,
     listener: Listener,
 ) -> LatencyTrace | None:
     if each.scheme.trace is not None:
         return LatencyTrace.load(each.scheme.trace)
-    path = workplace.trace(each.scheme)
+    path = workspace.trace(each.scheme)
     if each.model is None or not path.is_file():
         return None
     trace = LatencyTrace.load(path)

@@ -9,8 +9,7 @@ from me2e_compress.runtime.atomic import write_bytes, write_json
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report import html
 from me2e_compress.study.tables import all_tables
-
-JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
+from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 
 
 @dataclass(frozen=True)

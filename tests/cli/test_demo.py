@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.cli import demo_driver
+from me2e_compress.study import demo
 from me2e_compress.zoo import shipped
 from tests.cli.conftest import Command
 from tests.stand_in import write_shipped
@@ -19,10 +19,10 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small driver in the place of the one that ships, few frames, no processes."""
     write_shipped(tmp_path / "weights")
     monkeypatch.setattr(shipped, "WEIGHTS", tmp_path / "weights")
-    monkeypatch.setattr(demo_driver, "CALIBRATION_FRAMES", 3)
-    monkeypatch.setattr(demo_driver, "HELD_OUT_FRAMES", 2)
-    monkeypatch.setattr(demo_driver, "LATENCY_SAMPLES", 5)
-    monkeypatch.setattr(demo_driver, "LocalEngine", lambda workers: Here())
+    monkeypatch.setattr(demo, "CALIBRATION_FRAMES", 3)
+    monkeypatch.setattr(demo, "HELD_OUT_FRAMES", 2)
+    monkeypatch.setattr(demo, "LATENCY_SAMPLES", 5)
+    monkeypatch.setattr(demo, "LocalEngine", lambda workers: Here())
 
 
 def test_the_demo_compresses_drives_and_reports(

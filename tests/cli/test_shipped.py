@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.cli.models import model_path
 from me2e_compress.errors import GraphError
 from me2e_compress.simulator.routes import save_routes
+from me2e_compress.workflows.paths import model_path
 from me2e_compress.zoo import shipped
 from tests.cli.conftest import Command
 from tests.evaluators.highway.drivers import EXIT, straight_on

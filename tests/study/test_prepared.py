@@ -10,7 +10,8 @@ from me2e_compress.errors import StudyError
 from me2e_compress.manager import PassManager
 from me2e_compress.study import Listener, Scheme, Study
 from me2e_compress.study.prepared import PreparedScheme, prepare_scheme
-from me2e_compress.study.workplace import SILENT, Workplace
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.workflows.listener import SILENT
 from tests.cli.conftest import write_frames
 from tests.stand_in import write_model
 from tests.study.conftest import Make
@@ -38,7 +39,7 @@ def write_images(folder: Path, seed: int) -> None:
 
 
 def made(study: Study, folder: Path) -> PreparedScheme:
-    return prepare_scheme(study, study.schemes[0], Workplace(folder), SILENT)
+    return prepare_scheme(study, study.schemes[0], Workspace(folder), SILENT)
 
 
 @pytest.fixture
@@ -119,7 +120,7 @@ def test_an_altered_model_is_made_again(
         first.model.with_name(f"{first.model.stem}.report.json").write_text("{}")
 
     listener = Listener(on_warning=warnings.append)
-    again = prepare_scheme(study, study.schemes[0], Workplace(tmp_path), listener)
+    again = prepare_scheme(study, study.schemes[0], Workspace(tmp_path), listener)
 
     assert again == first
     assert graph.sha256_of(first.model) == first.sha256

@@ -8,13 +8,12 @@ from me2e_compress.study.cells import (
     INFINITE,
     MINUS,
     MISSING,
-    Cell,
-    Table,
     estimate_cell,
     measure_cell,
     number,
 )
 from me2e_compress.study.tables import abilities, all_tables, differences, scoreboards
+from me2e_compress.workflows.result import Cell, Table
 from tests.study.conftest import IDEAL
 
 pytestmark = pytest.mark.xdist_group("study")

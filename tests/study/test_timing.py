@@ -15,7 +15,8 @@ from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.study import Condition, Listener, Scheme, Study, Timing, timing
 from me2e_compress.study.prepared import prepare_scheme
 from me2e_compress.study.timing import Clock, time_all
-from me2e_compress.study.workplace import SILENT, Workplace
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.workflows.listener import SILENT
 from tests.study.conftest import BLIND, IDEAL, Make
 
 DEVICE = Condition("device", "trace")
@@ -24,7 +25,7 @@ HERE = machine_in_turn(1)
 
 
 def clock_of(study: Study, folder: Path, listener: Listener = SILENT) -> Clock:
-    place = Workplace(folder)
+    place = Workspace(folder)
     contenders = [
         prepare_scheme(study, each, place, listener) for each in study.schemes
     ]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.cli.commands.inspect import look
+from me2e_compress.workflows.inspect import inspect
 from me2e_compress.zoo.shipped import shipped
 
 ROOT = Path(__file__).parents[2]
@@ -22,13 +22,13 @@ def told() -> dict[str, tuple[int, float]]:
 def test_parameters_and_macs_are_those_of_the_file() -> None:
     found = {
         item.module: (item.parameters, round((item.macs or 0) / 1e6, 1))
-        for item in look(shipped("highway"), None).modules
+        for item in inspect(shipped("highway"), None).modules
     }
     assert told() == found
 
 
 def test_modules_are_told_in_the_order_of_the_map() -> None:
-    names = [item.module for item in look(shipped("highway"), None).modules]
+    names = [item.module for item in inspect(shipped("highway"), None).modules]
     assert list(told()) == names
 
 

@@ -1,15 +1,17 @@
 """Where a study keeps what it made, so that it goes on after a kill."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from me2e_compress.errors import StudyError
 from me2e_compress.study.definition import Condition, Scheme
 
+JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
+"""What is found, for programs, in a repository and in a browser."""
+
 
 @dataclass(frozen=True)
-class Workplace:
+class Workspace:
     """A folder; studies that share it share compressed models, traces and drives.
 
     Args:
@@ -44,19 +46,3 @@ class Workplace:
         except OSError as error:
             raise StudyError(f"{path}: cannot be made: {error.strerror}") from error
         return path
-
-
-@dataclass(frozen=True)
-class Listener:
-    """Who is told how a study goes; neither changes it.
-
-    Args:
-        on_progress: Called with the stage, things done and to do, and words.
-        on_warning: Called with one line a surprise.
-    """
-
-    on_progress: Callable[[str, int, int, str], None] = lambda stage, a, b, words: None
-    on_warning: Callable[[str], None] = lambda line: None
-
-
-SILENT = Listener()

@@ -1,4 +1,4 @@
-"""Numbers that options take: click's own bounds let NaN pass."""
+"""Numbers that options take; a command's own bounds let NaN pass."""
 
 import math
 
@@ -6,7 +6,7 @@ from me2e_compress.errors import RecipeError
 
 
 def check_number(option: str, value: float | None, *, zero: bool = False) -> None:
-    """Refuse what is no finite number above 0.
+    """Refuse anything but a finite number above 0.
 
     Args:
         option: its name, for the message.
@@ -20,3 +20,13 @@ def check_number(option: str, value: float | None, *, zero: bool = False) -> Non
         return
     least = "0 or above" if zero else "above 0"
     raise RecipeError(f"{option} is {value:g}: it must be a finite number {least}")
+
+
+def check_count(option: str, value: int, least: int = 0) -> None:
+    """Refuse a count that is too small.
+
+    Raises:
+        RecipeError: it is below the least.
+    """
+    if value < least:
+        raise RecipeError(f"{option} is {value}: it must be {least} or more")

@@ -1,6 +1,5 @@
-"""Outputs, looked at before any work: what cannot be written, or would do harm."""
+"""Files as users name them: which model a word means, which outputs would do harm."""
 
-import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -9,18 +8,46 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.passes import Pass
+from me2e_compress.modules import ModuleMap, map_of
+from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 Given: TypeAlias = str | Path | None
 """An input as the user names it; a word that is no file or folder harms nothing."""
+
+
+def model_path(text: str | Path, beside: Path = Path()) -> Path:
+    """Find the file that a word means; an existing file wins.
+
+    Args:
+        text: a path, or a name in `SHIPPED`.
+        beside: the folder that the path is relative to.
+
+    Raises:
+        GraphError: neither, or the shipped file is missing or altered.
+    """
+    path = beside / text
+    if path.is_file():
+        return path
+    if str(text) in SHIPPED:
+        return shipped(str(text))
+    raise GraphError(f"{text}: no such file; models that ship: {', '.join(SHIPPED)}")
+
+
+def load_map(named: str | Path | None, model: ir.Model) -> ModuleMap:
+    """Load the module map that is named; None finds the preset that fits a graph.
+
+    Raises:
+        ModuleMapError: no such map.
+    """
+    return map_of(model, None if named is None else str(named))
 
 
 def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> None:
     """Refuse files that could not be written, or would harm an input.
 
     Args:
-        outputs: the files that a command writes.
-        inputs: the files and folders of frames that it reads; of a model the files
+        outputs: the files that are to be written.
+        inputs: the files and folders of frames that are read; of a model the files
             with its weights count too.
 
     Raises:
@@ -46,9 +73,9 @@ def check_folder(
     """Refuse a folder that could not be made, or whose files would harm an input.
 
     Args:
-        folder: that a command writes into; it may be missing.
+        folder: that is written into; it may be missing.
         inputs: as in :func:`check_output`.
-        files: what it writes there, by name.
+        files: what is written there, by name.
 
     Raises:
         GraphError: it is a file or an input, or one of the files is an input.
@@ -62,14 +89,6 @@ def check_folder(
         if given.is_dir() and folder.samefile(given):
             raise GraphError(f"{folder} is the input: choose another folder")
     check_output([folder / name for name in files], read)
-
-
-def files_of(passes: Iterable[Pass]) -> Iterator[Path]:
-    """Give the files that the options of passes name."""
-    for each in passes:
-        if dataclasses.is_dataclass(each):
-            values = (getattr(each, field.name) for field in dataclasses.fields(each))
-            yield from (value for value in values if isinstance(value, Path))
 
 
 def _keep(output: Path, given: Path) -> None:
@@ -90,10 +109,10 @@ def _keep(output: Path, given: Path) -> None:
 
 
 def _weights(given: Path) -> Iterator[Path]:
-    """Give the files that hold the external weights of a model; none of other files."""
+    """Name the files with the external weights of a model; none for other files."""
     try:
         model = graph.load(given)
-    except GraphError:  # no model, or one that is refused before anything is written
+    except GraphError:  # not a model, or refused before anything is written
         return
     for each in model.graphs():
         for value in each.initializers.values():

@@ -1,0 +1,169 @@
+"""The demo with a driver: compressed, then both drive the same routes."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from me2e_compress import recipe
+from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.simulator.routes import load_routes, pick_routes
+from me2e_compress.study.definition import Condition, Scheme, Study, Timing
+from me2e_compress.study.outcome import StudyResult
+from me2e_compress.study.run import run_study
+from me2e_compress.study.tables import differences, scoreboards
+from me2e_compress.study.write import Written, write
+from me2e_compress.workflows.compare import compare
+from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.compress_result import CompressResult
+from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
+from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.paths import check_folder
+from me2e_compress.workflows.result import Result, Table
+from me2e_compress.zoo import shipped
+
+CALIBRATION_FRAMES, CALIBRATION_SEED = 64, 0
+HELD_OUT_FRAMES, HELD_OUT_SEED = 24, 1
+LATENCY_SAMPLES = 100
+FLOAT, TARGET = "float", "onnxruntime"
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class DriveResult(Result):
+    """How the driver drives before and after.
+
+    Attributes:
+        study: everything that was found.
+        written: its files.
+        ending: what the user has now, in words.
+    """
+
+    study: StudyResult
+    written: Written
+    ending: tuple[str, ...]
+
+    @property
+    def headline(self) -> str:
+        """What the user has now."""
+        return self.ending[0]
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what the user has, and how to make it for another target."""
+        return self.ending
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return scoreboard and differences."""
+        return (*scoreboards(self.study), differences(self.study))
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a drive."""
+        return self.study.records()
+
+    def to_json(self) -> object:
+        """Return everything that was found."""
+        return self.study.to_json()
+
+
+@dataclasses.dataclass(frozen=True)
+class DriverDemo:
+    """The driver that ships, compressed, and both held against each other.
+
+    Attributes:
+        name: of the driver.
+        out: the folder.
+        scheme: a shipped recipe.
+        routes: that both drive: a number or ``ID,ID``.
+        workers: routes at a time.
+
+    Raises:
+        RecipeError: no such recipe.
+        EvaluationError: no such route.
+        GraphError: the folder is a file.
+    """
+
+    name: str
+    out: Path
+    scheme: str = "feature-ext"
+    routes: str = "5"
+    workers: int = 2
+
+    def __post_init__(self) -> None:
+        """Check recipe, routes and folder."""
+        recipe.load(self.scheme)
+        pick_routes(load_routes(), self.routes)
+        check_folder(self.out, ())
+
+    @property
+    def steps(self) -> tuple[Callable[[Listener], Result], ...]:
+        """What is done, in order."""
+        return self.compress, self.weigh, self.compare, self.drive
+
+    def compress(self, listener: Listener) -> CompressResult:
+        """Copy the driver, let it see routes, make it small.
+
+        Int8 is for what drives here: placed for TensorRT it is slower than float.
+        """
+        shipped.copy(self.name, self._source)
+        for folder, count, seed in (
+            (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
+            (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
+        ):
+            record_frames(self._source, folder, FramesOptions(count, seed), listener)
+        passes = recipe.load(self.scheme)
+        target = TARGET if any(each.quantizes for each in passes) else None
+        options = CompressOptions(target=target)
+        return compress(
+            self._source, self._small, passes, self._frames, options, listener
+        )
+
+    def weigh(self, listener: Listener) -> ModuleChanges:
+        """Weigh the modules before and after."""
+        return compare_modules(self._source, self._small)
+
+    def compare(self, listener: Listener) -> Result:
+        """Hold the small graph against the driver on other frames."""
+        return compare(self._source, self._small, self._held_out, listener)
+
+    def drive(self, listener: Listener) -> DriveResult:
+        """Let both drive the routes, and write the report."""
+        everything = load_routes()
+        study = Study(
+            f"{self.name} before and after {self.scheme}",
+            (
+                Scheme(FLOAT, str(self._source)),
+                Scheme(self.scheme, str(self._small)),
+            ),
+            (Condition("ideal", "none"),),
+            FLOAT,
+            pick_routes(everything, self.routes),
+            len(everything),
+            held_out=self._held_out,
+            timing=Timing(LATENCY_SAMPLES),
+        )
+        found = run_study(study, self.out, LocalEngine(self.workers), listener)
+        words = ("me2e-compress", "demo", "--out", str(self.out))
+        chosen = ("--routes", self.routes, "--scheme", self.scheme)
+        written = write(found, self.out, (*words, *chosen))
+        ending = (
+            f"{self._small} and {written.report} are yours.",
+            f"Its int8 is for {TARGET}, which drives here. For TensorRT: me2e-compress"
+            f" compress {self.name} -r {self.scheme} --frames {self._frames} -o"
+            f" {self.name}.trt.onnx",
+        )
+        return DriveResult(found, written, ending)
+
+    @property
+    def _source(self) -> Path:
+        return self.out / f"{self.name}.onnx"
+
+    @property
+    def _small(self) -> Path:
+        return self.out / f"{self.name}.{self.scheme}.onnx"
+
+    @property
+    def _frames(self) -> Path:
+        return self.out / "frames"
+
+    @property
+    def _held_out(self) -> Path:
+        return self.out / "frames-held-out"

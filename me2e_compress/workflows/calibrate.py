@@ -1,0 +1,255 @@
+"""Ranges of every tensor that int8 may need: measured, merged, or another tool's."""
+
+import dataclasses
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.exchange import (
+    TABLE_FILES,
+    read_foreign,
+    write_onnxruntime_table,
+    write_tensorrt_cache,
+)
+from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.sample import Part, draw, shard
+from me2e_compress.calibration.statistics import Statistics, merge
+from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_folder, check_output, model_path
+from me2e_compress.workflows.prepare_int8 import PreparedGraph
+from me2e_compress.workflows.result import Result, Table
+
+_SHOWN = 5
+"""How many of a kind are listed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrateOptions:
+    """How ranges come about.
+
+    Attributes:
+        recipe: whose passes before int8 are run; a shipped one or a TOML file.
+        method: ``max-min``, ``moving-average:W``, ``percentile:P``, ``mse``,
+            ``entropy``.
+        count: frames, drawn in whole scenes.
+        seed: of the draw.
+        module_map: preset or TOML file; None finds the preset.
+        shard: ``2/4``: only the second of four shards, saved as statistics.
+        merge: shards that were saved, instead of frames.
+        imported: a TensorRT cache or onnxruntime table, instead of frames.
+        tensorrt_cache: write a TensorRT calibration cache too.
+        onnxruntime_table: write onnxruntime's table too, into this folder.
+        threads: of onnxruntime; 0 takes all.
+
+    Raises:
+        RecipeError: no such method, a number below 0, or a shard that is none.
+        FramesError: a shard with outputs that only whole ranges have.
+    """
+
+    recipe: str | Path = "exact"
+    method: str = "max-min"
+    count: int = 256
+    seed: int = 0
+    module_map: str | Path | None = None
+    shard: str | None = None
+    merge: tuple[str | Path, ...] = ()
+    imported: str | Path | None = None
+    tensorrt_cache: str | Path | None = None
+    onnxruntime_table: str | Path | None = None
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a file."""
+        OBSERVERS.parse(self.method)
+        check_count("--seed", self.seed)
+        check_count("--threads", self.threads)
+        if self.shard is None:
+            return
+        _fraction(self.shard)
+        if self.tensorrt_cache is not None or self.onnxruntime_table is not None:
+            raise FramesError(
+                "a shard has no ranges yet: leave --tensorrt-cache and"
+                " --onnxruntime-table to --merge"
+            )
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CalibrateResult(Result):
+    """Ranges, or the statistics of one shard.
+
+    Attributes:
+        output: the file that was written.
+        frames: how many frames were seen.
+        ranges: of every tensor; None of a shard.
+        shard: ``2/4`` of a shard, else None.
+    """
+
+    output: Path
+    frames: int
+    ranges: Ranges | None
+    shard: str | None = None
+
+    @property
+    def headline(self) -> str:
+        """File, tensors, method, frames."""
+        if self.ranges is None:
+            return f"{self.output}: shard {self.shard}, {self.frames} frames"
+        found = self.ranges
+        return (
+            f"{self.output}: {len(found.tensors)} tensors, {found.method},"
+            f" {found.frames} frames"
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the headline, and which ranges deserve a look."""
+        if self.ranges is None:
+            return (self.headline,)
+        worst = sorted(self.ranges.outliers.items(), key=lambda item: -item[1])
+        outliers = [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
+        return (
+            self.headline,
+            *_first(list(self.ranges.dead), "always zero"),
+            *_first(outliers, "a few elements make the range"),
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return none: the lines say what there is to read."""
+        return ()
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a tensor."""
+        tensors = {} if self.ranges is None else self.ranges.tensors
+        return [
+            {"tensor": name, "low": low, "high": high}
+            for name, (low, high) in tensors.items()
+        ]
+
+    def to_json(self) -> object:
+        """Return the ranges, and which are always zero; nothing of a shard."""
+        if self.ranges is None:
+            return None
+        return {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
+
+
+def calibrate(
+    model: str | Path,
+    frames: str | Path | None,
+    output: str | Path,
+    options: CalibrateOptions | None = None,
+    listener: Listener = SILENT,
+) -> CalibrateResult:
+    """Measure the ranges of every tensor that any scheme, rule set or target needs.
+
+    A run that was killed goes on from ``OUTPUT.checkpoint``.
+
+    Args:
+        model: the float ONNX file, or the name of one that ships.
+        frames: folder of recorded frames; None where shards are merged or another
+            tool's cache is read.
+        output: ``RANGES.json``, or ``SHARD.npz`` of a shard.
+        options: None takes the defaults.
+        listener: who is told how it goes.
+
+    Raises:
+        FramesError: no frames or more than one source, or frames that do not fit.
+        PreconditionError: the graph is quantized already, or nothing can be int8.
+        GraphError: no such model, or an output would harm an input.
+        RecipeError: no such recipe.
+    """
+    options = options or CalibrateOptions()
+    source, output = model_path(model), Path(output)
+    _check_sources(frames, options)
+    checkpoint = output.with_name(output.name + ".checkpoint")
+    _check_outputs(source, frames, (output, checkpoint), options)
+    passes = recipe.load(options.recipe)
+    loaded = graph.load(source)
+    part = None if frames is None else _part(loaded, Path(frames), options)
+    ready = PreparedGraph.of(source, loaded, options.module_map, passes)
+    tensors = ready.tensors()
+    if part is None:
+        found = _given(graph.digest(ready.model), tensors, options)
+        return _written(found, output, options)
+    method = options.method
+    calibrator = Calibrator(method, options.threads, checkpoint=checkpoint)
+    seen = calibrator.collect(
+        ready.model,
+        tensors,
+        part,
+        lambda done, of: listener.on_progress("calibrate", done, of, method),
+    )
+    if options.shard is not None:
+        dataclasses.replace(seen, share=part.share).save(output)
+        return CalibrateResult(output, len(part), None, options.shard)
+    return _written(Ranges.of(seen, OBSERVERS.parse(method)), output, options)
+
+
+def _check_sources(frames: str | Path | None, options: CalibrateOptions) -> None:
+    given = [each is not None for each in (frames, options.imported)]
+    if sum(given) + bool(options.merge) != 1:
+        raise FramesError(
+            "give recorded frames, or shards (--merge), or another tool's cache"
+            " (--import): one of the three; ranges are never made up"
+        )
+    if options.shard is not None and frames is None:
+        raise FramesError("--shard is for frames, and none are given")
+
+
+def _check_outputs(
+    source: Path,
+    frames: str | Path | None,
+    outputs: tuple[Path, ...],
+    options: CalibrateOptions,
+) -> None:
+    cache, table = options.tensorrt_cache, options.onnxruntime_table
+    named = (options.recipe, options.module_map, options.imported)
+    read = (source, frames, *named, *options.merge)
+    check_output([*outputs, None if cache is None else Path(cache)], read)
+    if table is not None:
+        check_folder(Path(table), read, TABLE_FILES)
+
+
+def _part(loaded: ir.Model, folder: Path, options: CalibrateOptions) -> Part:
+    """Draw frames that fit the model, or one shard of those."""
+    recording = CalibrationSet(folder)
+    recording.check(loaded)
+    drawn = draw(recording, options.count, options.seed)
+    return drawn if options.shard is None else shard(drawn, *_fraction(options.shard))
+
+
+def _given(digest: str, tensors: tuple[str, ...], options: CalibrateOptions) -> Ranges:
+    """Read another tool's ranges, or put shards together."""
+    if options.imported is not None:
+        return read_foreign(Path(options.imported), digest, tensors)
+    seen = merge([Statistics.load(Path(path)) for path in options.merge])
+    found = Ranges.of(seen, OBSERVERS.parse(options.method))
+    found.check(model=digest, tensors=tensors, method=options.method)
+    return found
+
+
+def _written(found: Ranges, output: Path, options: CalibrateOptions) -> CalibrateResult:
+    found.save(output)
+    if options.tensorrt_cache is not None:
+        write_tensorrt_cache(found, Path(options.tensorrt_cache))
+    if options.onnxruntime_table is not None:
+        write_onnxruntime_table(found, Path(options.onnxruntime_table))
+    return CalibrateResult(output, found.frames, found)
+
+
+def _fraction(text: str) -> tuple[int, int]:
+    number, slash, count = text.partition("/")
+    if not slash or not (number.isdecimal() and count.isdecimal()):
+        raise RecipeError(f"--shard is {text!r}; write 2/4 for the second of four")
+    return int(number), int(count)
+
+
+def _first(names: list[str], what: str) -> tuple[str, ...]:
+    if not names:
+        return ()
+    more = f"; and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return (f"{len(names)} {what}: {'; '.join(names[:_SHOWN])}{more}",)

@@ -1,0 +1,91 @@
+"""How close one graph stays to another on the same frames."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.compare import compare as measure
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import model_path
+from me2e_compress.workflows.result import Result, Table, table
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CompareResult(Result):
+    """How close a graph stays to another.
+
+    Attributes:
+        reference: the graph to be true to.
+        candidate: the graph that is judged.
+        fidelity: output by output, and of the plan.
+    """
+
+    reference: Path
+    candidate: Path
+    fidelity: Fidelity
+
+    @property
+    def headline(self) -> str:
+        """How far the plan moved."""
+        found = self.fidelity
+        if found.plan is None:
+            return f"plan displacement: not measured ({found.plan_reason})"
+        return (
+            f"plan displacement: mean {found.plan.mean_m:.4f} m, largest"
+            f" {found.plan.max_m:.4f} m over {found.frames} frames"
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return signal to noise and largest error of every output."""
+        found = self.fidelity
+        rows = [
+            *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in found.outputs),
+            *((name, "removed", "") for name in found.missing),
+        ]
+        title = f"Fidelity over {found.frames} frames"
+        return (table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row an output."""
+        return [dataclasses.asdict(each) for each in self.fidelity.outputs]
+
+    def to_json(self) -> object:
+        """Return outputs, missing outputs, plan and number of frames."""
+        return self.fidelity
+
+
+def compare(
+    reference: str | Path,
+    candidate: str | Path,
+    frames: str | Path,
+    listener: Listener = SILENT,
+) -> CompareResult:
+    """Run two graphs over frames: SQNR of every output, plan displacement in metres.
+
+    Args:
+        reference: the graph to be true to: a file, or the name of one that ships.
+        candidate: the graph that is judged.
+        frames: folder of recorded frames.
+        listener: who is told how it goes.
+
+    Raises:
+        GraphError: no such model, or onnxruntime cannot run it.
+        FramesError: a frame fits one of the graphs not.
+        EvaluationError: no output in common, or one that is not finite.
+    """
+    paths = model_path(reference), model_path(candidate)
+    recording = CalibrationSet(Path(frames))
+    for path in paths:
+        recording.check(graph.load(path))
+    total = len(recording)
+
+    def told(frame: Frame) -> Frame:
+        listener.on_progress("frames", frame.index, total, "")
+        return frame
+
+    left, right = (Session(path, release=True) for path in paths)
+    return CompareResult(*paths, measure(left, right, map(told, recording)))

@@ -1,0 +1,176 @@
+"""One compression, from file to file."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TypeAlias
+
+from me2e_compress import graph
+from me2e_compress import recipe as recipes
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import RecipeError
+from me2e_compress.manager import PassManager, Report
+from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import plan_of, save_plan
+from me2e_compress.runtime.atomic import write_json
+from me2e_compress.workflows.compress_result import CompressResult, beside
+from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_output, load_map, model_path
+
+Recipe: TypeAlias = str | Path | Sequence[Pass]
+"""A shipped recipe's name, a TOML file, or passes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CompressOptions:
+    """How a graph is compressed; None leaves it to the recipe.
+
+    Attributes:
+        scheme: int8 after the recipe's passes: ``feature-ext``, ``prediction``,
+            ``full``.
+        rules: of the int8 plan: ``paper`` or ``tensorrt``.
+        target: who will run the int8 graph: ``tensorrt`` or ``onnxruntime``.
+        overrides: TOML file of exceptions to the int8 plan.
+        ranges: file of saved ranges, instead of frames.
+        method: how ranges are read from frames, or were for ``ranges``.
+        module_map: preset or TOML file; None finds the preset.
+        seed: of everything random.
+        verify_frames: frames that exact passes are checked on; 0 checks none.
+
+    Raises:
+        RecipeError: a number below 0.
+    """
+
+    scheme: str | None = None
+    rules: str | None = None
+    target: str | None = None
+    overrides: str | Path | None = None
+    ranges: str | Path | None = None
+    method: str | None = None
+    module_map: str | Path | None = None
+    seed: int = 0
+    verify_frames: int = 2
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_count("--seed", self.seed)
+        check_count("--verify-frames", self.verify_frames)
+
+    def passes(self, recipe: Recipe | None) -> tuple[Pass, ...]:
+        """Build the passes of a recipe, with what these options say about int8.
+
+        Raises:
+            RecipeError: nothing to do, an unknown recipe, int8 twice, or options of
+                int8 without int8.
+        """
+        if isinstance(recipe, str | Path):
+            passes = recipes.load(recipe)
+        elif recipe is not None:
+            passes = tuple(recipe)
+        elif self.scheme is not None:
+            passes = recipes.load("exact")
+        else:
+            raise RecipeError(
+                f"say what to do: -r RECIPE ({', '.join(recipes.shipped())}), --passes"
+                " TEXT or --scheme"
+            )
+        quantizers = [each for each in passes if each.quantizes]
+        if len(quantizers) + (self.scheme is not None) > 1:
+            raise RecipeError(
+                f"{QuantizeInt8.name} is twice in the pipeline, a graph is quantized"
+                f" once: leave out {'--scheme' if self.scheme else 'one of them'}"
+            )
+        if self.scheme is not None:
+            passes = (*passes, QuantizeInt8(scheme=self.scheme))
+        return self._told(passes)
+
+    def _told(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
+        """Put the options into what quantizes; else into what reads ranges."""
+        named = ("rules", "target", "method")
+        given: dict[str, object] = {n: v for n in named if (v := getattr(self, n))}
+        files = {"overrides": self.overrides, "ranges": self.ranges}
+        given |= {name: Path(file) for name, file in files.items() if file is not None}
+        if not given:
+            return passes
+        readers = [each for each in passes if each.quantizes] or [
+            each for each in passes if each.reads_ranges
+        ]
+        known = {name for each in readers for name in each.option_names()}
+        if unknown := [name for name in given if name not in known]:
+            raise RecipeError(
+                f"--{unknown[0]} is for int8, and the pipeline has no"
+                f" {QuantizeInt8.name}: add --scheme"
+            )
+        return tuple(
+            each.with_options(
+                {n: v for n, v in given.items() if n in each.option_names()}
+            )
+            if each in readers
+            else each
+            for each in passes
+        )
+
+
+def compress(
+    model: str | Path,
+    output: str | Path,
+    recipe: Recipe | None = None,
+    frames: str | Path | None = None,
+    options: CompressOptions | None = None,
+    listener: Listener = SILENT,
+) -> CompressResult:
+    """Apply passes to a graph, check each, and write the smaller graph and a report.
+
+    Args:
+        model: the ONNX file, or the name of one that ships; it is not changed.
+        output: the smaller one.
+        recipe: a shipped recipe's name, a TOML file, or passes.
+        frames: folder of recorded frames.
+        options: None takes the defaults.
+        listener: who is told how it goes.
+
+    Raises:
+        GraphError: no such model, or the output would harm an input.
+        RecipeError: nothing to do, or options that do not fit the passes.
+        FramesError: frames that do not fit the model.
+        Me2eError: a pass refused the graph or broke.
+    """
+    options = options or CompressOptions()
+    source, output = model_path(model), Path(output)
+    passes = options.passes(recipe)
+    read = [file for each in passes for file in each.files()]
+    named = recipe if isinstance(recipe, str | Path) else None
+    check_output(_written(output), (source, named, frames, options.module_map, *read))
+    loaded = graph.load(source)
+    modules = load_map(options.module_map, loaded)
+    recording = None
+    if frames is not None:
+        recording = CalibrationSet(Path(frames))
+        recording.check(loaded)
+    manager = PassManager(passes, options.verify_frames, output.parent)
+    report = manager.run(
+        loaded,
+        Context(modules, recording, options.seed),
+        partial(listener.on_progress, "passes"),
+    )
+    return _write(report, source, output)
+
+
+def _written(output: Path) -> tuple[Path, ...]:
+    data = output.with_name(output.name + ".data")
+    return output, data, beside(output, "plan"), beside(output, "report")
+
+
+def _write(report: Report, source: Path, output: Path) -> CompressResult:
+    """Write the graph and its plan; the report last, it vouches for the others."""
+    graph.save(report.model, output)
+    plan = plan_of(report.model)
+    if plan is not None:
+        save_plan(plan, beside(output, "plan"))
+    record = report.record(source, output)
+    write_json(beside(output, "report"), record, indent=2)
+    sizes = graph.file_bytes(source), graph.file_bytes(output)
+    return CompressResult(source, output, report, record, *sizes)

@@ -1,0 +1,179 @@
+"""The demo with a stack of published size: nothing drives."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.runtime.interleaved import Lap, race
+from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.compare import compare
+from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.compress_result import CompressResult
+from me2e_compress.workflows.export import export_stack
+from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
+from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.paths import check_folder
+from me2e_compress.workflows.result import Result, Table, megabytes, table
+
+CALIBRATION_FRAMES, HELD_OUT_FRAMES = 8, 4
+SCENE_LENGTH = 4
+CALIBRATION_SEED, HELD_OUT_SEED = 0, 1
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class FilesResult(Result):
+    """Size and latency of files, measured in turn on one frame.
+
+    Attributes:
+        laps: by file, the first is what the others are held against.
+        threads: of onnxruntime.
+        rounds: how often each was run.
+        ending: what the user has now, in words.
+    """
+
+    laps: dict[Path, Lap]
+    threads: int
+    rounds: int
+    ending: str
+
+    @property
+    def headline(self) -> str:
+        """What the user has now."""
+        return self.ending
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a row a file."""
+        first = next(iter(self.laps.values()))
+        rows = [
+            (
+                path.name,
+                megabytes(graph.file_bytes(path)),
+                f"{lap.median_wall_s:.3f}",
+                f"{lap.best_wall_s:.3f}",
+                f"{min(lap.cpu_s):.3f}",
+                f"{lap.median_wall_s / first.median_wall_s:.3f}",
+            )
+            for path, lap in self.laps.items()
+        ]
+        how = f"{self.threads} threads, {self.rounds} rounds in turn"
+        return (
+            table(
+                f"Files, and latency on this CPU ({how})",
+                ("file", "MB", "median s", "best s", "CPU s", "ratio to the first"),
+                rows,
+                "int8 here is placed for TensorRT; onnxruntime's CPU runs such graphs"
+                " slower",
+            ),
+        )
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a file."""
+        return [
+            {
+                "file": path.name,
+                "bytes": graph.file_bytes(path),
+                "median_wall_s": lap.median_wall_s,
+                "best_wall_s": lap.best_wall_s,
+                "cpu_s": min(lap.cpu_s),
+            }
+            for path, lap in self.laps.items()
+        ]
+
+    def to_json(self) -> object:
+        """Return a row a file."""
+        return self.records()
+
+
+@dataclasses.dataclass(frozen=True)
+class StackDemo:
+    """A stack of the zoo, exported, made small, and what that did to it.
+
+    Attributes:
+        stack: ``vad-tiny``.
+        out: the folder.
+        scheme: a shipped recipe.
+        rounds: of the latency.
+        threads: of onnxruntime.
+
+    Raises:
+        RecipeError: no such recipe.
+        GraphError: the folder is a file.
+    """
+
+    stack: str
+    out: Path
+    scheme: str = "feature-ext"
+    rounds: int = 4
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        """Check recipe and folder."""
+        recipe.load(self.scheme)
+        check_folder(self.out, ())
+
+    @property
+    def steps(self) -> tuple[Callable[[Listener], Result], ...]:
+        """What is done, in order."""
+        return self.compress, self.weigh, self.compare, self.time
+
+    def compress(self, listener: Listener) -> CompressResult:
+        """Export the stack, write its frames, make it small."""
+        export_stack(self.stack, self._source)
+        for folder, count, seed in (
+            (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
+            (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
+        ):
+            options = FramesOptions(count, seed, SCENE_LENGTH)
+            record_frames(self.stack, folder, options, listener)
+        return compress(
+            self._source, self._small, self.scheme, self._frames, listener=listener
+        )
+
+    def weigh(self, listener: Listener) -> ModuleChanges:
+        """Weigh the modules before and after."""
+        return compare_modules(self._source, self._small)
+
+    def compare(self, listener: Listener) -> Result:
+        """Hold the small graph against the stack on other frames."""
+        return compare(self._source, self._small, self._held_out, listener)
+
+    def time(self, listener: Listener) -> FilesResult:
+        """Time the stack, its exact form and the small graph in turn."""
+        exact = self.out / f"{self.stack}.exact.onnx"
+        unchecked = CompressOptions(verify_frames=0)
+        compress(self._source, exact, "exact", options=unchecked, listener=listener)
+        paths = {path.name: path for path in (self._source, exact, self._small)}
+        sessions = {
+            name: Session(path, threads=self.threads, release=True)
+            for name, path in paths.items()
+        }
+        frame = CalibrationSet(self._held_out)[0]
+        told = partial(listener.on_progress, "latency")
+        laps = race(sessions, [frame], self.rounds, told)
+        report = self._small.with_name(self._small.stem + ".report.json")
+        return FilesResult(
+            {paths[name]: lap for name, lap in laps.items()},
+            self.threads,
+            self.rounds,
+            f"{self._small} and {report} are yours.",
+        )
+
+    @property
+    def _source(self) -> Path:
+        return self.out / f"{self.stack}.onnx"
+
+    @property
+    def _small(self) -> Path:
+        return self.out / f"{self.stack}.{self.scheme}.onnx"
+
+    @property
+    def _frames(self) -> Path:
+        return self.out / "frames"
+
+    @property
+    def _held_out(self) -> Path:
+        return self.out / "frames-held-out"

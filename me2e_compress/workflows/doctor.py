@@ -1,0 +1,112 @@
+"""What this machine can do, and what to install for the rest."""
+
+import dataclasses
+import importlib.metadata
+import importlib.util
+import os
+import platform
+
+import onnxruntime
+import psutil
+import pynvml
+
+from me2e_compress.manager.report import versions
+from me2e_compress.workflows.result import Result, Table, table
+
+_EXTRAS = (
+    ("torch", "zoo", "export the reference stacks, train the driver"),
+    ("highway_env", "highway", "drive models in closed loop"),
+    ("tensorrt_rtx", "trt-check", "parse and build for TensorRT without a GPU"),
+    ("onnxslim", "bench", "compare with onnxslim in the benchmarks"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkup:
+    """One thing a machine can or cannot do.
+
+    Attributes:
+        what: the ability.
+        found: what is there, or None.
+        advice: what to do to have it; empty where it is there.
+    """
+
+    what: str
+    found: str | None
+    advice: str = ""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class DoctorResult(Result):
+    """Everything that was looked for.
+
+    Attributes:
+        checkups: one a thing.
+    """
+
+    checkups: tuple[Checkup, ...]
+
+    @property
+    def headline(self) -> str:
+        """Count what is there."""
+        found = sum(each.found is not None for each in self.checkups)
+        return f"{found} of {len(self.checkups)} things found"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the table says it."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return what was found, and what to do for the rest."""
+        rows = [(each.what, each.found or "no", each.advice) for each in self.checkups]
+        return (table("This machine", ("what", "found", "to have it"), rows, words=3),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a thing."""
+        return [dataclasses.asdict(each) for each in self.checkups]
+
+    def to_json(self) -> object:
+        """Return what was found."""
+        return self.records()
+
+
+def doctor() -> DoctorResult:
+    """Look for everything that the toolkit can make use of."""
+    return DoctorResult((*_machine(), *_packages(), _gpu()))
+
+
+def _machine() -> list[Checkup]:
+    memory = psutil.virtual_memory().total / 2**30
+    enough = "" if memory >= 6 else "VAD-tiny wants 6 GiB to calibrate"
+    return [
+        Checkup("cores", str(os.cpu_count())),
+        Checkup("memory", f"{memory:.1f} GiB", enough),
+        Checkup("platform", platform.platform()),
+        Checkup("onnxruntime on", ", ".join(onnxruntime.get_available_providers())),
+    ]
+
+
+def _packages() -> list[Checkup]:
+    found = [Checkup(name, version) for name, version in versions().items()]
+    for module, extra, purpose in _EXTRAS:
+        if importlib.util.find_spec(module) is None:
+            advice = f"{purpose}: pip install 'me2e-compress[{extra}]'"
+            found.append(Checkup(module, None, advice))
+        else:
+            name = module.replace("_", "-")
+            found.append(Checkup(module, importlib.metadata.version(name)))
+    return found
+
+
+def _gpu() -> Checkup:
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError as error:
+        return Checkup("NVIDIA GPU", None, f"energy is not measured here ({error})")
+    try:
+        handle = pynvml.nvmlDeviceGetHandleByIndex(0)
+        return Checkup("NVIDIA GPU", str(pynvml.nvmlDeviceGetName(handle)))
+    except pynvml.NVMLError as error:
+        return Checkup("NVIDIA GPU", None, f"the driver answers: {error}")
+    finally:
+        pynvml.nvmlShutdown()

@@ -1,0 +1,192 @@
+"""A policy driven over routes of highway-env, and scored."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.driving.latency import parse_latency
+from me2e_compress.driving.policies import POLICIES, Driver, driver_named
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
+from me2e_compress.evaluators.highway.evaluation_options import (
+    engine_of,
+    routes_named,
+    weather_of,
+)
+from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
+from me2e_compress.evaluators.highway.render import render
+from me2e_compress.evaluators.highway.results import MANIFEST
+from me2e_compress.evaluators.highway.runner import Conditions
+from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.metrics.scores import score as score_episodes
+from me2e_compress.simulator.routes import pick_routes
+from me2e_compress.workflows.limits import check_number
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_folder, model_path
+from me2e_compress.workflows.result import Result, Table, number
+from me2e_compress.workflows.score import driving_score, score_records, scores_table
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateOptions:
+    """What is driven, under what.
+
+    Attributes:
+        routes: ``all``, a number, ``ID,ID`` or a file of routes.
+        latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE`` or
+            ``measured``.
+        latency_scale: of a trace or a measurement.
+        in_order: replay a trace in its order.
+        seed: of the draws from a trace.
+        workers: routes at a time.
+        dt_ms: step of the world.
+        adapter: TOML file that adapts the model to the policy contract.
+        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day.
+        frame_limit_s: until a decision counts as hung.
+        engine: ``local`` or ``ray``.
+        address: of a Ray cluster.
+        render: draw these routes as GIF and PNG; chosen as ``routes`` is.
+
+    Raises:
+        RecipeError: a number that is not positive and finite.
+    """
+
+    routes: str = "all"
+    latency: str = "none"
+    latency_scale: float = 1.0
+    in_order: bool = False
+    seed: int = 0
+    workers: int = 1
+    dt_ms: float = 50.0
+    adapter: str | Path | None = None
+    weather: str = ""
+    frame_limit_s: float = FRAME_LIMIT_S
+    engine: str = "local"
+    address: str | None = None
+    render: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("--dt-ms", self.dt_ms)
+        check_number("--frame-limit", self.frame_limit_s)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class EvaluateResult(Result):
+    """How a policy drives.
+
+    Attributes:
+        policy: as it was named.
+        output: the folder of results.
+        scores: over the routes.
+        pictures: that were drawn.
+    """
+
+    policy: str
+    output: Path
+    scores: Scores
+    pictures: tuple[Path, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """Policy, driving score, routes."""
+        return f"{self.policy}: {driving_score(self.scores)}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the table says it."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return every score with its interval."""
+        return (scores_table(self.policy, self.scores),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a score."""
+        return score_records(self.scores)
+
+    def to_json(self) -> object:
+        """Return the scores."""
+        return self.scores.to_json()
+
+
+def evaluate(
+    policy: str | Path,
+    output: str | Path,
+    options: EvaluateOptions | None = None,
+    listener: Listener = SILENT,
+) -> EvaluateResult:
+    """Drive a policy over routes of highway-env; run again, it goes on.
+
+    Args:
+        policy: an ONNX file, the name of a model that ships, ``expert``, ``blind`` or
+            ``blind:MPS``.
+        output: the folder of results.
+        options: None takes the defaults.
+        listener: who is told how it goes.
+
+    Raises:
+        EvaluationError: no such policy, route, latency, weather or engine; the policy
+            cannot drive; the folder is of another evaluation.
+        GraphError: the folder is a file or an input.
+    """
+    options, output, policy = options or EvaluateOptions(), Path(output), str(policy)
+    trace = options.latency.removeprefix("trace:")
+    check_folder(output, (policy, options.routes, trace, options.adapter), (MANIFEST,))
+    picked, set_size = routes_named(options.routes)
+    shown = () if options.render is None else pick_routes(picked, options.render)
+    job = _job(policy, options)
+
+    def on_progress(now: DrivingProgress) -> None:
+        running = f"DS {number(now.driving_score, '.1f')}"
+        running += f" SR {number(now.success_rate, '.1f')} %"
+        listener.on_progress("evaluate", now.done, now.total, running)
+
+    evaluator = HighwayEvaluator(
+        job,
+        picked,
+        output,
+        set_size,
+        engine_of(options.engine, options.workers, options.address),
+        on_progress,
+        listener.on_warning,
+    )
+    scores = score_episodes(tuple(evaluator.episodes()), set_size)
+    pictures = [file for route in shown for file in render(job, route, output)]
+    return EvaluateResult(policy, output, scores, tuple(pictures))
+
+
+def _job(policy: str, options: EvaluateOptions) -> Job:
+    driver = driver_of(policy, options.adapter)
+    latency = parse_latency(
+        options.latency,
+        in_order=options.in_order,
+        scale=options.latency_scale,
+        seed=options.seed,
+    )
+    conditions = Conditions(
+        latency,
+        round(options.dt_ms * 1000),
+        image_size_of(driver.open()),
+        weather_of(options.weather),
+    )
+    return Job(driver, conditions, options.frame_limit_s)
+
+
+def driver_of(text: str, adapter: str | Path | None = None) -> Driver:
+    """Find the driver that a word means, and its model.
+
+    Args:
+        text: a policy by name, a path, or a shipped model's name.
+        adapter: TOML file that adapts the model to the policy contract.
+
+    Raises:
+        EvaluationError: none of them.
+    """
+    driver = driver_named(text, None if adapter is None else Path(adapter))
+    if not isinstance(driver, OnnxDriver):
+        return driver
+    try:
+        return dataclasses.replace(driver, path=model_path(driver.path))
+    except GraphError as error:
+        policies = ", ".join(POLICIES.names())
+        raise EvaluationError(f"{error}; policies: {policies}") from error

@@ -1,0 +1,81 @@
+"""A reference stack as ONNX."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from me2e_compress.errors import GraphError
+from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.paths import check_output
+from me2e_compress.zoo import export as exporter
+from me2e_compress.zoo import shipped
+
+OPSET = 17
+"""Of the shipped models, and of the others unless asked otherwise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportOptions:
+    """How a stack is written; a trained model leaves nothing to choose.
+
+    Attributes:
+        opset: ONNX opset of the file.
+        heads: classes and ego modes of vad-tiny; None is nuScenes'.
+        seed: of the initial weights; None is 0.
+
+    Raises:
+        RecipeError: a seed below 0.
+    """
+
+    opset: int = OPSET
+    heads: Literal["nuscenes", "bench2drive"] | None = None
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the seed."""
+        check_count("--seed", self.seed or 0)
+
+
+def export_stack(
+    stack: str, output: str | Path, options: ExportOptions | None = None
+) -> Path:
+    """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver.
+
+    Args:
+        stack: ``vad-tiny`` or ``highway``.
+        output: the file; its folder is made.
+        options: None takes the defaults.
+
+    Returns:
+        The file.
+
+    Raises:
+        GraphError: no such stack or opset, options for a trained model, or an output
+            that cannot be written.
+        MissingExtraError: exporting needs the extra ``zoo``.
+    """
+    options, output = options or ExportOptions(), Path(output)
+    if output.parent.is_dir():  # else it is made
+        check_output([output], ())
+    if stack not in shipped.SHIPPED:
+        return exporter.export(
+            stack,
+            output,
+            opset=options.opset,
+            seed=options.seed or 0,
+            heads=options.heads or "nuscenes",
+        )
+    _refuse(stack, {"--seed": options.seed, "--heads": options.heads}, options.opset)
+    return shipped.copy(stack, output)
+
+
+def _refuse(stack: str, options: Mapping[str, object], opset: int) -> None:
+    """Refuse options: a trained model is one file."""
+    given = [option for option, value in options.items() if value is not None]
+    if opset != OPSET:
+        given.append(f"--opset {opset}")
+    if given:
+        raise GraphError(
+            f"{stack} is a trained model of opset {OPSET}: {given[0]} cannot be chosen"
+        )

@@ -1,0 +1,107 @@
+"""Calibration frames, coherent in time, seen by six cameras."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+from me2e_compress.calibration.recording import write_recording
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.workflows.extras import need_closed_loop
+from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_folder, model_path
+from me2e_compress.zoo.stacks import STACKS, find
+from me2e_compress.zoo.synthetic_frames import frames as synthetic
+
+SCENE_LENGTH = 8
+"""Frames of a synthetic scene, half a second apart."""
+DRIVEN_SCENE_LENGTH = 16
+"""Frames of a stretch of a route, half a second apart."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FramesOptions:
+    """Which frames are made.
+
+    Attributes:
+        count: how many.
+        seed: of everything.
+        scene_length: frames a scene; None is `SCENE_LENGTH` of a synthetic world,
+            `DRIVEN_SCENE_LENGTH` of a driven route.
+
+    Raises:
+        RecipeError: a seed below 0.
+    """
+
+    count: int = 256
+    seed: int = 0
+    scene_length: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the seed."""
+        check_count("--seed", self.seed)
+
+
+def record_frames(
+    source: str | Path,
+    folder: str | Path,
+    options: FramesOptions | None = None,
+    listener: Listener = SILENT,
+) -> Path:
+    """Make frames of a stack or a driver and write them, all or nothing.
+
+    Of ``vad-tiny`` a synthetic world is drawn; for ``highway``, or any ONNX file that
+    keeps the policy contract, the expert drives fresh routes of highway-env.
+
+    Args:
+        source: a stack of the zoo, or an ONNX file that keeps the policy contract.
+        folder: is written.
+        options: None takes the defaults.
+        listener: who is told how it goes.
+
+    Returns:
+        The folder.
+
+    Raises:
+        GraphError: no such stack and no such file, or altered weights; or the folder
+            is the input.
+        FramesError: a count below 1, or the folder holds something else.
+        EvaluationError: the file does not keep the policy contract.
+        MissingExtraError: driving needs the extra ``highway``.
+    """
+    options, folder = options or FramesOptions(), Path(folder)
+    check_folder(folder, (source,))
+    if Path(source).is_file() or find(str(source)).trained:
+        made = _driven(model_path(source), options)
+    else:
+        made = _synthetic(str(source), options)
+    about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
+
+    def told() -> Iterator[Frame]:
+        for frame in made:
+            yield frame
+            done = frame.index + 1
+            listener.on_progress("frames", done, options.count, folder.name)
+
+    return write_recording(folder, told(), about)
+
+
+def _driven(model: Path, options: FramesOptions) -> Iterator[Frame]:
+    need_closed_loop("what frames of a driver need")
+    from me2e_compress.evaluators.highway.driven_frames import driven_frames
+    from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+
+    length = options.scene_length
+    return driven_frames(
+        OnnxPolicy.open(model),
+        options.count,
+        seed=options.seed,
+        scene_length=DRIVEN_SCENE_LENGTH if length is None else length,
+    )
+
+
+def _synthetic(stack: str, options: FramesOptions) -> Iterator[Frame]:
+    length = SCENE_LENGTH if options.scene_length is None else options.scene_length
+    made = synthetic(STACKS[stack], options.count, options.seed, length)
+    for index, arrays in enumerate(made):
+        yield Frame(index, index % length == 0, dict(arrays))

@@ -1,0 +1,196 @@
+"""What a graph holds: interface, and nodes, parameters, MACs by module."""
+
+import dataclasses
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress import graph, recipe
+from me2e_compress.graph import Port, provenance
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import Item, ModuleMap, assign, itemise
+from me2e_compress.passes import Context
+from me2e_compress.workflows.compress_result import giga
+from me2e_compress.workflows.paths import load_map, model_path
+from me2e_compress.workflows.result import Result, Table, megabytes, number, table
+
+_SHAPES = "import-normalize,fold-constants{through_compute=false}"
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Inspection(Result):
+    """What a file holds.
+
+    Attributes:
+        file: its name.
+        file_bytes: with the weights beside it.
+        opset: of the default domain.
+        domains: further operator domains.
+        map: the module map that was used.
+        inputs: what it takes.
+        outputs: what it answers.
+        modules: module by module.
+        rules: how many nodes each rule of the map placed.
+    """
+
+    file: str
+    file_bytes: int
+    opset: int | None
+    domains: tuple[str, ...]
+    map: str
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    modules: tuple[Item, ...]
+    rules: dict[str, int]
+
+    @property
+    def headline(self) -> str:
+        """File, size, opset."""
+        more = f" and {', '.join(self.domains)}" if self.domains else ""
+        return f"{self.file}: {megabytes(self.file_bytes)} MB, opset {self.opset}{more}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the interface, and the modules."""
+        ports = [
+            (kind, port.name, port.type, port.shape)
+            for kind, side in (("in", self.inputs), ("out", self.outputs))
+            for port in side
+        ]
+        rows = [
+            (
+                item.module,
+                number(item.nodes),
+                number(item.parameters),
+                megabytes(item.weight_bytes),
+                number(None if item.macs is None else item.macs / 1e9, ".3f"),
+            )
+            for item in self.modules
+        ]
+        rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
+        columns = ("module", "nodes", "parameters", "MB", "GMACs")
+        return (
+            table("Interface", ("", "name", "type", "shape"), ports, words=4),
+            table(f"Modules (map {self.map})", columns, rows, f"nodes placed: {rules}"),
+        )
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a module."""
+        return [dataclasses.asdict(item) for item in self.modules]
+
+    def to_json(self) -> object:
+        """Return everything."""
+        return dataclasses.asdict(self)
+
+
+def inspect(model: str | Path, module_map: str | Path | None = None) -> Inspection:
+    """Read a graph and weigh its modules.
+
+    Args:
+        model: an ONNX file, or the name of one that ships.
+        module_map: preset or TOML file; None finds the preset.
+
+    Raises:
+        GraphError: no such model.
+        ModuleMapError: no such map.
+    """
+    path = model_path(model)
+    loaded = graph.load(path)
+    modules = load_map(module_map, loaded)
+    placed = assign(loaded, modules)
+    inputs, outputs = graph.interface(loaded)
+    items = itemise(loaded, modules, placed.module_of)
+    costs = {item.module: item.macs for item in weigh(loaded, modules)}
+    return Inspection(
+        path.name,
+        graph.file_bytes(path),
+        loaded.opset_imports.get(""),
+        tuple(sorted(domain for domain in loaded.opset_imports if domain)),
+        modules.name,
+        inputs,
+        outputs,
+        tuple(dataclasses.replace(i, macs=costs.get(i.module)) for i in items),
+        {str(rule): count for rule, count in placed.rules().items()},
+    )
+
+
+def weigh(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
+    """Weigh the modules once the shape arithmetic is done, which MACs need to know."""
+    if provenance.missing(model):
+        manager = PassManager(recipe.parse(_SHAPES), verify_frames=0)
+        model = manager.run(model, Context(modules)).model
+    graph.infer_shapes(model)
+    return itemise(model, modules, provenance.module_of, graph.macs)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ModuleChanges(Result):
+    """What the modules of a graph held before and hold now.
+
+    Attributes:
+        before: module by module.
+        after: the same; a module that is gone is not there.
+    """
+
+    before: tuple[Item, ...]
+    after: tuple[Item, ...]
+
+    @property
+    def headline(self) -> str:
+        """Nodes in all."""
+        before, after = (
+            sum(item.nodes for item in side) for side in (self.before, self.after)
+        )
+        return f"{before} nodes, now {after}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the table says it."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return module by module what there was and is."""
+        rows = []
+        for item, now in self._pairs():
+            nodes, size = (now.nodes, now.weight_bytes) if now else (0, 0)
+            rows.append(
+                (
+                    item.module,
+                    f"{item.nodes} → {nodes}",
+                    number(item.parameters),
+                    f"{megabytes(item.weight_bytes)} → {megabytes(size)}",
+                    f"{giga(item.macs)} → {giga(now.macs if now else 0)}",
+                )
+            )
+        columns = ("module", "nodes", "parameters", "weights MB", "GMACs")
+        note = "before: once imported, its shape arithmetic done"
+        return (table("Module by module", columns, rows, note),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a module."""
+        return [
+            {
+                "module": item.module,
+                "nodes_before": item.nodes,
+                "nodes": now.nodes if now else 0,
+                "weight_bytes_before": item.weight_bytes,
+                "weight_bytes": now.weight_bytes if now else 0,
+            }
+            for item, now in self._pairs()
+        ]
+
+    def to_json(self) -> object:
+        """Return both sides."""
+        return {"before": self.before, "after": self.after}
+
+    def _pairs(self) -> list[tuple[Item, Item | None]]:
+        held = {item.module: item for item in self.after}
+        return [(item, held.get(item.module)) for item in self.before]
+
+
+def compare_modules(before: Path, after: Path) -> ModuleChanges:
+    """Weigh the modules of two files, each by the preset that fits it.
+
+    Raises:
+        GraphError: not a graph.
+    """
+    loaded = [graph.load(path) for path in (before, after)]
+    return ModuleChanges(*(weigh(each, load_map(None, each)) for each in loaded))

@@ -1,0 +1,134 @@
+"""What ``sensitivity`` and ``search`` have in common: a model, calibrated once."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.sample import draw
+from me2e_compress.quantization.rules import RULE_SETS
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
+from me2e_compress.targets import TARGETS
+from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.paths import Given, check_output, load_map
+from me2e_compress.workflows.prepare_int8 import PreparedGraph
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrialOptions:
+    """How int8 variants are made and judged.
+
+    Attributes:
+        scheme: modules that may be int8: ``feature-ext``, ``prediction``, ``full``.
+        rules: of the int8 plans.
+        target: who will run the graph; None leaves it to the workflow.
+        ranges: file of saved ranges, instead of calibrating.
+        module_map: preset or TOML file; None finds the preset.
+        count: frames to judge on.
+        threads: of onnxruntime; 0 takes all.
+
+    Raises:
+        RecipeError: threads below 0.
+    """
+
+    scheme: str = "full"
+    rules: str = "paper"
+    target: str | None = None
+    ranges: str | Path | None = None
+    module_map: str | Path | None = None
+    count: int = 4
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the number of threads."""
+        check_count("--threads", self.threads)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialFiles:
+    """Where trials read and write.
+
+    Attributes:
+        model: the float ONNX file.
+        frames: folder of recorded frames.
+        output: the recipe.
+    """
+
+    model: Path
+    frames: Path
+    output: Path
+
+    def check(self, options: TrialOptions, *inputs: Given) -> None:
+        """Refuse, before any work, a recipe that could not be written or does harm.
+
+        Raises:
+            GraphError: names it.
+        """
+        read = (self.model, self.frames, options.ranges, options.module_map, *inputs)
+        overrides = self.output.with_name(self.output.stem + ".overrides.toml")
+        check_output([self.output, overrides], read)
+
+    def trials(
+        self,
+        options: TrialOptions,
+        target: str,
+        listener: Listener,
+        drive: Drive | None = None,
+    ) -> tuple[Trials, tuple[str, ...]]:
+        """Prepare the graph, calibrate once, and name the modules to try.
+
+        Raises:
+            RecipeError: no such scheme, rule set or target.
+            FramesError: frames or saved ranges that do not fit.
+            PreconditionError: the graph is quantized already, or nothing can be int8.
+        """
+        rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
+        recording = CalibrationSet(self.frames)
+        loaded = graph.load(self.model)
+        recording.check(loaded)
+        scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
+        ready = PreparedGraph.of(self.model, loaded, options.module_map)
+        made = Trials(
+            ready.model,
+            ready.modules,
+            rules,
+            place,
+            _ranges(ready, recording, options, listener),
+            draw(recording, options.count, 0),
+            drive=drive,
+            threads=options.threads,
+        )
+        return made, scheme.modules
+
+    def write(self, choice: Int8Choice, rules: str, target: str) -> str:
+        """Write the recipe, and return a line that says what it makes int8."""
+        before = tuple(each.name for each in recipe.load("exact"))
+        overrides = write_recipe(self.output, choice, before, rules, target)
+        listed = ", ".join(choice.modules) or "no module"
+        more = f", {len(choice.floats)} of their nodes in float" if overrides else ""
+        return f"{self.output}: int8 in {listed}{more}"
+
+
+def _ranges(
+    ready: PreparedGraph,
+    recording: CalibrationSet,
+    options: TrialOptions,
+    listener: Listener,
+) -> Ranges:
+    """Load the ranges of every tensor, or measure them on the frames."""
+    tensors = ready.tensors()
+    if options.ranges is not None:
+        ranges = Ranges.load(Path(options.ranges))
+        digest = graph.digest(ready.model)
+        ranges.check(model=digest, tensors=tensors, method=ranges.method)
+        return ranges
+    return Calibrator(threads=options.threads).run(
+        ready.model,
+        tensors,
+        recording,
+        lambda done, of: listener.on_progress("calibrate", done, of, ""),
+    )

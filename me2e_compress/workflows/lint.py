@@ -1,0 +1,168 @@
+"""Whether the program that is to run a graph would take it."""
+
+import dataclasses
+from collections import Counter
+from pathlib import Path
+
+from me2e_compress import graph
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.targets.lint import LintFinding
+from me2e_compress.targets.lint import lint as find
+from me2e_compress.targets.tensorrt.rtx import BuildResult, check
+from me2e_compress.workflows.paths import model_path
+from me2e_compress.workflows.result import Result, Table, table
+
+
+@dataclasses.dataclass(frozen=True)
+class LintOptions:
+    """What is asked.
+
+    Attributes:
+        target: ``tensorrt`` or ``onnxruntime``.
+        trt_check: also parse and build the graph by TensorRT-RTX.
+        sm: GPU generation that is built for.
+
+    Raises:
+        RecipeError: TensorRT-RTX is asked about a graph for another target.
+    """
+
+    target: str = "tensorrt"
+    trt_check: bool = False
+    sm: int = 86
+
+    def __post_init__(self) -> None:
+        """Check that TensorRT-RTX is asked about its own."""
+        if self.trt_check and self.target != "tensorrt":
+            raise RecipeError(f"--trt-check is for tensorrt, not for {self.target}")
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class LintResult(Result):
+    """What was found.
+
+    Attributes:
+        model: the file.
+        options: what was asked.
+        findings: by our own rules and operator tables.
+        build: what TensorRT-RTX said; None if it was not asked.
+    """
+
+    model: Path
+    options: LintOptions
+    findings: tuple[LintFinding, ...]
+    build: BuildResult | None
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the target would refuse the graph, in one line; None if it would not."""
+        errors = [each for each in self.findings if each.severity == "error"]
+        if errors:
+            first = errors[0]
+            return (
+                f"{self.model}: {self.options.target} refuses it, {len(errors)} errors;"
+                f" {first.rule} {first.node!r}: {first.message}"
+            )
+        if self.build is not None and not self.build.passed:
+            return f"{self.model}: {_why(self.build)}"
+        return None
+
+    def check(self) -> None:
+        """Go on if the target takes the graph.
+
+        Raises:
+            PreconditionError: it would not.
+        """
+        if self.refusal is not None:
+            raise PreconditionError(self.refusal)
+
+    @property
+    def headline(self) -> str:
+        """Count errors and warnings."""
+        counts = Counter(each.severity for each in self.findings)
+        return (
+            f"{self.model.name} for {self.options.target}: {counts['error']} errors,"
+            f" {counts['warning']} warnings (our own rules and operator tables)"
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the headline, and what TensorRT-RTX said."""
+        said = () if self.build is None else _said(self.build, self.options.sm)
+        return (self.headline, *said)
+
+    def tables(self, *, shown: int = 3) -> tuple[Table, ...]:
+        """Return the findings.
+
+        Args:
+            shown: nodes of each rule; below the table stands how many more there are.
+        """
+        if not self.findings:
+            return ()
+        rows = list[tuple[str, ...]]()
+        seen: Counter[tuple[str, str]] = Counter()
+        for each in self.findings:
+            key = (each.severity, each.rule)
+            seen[key] += 1
+            if seen[key] <= shown:
+                rows.append((*key, each.node, each.message))
+        more = (
+            f"{severity} {rule}: {count - shown} more"
+            for (severity, rule), count in seen.items()
+            if count > shown
+        )
+        columns = ("", "rule", "node", "what")
+        return (table("Findings", columns, rows, "\n".join(more), words=4),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a finding."""
+        return [dataclasses.asdict(each) for each in self.findings]
+
+    def to_json(self) -> object:
+        """Return the findings, and the answer of TensorRT-RTX."""
+        return {"findings": self.findings, "tensorrt_rtx": self.build}
+
+
+def lint(model: str | Path, options: LintOptions | None = None) -> LintResult:
+    """Check a graph for the program that will run it.
+
+    Args:
+        model: an ONNX file, or the name of one that ships.
+        options: None takes the defaults.
+
+    Raises:
+        GraphError: no such model.
+        RecipeError: no such target.
+        MissingExtraError: TensorRT-RTX is not installed and was asked.
+    """
+    options, path = options or LintOptions(), model_path(model)
+    loaded = graph.load(path)
+    found = tuple(find(loaded, options.target))
+    build = check(loaded, options.sm) if options.trt_check else None
+    return LintResult(path, options, found, build)
+
+
+def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:
+    """Say what TensorRT-RTX made of a graph."""
+    int8 = Counter(each.kind for each in verdict.kernels if each.is_int8)
+    every = Counter(each.kind for each in verdict.kernels)
+    kernels = ", ".join(f"{int8[kind]} of {every[kind]} {kind}s" for kind in every)
+    parsed = "parsed" if verdict.parsed else "not parsed"
+    built = "built" if verdict.built else "not built"
+    lines = [
+        f"TensorRT-RTX {verdict.version}, on this CPU: {parsed}"
+        + ("" if verdict.built is None else f", {built} for SM{sm}")
+    ]
+    if kernels:
+        lines.append(f"kernels with int8 operands: {kernels}")
+    if verdict.cut:
+        lines.append(f"cut at {len(verdict.cut)} plugins: {', '.join(verdict.cut[:5])}")
+    return tuple(lines)
+
+
+def _why(verdict: BuildResult) -> str:
+    if verdict.missing:
+        return (
+            f"{len(verdict.missing)} convolutions that the plan makes int8 have no int8"
+            f" kernel, {verdict.missing[0]} first"
+        )
+    first = verdict.errors[0] if verdict.errors else "it does not say why"
+    return f"TensorRT-RTX refuses it: {first}"

@@ -1,0 +1,20 @@
+"""Who is told how a workflow goes; nobody is, unless asked for."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Functions that are called while a workflow runs; neither changes it.
+
+    Args:
+        on_progress: Called with the stage, things done and to do, and words.
+        on_warning: Called with one line a surprise.
+    """
+
+    on_progress: Callable[[str, int, int, str], None] = lambda stage, a, b, words: None
+    on_warning: Callable[[str], None] = lambda line: None
+
+
+SILENT = Listener()

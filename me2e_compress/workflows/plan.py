@@ -1,0 +1,211 @@
+"""Which nodes become int8, which stay float, by which rule, and why."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import RecipeError
+from me2e_compress.graph import WEIGHTED
+from me2e_compress.passes import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import (
+    INT8,
+    PlanDifference,
+    QuantPlan,
+    differences,
+    load_plan,
+    plan_of,
+    save_plan,
+)
+from me2e_compress.quantization.plan.decision import record
+from me2e_compress.workflows.paths import check_output, model_path
+from me2e_compress.workflows.prepare_int8 import PreparedGraph
+from me2e_compress.workflows.result import Result, Table, table
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanOptions:
+    """What is planned; of no meaning for a plan that is made already.
+
+    Attributes:
+        scheme: ``feature-ext``, ``prediction``; None is ``full``.
+        rules: ``paper`` or ``tensorrt``; None is ``paper``.
+        overrides: TOML file of exceptions.
+        module_map: preset or TOML file; None finds the preset.
+    """
+
+    scheme: str | None = None
+    rules: str | None = None
+    overrides: str | Path | None = None
+    module_map: str | Path | None = None
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class PlanResult(Result):
+    """A plan, and how it differs from another.
+
+    Attributes:
+        plan: decisions for every node.
+        changes: nodes that another plan decides differently; None where none was
+            given to compare with.
+    """
+
+    plan: QuantPlan
+    changes: tuple[PlanDifference, ...] | None = None
+
+    @property
+    def headline(self) -> str:
+        """Count int8, by rule; or the differences."""
+        if self.changes is not None:
+            return f"{len(self.changes)} differences"
+        found, kept = self.plan, len(self.plan.kept_float)
+        counts = ", ".join(f"{rule} {count}" for rule, count in found.counts().items())
+        return (
+            f"scheme {found.scheme.name}, rules {found.rules}: {len(found.chosen)} of"
+            f" {len(found.decisions)} nodes int8; {counts}"
+            + (f"; {kept} of them stay float on their target" if kept else "")
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the differences, and the headline."""
+        return (*map(str, self.changes or ()), self.headline)
+
+    def tables(self, *, every: bool = False) -> tuple[Table, ...]:
+        """Return the decisions, and what was decided together.
+
+        Args:
+            every: every node, not only what could be int8.
+        """
+        if self.changes is not None:
+            return ()
+        rows = [
+            (
+                each.module,
+                each.node,
+                each.op,
+                each.dtype,
+                each.rule,
+                each.reason + (f" ({each.borderline})" if each.borderline else ""),
+            )
+            for each in self.plan.decisions
+            if every or each.op in WEIGHTED or each.dtype == INT8
+        ]
+        columns = ("module", "node", "op", "", "rule", "why")
+        shown = table("Decisions", columns, rows, words=6)
+        return (shown, *self._groups()) if every else (shown,)
+
+    def _groups(self) -> tuple[Table, ...]:
+        rows = [
+            (group.kind, group.name, ", ".join(group.tensors), ", ".join(group.nodes))
+            for group in self.plan.groups
+        ]
+        if not rows:
+            return ()
+        columns = ("kind", "name", "tensors", "read by")
+        return (table("Decided together", columns, rows, words=4),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a node."""
+        return [
+            {
+                "module": each.module,
+                "node": each.node,
+                "op": each.op,
+                "dtype": each.dtype,
+                "rule": each.rule,
+                "reason": each.reason,
+                "borderline": each.borderline,
+            }
+            for each in self.plan.decisions
+        ]
+
+    def to_json(self) -> object:
+        """Return the plan; the differences, where another was given."""
+        return record(self.plan) if self.changes is None else self.changes
+
+
+def plan(
+    model: str | Path,
+    output: str | Path | None = None,
+    against: str | Path | None = None,
+    options: PlanOptions | None = None,
+) -> PlanResult:
+    """Decide for every node whether it becomes int8, as ``compress`` will.
+
+    Args:
+        model: an ONNX file, the name of one that ships, or a saved plan; a file that
+            carries its plan is taken at its word.
+        output: write the plan as JSON.
+        against: another model or plan to compare with; of a float model it is the
+            plan without overrides.
+        options: None takes the defaults.
+
+    Raises:
+        GraphError: no such model, or the output would harm an input.
+        RecipeError: not a plan, an unknown scheme or rule set, or options for a plan
+            that is made already.
+        PreconditionError: the graph is quantized and carries no plan.
+    """
+    options = options or PlanOptions()
+    files = [model_path(model), *([] if against is None else [Path(against)])]
+    written = None if output is None else Path(output)
+    check_output([written], (*files, options.overrides, options.module_map))
+    read = [_read(path) for path in files]
+    _check_options(options, files, read)
+    plain = QuantizeInt8(
+        scheme=options.scheme or "full", rules=options.rules or "paper"
+    )
+    overrides = None if options.overrides is None else Path(options.overrides)
+    chosen = dataclasses.replace(plain, overrides=overrides)
+    found = _made(files[0], read[0], chosen, options)
+    if written is not None:
+        save_plan(found, written)
+    if against is None:
+        return PlanResult(found)
+    other = _made(files[1], read[1], plain, options)
+    return PlanResult(found, tuple(differences(other, found)))
+
+
+def _read(path: Path) -> QuantPlan | ir.Model:
+    """Read the plan that a file is or carries, else the graph to make one of."""
+    if path.suffix == ".json":
+        return load_plan(path)
+    model = graph.load(path)
+    return plan_of(model) or model
+
+
+def _check_options(
+    options: PlanOptions,
+    files: Sequence[Path],
+    read: Sequence[QuantPlan | ir.Model],
+) -> None:
+    """Refuse options of a plan that would change none, for all are made.
+
+    Raises:
+        RecipeError: names the first option and the file.
+    """
+    names = ("scheme", "rules", "overrides")
+    given = [name for name in names if getattr(options, name)]
+    only = read[:1] if "overrides" in given else read
+    if given and all(isinstance(each, QuantPlan) for each in only):
+        option = "overrides" if "overrides" in given else given[0]
+        raise RecipeError(
+            f"--{option} is for a plan that is yet to be made, and {files[0]} has its"
+            " own: give the float model"
+        )
+
+
+def _made(
+    file: Path,
+    read: QuantPlan | ir.Model,
+    quantizer: QuantizeInt8,
+    options: PlanOptions,
+) -> QuantPlan:
+    """Take a plan, or plan a float graph once the exact passes are done."""
+    if isinstance(read, QuantPlan):
+        return read
+    ready = PreparedGraph.of(file, read, options.module_map)
+    return quantizer.plan(ready.model, Context(ready.modules))

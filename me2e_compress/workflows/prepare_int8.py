@@ -1,0 +1,100 @@
+"""The graph that int8 is put on: what comes before is done, shapes are inferred."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn, Self
+
+import onnx_ir as ir
+
+from me2e_compress import graph, recipe
+from me2e_compress.errors import PreconditionError
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.rules import RULE_SETS
+from me2e_compress.targets import TARGETS
+from me2e_compress.targets.quantized import describe_quantized
+from me2e_compress.workflows.paths import load_map
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PreparedGraph:
+    """A graph as the pass finds it that reads ranges.
+
+    Attributes:
+        file: what it was read from.
+        model: after the passes before that one, shapes inferred.
+        modules: its module map.
+        reader: the pass that reads ranges; None where the recipe has none.
+    """
+
+    file: Path
+    model: ir.Model
+    modules: ModuleMap
+    reader: Pass | None
+
+    @classmethod
+    def of(
+        cls,
+        file: Path,
+        loaded: ir.Model,
+        module_map: str | Path | None,
+        passes: Sequence[Pass] | None = None,
+    ) -> Self:
+        """Run the passes before the first that reads ranges, unverified.
+
+        Args:
+            file: what the graph was read from.
+            loaded: the graph.
+            module_map: preset or TOML file; None finds the preset.
+            passes: None stands for the recipe ``exact``.
+
+        Raises:
+            PreconditionError: the graph is quantized already, and int8 is what the
+                passes lead to.
+            ModuleMapError: no such map.
+            Me2eError: a pass refused the graph or broke.
+        """
+        chosen = tuple(recipe.load("exact") if passes is None else passes)
+        at = next((at for at, each in enumerate(chosen) if each.reads_ranges), None)
+        reader = None if at is None else chosen[at]
+        quantized = describe_quantized(loaded)
+        if quantized and (reader is None or reader.quantizes):
+            raise PreconditionError(
+                f"{file}: the graph is quantized already: {quantized}; give the float"
+                " graph that it was made of"
+            )
+        modules = load_map(module_map, loaded)
+        manager = PassManager(chosen[:at], verify_frames=0)
+        model = manager.run(loaded, Context(modules)).model
+        graph.infer_shapes(model)
+        return cls(file, model, modules, reader)
+
+    def tensors(self) -> tuple[str, ...]:
+        """Name every tensor that any scheme, rule set or target needs a range of.
+
+        Of a quantized graph that is to be rewritten: those that it tells no range of.
+
+        Raises:
+            PreconditionError: there is none.
+        """
+        if self.reader is None or self.reader.quantizes:
+            return self._of_all() or self._refuse("no node can become int8")
+        missing = self.reader.ranged_tensors(self.model, Context(self.modules))
+        return missing or self._refuse(
+            f"it tells every range that {self.reader.name} needs: none to measure"
+        )
+
+    def _of_all(self) -> tuple[str, ...]:
+        names: dict[str, None] = {}
+        for rules in RULE_SETS.usable():
+            every = QuantizeInt8(modules=self.modules.names(), rules=rules)
+            plan = every.plan(self.model, Context(self.modules))
+            for target in map(TARGETS.parse, TARGETS.usable()):
+                names |= dict.fromkeys(target.tensors(plan, self.model))
+        return tuple(names)
+
+    def _refuse(self, reason: str) -> NoReturn:
+        raise PreconditionError(f"{self.file}: {reason}")

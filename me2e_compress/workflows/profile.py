@@ -1,0 +1,119 @@
+"""Latency of a model alone and warm, as a trace."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.runtime.latency_trace import PERCENTILES, LatencyTrace
+from me2e_compress.runtime.profile import WARM_UP
+from me2e_compress.runtime.profile import profile as measure
+from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_output, model_path
+from me2e_compress.workflows.result import Result, Table, table
+
+
+@dataclasses.dataclass(frozen=True)
+class ProfileOptions:
+    """How latencies are measured.
+
+    Attributes:
+        samples: how many; None is one a frame.
+        warm_up: inferences before the first that counts.
+        threads: of onnxruntime; 0 takes all.
+
+    Raises:
+        RecipeError: threads below 0.
+    """
+
+    samples: int | None = None
+    warm_up: int = WARM_UP
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the number of threads."""
+        check_count("--threads", self.threads)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ProfileResult(Result):
+    """Latencies of one model.
+
+    Attributes:
+        model: the file.
+        trace: the samples.
+        output: the trace that was written; None if none was.
+    """
+
+    model: Path
+    trace: LatencyTrace
+    output: Path | None
+
+    @property
+    def headline(self) -> str:
+        """File, number of inferences, machine."""
+        count = len(self.trace.samples_us)
+        return (
+            f"{self.output or self.model.name}: {count} inferences on"
+            f" {self.trace.machine}"
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the table's title is the headline."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the percentiles in milliseconds."""
+        rows = [
+            *((f"p{p}", self.trace.percentile_us(p)) for p in PERCENTILES),
+            ("max", self.trace.max_us),
+        ]
+        shown = [(name, f"{taken_us / 1e3:.2f}") for name, taken_us in rows]
+        return (table(self.headline, ("latency", "ms"), shown),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row an inference, in their order."""
+        return [{"latency_us": sample} for sample in self.trace.samples_us]
+
+    def to_json(self) -> object:
+        """Return what the trace file holds."""
+        return self.trace.to_json()
+
+
+def profile(
+    model: str | Path,
+    frames: str | Path,
+    output: str | Path | None = None,
+    options: ProfileOptions | None = None,
+    listener: Listener = SILENT,
+) -> ProfileResult:
+    """Measure a model alone and warm.
+
+    Args:
+        model: the graph, or the name of one that ships.
+        frames: folder of recorded frames; repeated as often as it takes.
+        output: write the latencies as a trace, which ``evaluate`` can charge.
+        options: None takes the defaults.
+        listener: who is told how it goes.
+
+    Raises:
+        GraphError: no such model, it cannot be run, or the output would harm an input.
+        EvaluationError: there is nothing to measure.
+        FramesError: a frame does not fit.
+    """
+    options = options or ProfileOptions()
+    source, written = model_path(model), None if output is None else Path(output)
+    check_output([written], (source, frames))
+    trace = measure(
+        source,
+        CalibrationSet(Path(frames)),
+        samples=options.samples,
+        warm_up=options.warm_up,
+        threads=options.threads,
+        on_sample=lambda done, total: listener.on_progress(
+            "profile", done, total, "inferences"
+        ),
+    )
+    if written is not None:
+        trace.save(written)
+    return ProfileResult(source, trace, written)

@@ -1,0 +1,161 @@
+"""Results that show themselves: on a terminal, in a notebook, to a program."""
+
+import abc
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.errors import MissingPackageError
+
+MOST_ROWS = 30
+"""Rows of a table in a notebook; the last line says how many more there are."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number as it is shown.
+
+    Attributes:
+        text: The number, or words.
+        detail: Its interval, in smaller type; empty if it has none.
+        reason: Why there is no number; empty if there is one.
+    """
+
+    text: str
+    detail: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of one thing each: the first columns are words, the others are numbers.
+
+    Attributes:
+        title: Heads it.
+        columns: With their units.
+        rows: As wide as the columns.
+        note: What a reader must know; a few sentences, or a few lines.
+        strong: Name of the row that the others are held against.
+        words: How many of the first columns are words.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+    strong: str = ""
+    words: int = 1
+
+    def markdown(self) -> str:
+        """Write it as GitHub shows it, intervals in brackets."""
+        rule = "|---|" + "---:|" * (len(self.columns) - 1)
+        rows = [[_text(cell).replace("|", "\\|") for cell in row] for row in self.rows]
+        lines = [_line(self.columns), rule, *map(_line, rows)]
+        parts = [f"**{self.title}**", "\n".join(lines), *filter(None, [self.note])]
+        return "\n\n".join(parts) + "\n"
+
+    def html(self) -> str:
+        """Write a small table for a notebook, every name escaped."""
+        shown = [self._row("td", map(_text, row)) for row in self.rows[:MOST_ROWS]]
+        if more := len(self.rows) - len(shown):
+            shown.append(f'<tr><td colspan="{len(self.columns)}">{more} more</td></tr>')
+        note = "<br>".join(html.escape(line) for line in self.note.splitlines())
+        return (
+            f"<table><caption>{html.escape(self.title)}</caption>"
+            f"<thead>{self._row('th', self.columns)}</thead>"
+            f"<tbody>{''.join(shown)}</tbody></table>"
+            + (f"<p><small>{note}</small></p>" if note else "")
+        )
+
+    def _row(self, tag: str, cells: Iterable[str]) -> str:
+        row = "".join(
+            f'<{tag} style="text-align:{"left" if at < self.words else "right"}">'
+            f"{html.escape(text)}</{tag}>"
+            for at, text in enumerate(cells)
+        )
+        return f"<tr>{row}</tr>"
+
+
+def table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    note: str = "",
+    words: int = 1,
+) -> Table:
+    """Build a table of plain texts."""
+    cells = tuple(tuple(map(Cell, row)) for row in rows)
+    return Table(title, tuple(columns), cells, note, words=words)
+
+
+def number(value: float | None, form: str = ",.0f") -> str:
+    """Write a number, or a dash for what was not measured."""
+    return "-" if value is None else format(value, form)
+
+
+def megabytes(count: float) -> str:
+    """Write bytes as MB (1e6)."""
+    return f"{count / 1e6:.2f}"
+
+
+class Result(abc.ABC):
+    """What a workflow found."""
+
+    @property
+    @abc.abstractmethod
+    def headline(self) -> str:
+        """The result in one line."""
+
+    @abc.abstractmethod
+    def tables(self) -> tuple[Table, ...]:
+        """Return what there is to read, as tables."""
+
+    @abc.abstractmethod
+    def records(self) -> list[dict[str, object]]:
+        """Return what there is to compute with: flat rows of one kind."""
+
+    @abc.abstractmethod
+    def to_json(self) -> object:
+        """Return everything, as JSON data."""
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what is said below the tables."""
+        return (self.headline,)
+
+    def to_pandas(self) -> Any:
+        """Build a ``pandas.DataFrame`` of the records.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError as error:
+            raise MissingPackageError("pandas") from error
+        return pd.DataFrame(self.records())
+
+    def __repr__(self) -> str:
+        """Show the class and the one line."""
+        return f"<{type(self).__name__}: {self.headline}>"
+
+    def _repr_html_(self) -> str:
+        """Show the tables in a notebook; the records, where there are none."""
+        shown = self.tables() or _table_of(self.records())
+        below = "".join(f"<p>{html.escape(line)}</p>" for line in self.lines())
+        return "".join(each.html() for each in shown) + below
+
+
+def _table_of(records: Sequence[Mapping[str, object]]) -> tuple[Table, ...]:
+    if not records:
+        return ()
+    rows = [[str(value) for value in record.values()] for record in records]
+    return (table("", list(records[0]), rows),)
+
+
+def _line(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _text(cell: Cell) -> str:
+    return f"{cell.text} ({cell.detail})" if cell.detail else cell.text

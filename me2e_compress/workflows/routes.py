@@ -1,0 +1,216 @@
+"""Sets of routes: made and admitted, or examined again."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.admission import Admission, examine
+from me2e_compress.evaluators.highway.generate import VARIANTS, ScenarioRoutes, generate
+from me2e_compress.simulator.routes import load_routes, pick_routes, save_routes
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_output
+from me2e_compress.workflows.result import Result, Table, table
+
+
+@dataclasses.dataclass(frozen=True)
+class RoutesOptions:
+    """Which routes are made.
+
+    Attributes:
+        seed: decides every route.
+        variants: of each scenario type.
+        scenarios: ``all``, or ``NAME,NAME``.
+        workers: scenario types at a time.
+
+    Raises:
+        RecipeError: a seed below 0.
+        EvaluationError: no such scenario.
+    """
+
+    seed: int = 0
+    variants: int = VARIANTS
+    scenarios: str = "all"
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        """Check seed and scenarios."""
+        check_count("--seed", self.seed)
+        for name in self.names:
+            if name not in SCENARIO_ABILITIES:
+                there = ", ".join(sorted(SCENARIO_ABILITIES))
+                raise EvaluationError(f"no scenario {name!r}; there are {there}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the scenario types."""
+        if self.scenarios == "all":
+            return tuple(SCENARIO_ABILITIES)
+        return tuple(name.strip() for name in self.scenarios.split(","))
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class RoutesResult(Result):
+    """A set of routes that was made.
+
+    Attributes:
+        output: its file.
+        harvests: what every scenario type gave.
+    """
+
+    output: Path
+    harvests: tuple[ScenarioRoutes, ...]
+
+    @property
+    def admitted(self) -> int:
+        """How many routes the set has."""
+        return sum(len(one.routes) for one in self.harvests)
+
+    @property
+    def tried(self) -> int:
+        """How many were proposed."""
+        return sum(one.tried for one in self.harvests)
+
+    @property
+    def headline(self) -> str:
+        """Routes, tries, file."""
+        share = self.admitted / self.tried
+        return (
+            f"{self.admitted} routes of {self.tried} tried ({share:.0%}) ->"
+            f" {self.output}"
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return scenario by scenario what was admitted, and why others were not."""
+        rows = [
+            (
+                one.scenario,
+                str(len(one.routes)),
+                str(one.tried),
+                "; ".join(dict.fromkeys(one.refusals)),
+            )
+            for one in self.harvests
+        ]
+        columns = ("scenario", "admitted", "tried", "refused because")
+        return (table("Routes", columns, rows, words=4),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a scenario."""
+        return [
+            {
+                "scenario": one.scenario,
+                "admitted": len(one.routes),
+                "tried": one.tried,
+                "refusals": one.refusals,
+            }
+            for one in self.harvests
+        ]
+
+    def to_json(self) -> object:
+        """Return the counts, in all and by scenario."""
+        counts = {"admitted": self.admitted, "tried": self.tried}
+        return {**counts, "scenarios": self.records()}
+
+
+def make_routes(
+    output: str | Path,
+    options: RoutesOptions | None = None,
+    listener: Listener = SILENT,
+) -> RoutesResult:
+    """Make a fresh set of routes, each admitted by the expert and the blind driver.
+
+    Args:
+        output: the manifest to write.
+        options: None takes the defaults.
+        listener: who is told how it goes.
+
+    Raises:
+        GraphError: the output cannot be written.
+    """
+    options, output = options or RoutesOptions(), Path(output)
+    check_output([output], ())
+    names, harvests = options.names, list[ScenarioRoutes]()
+    made = generate(options.seed, names, options.variants, options.workers)
+    for harvest in made:
+        harvests.append(harvest)
+        done = len(harvests)
+        listener.on_progress("admitting", done, len(names), harvest.scenario)
+    save_routes([route for one in harvests for route in one.routes], output)
+    return RoutesResult(output, tuple(harvests))
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ExaminationResult(Result):
+    """What the gate says of a set of routes.
+
+    Attributes:
+        manifest: the set.
+        verdicts: one a route.
+    """
+
+    manifest: Path
+    verdicts: tuple[Admission, ...]
+
+    @property
+    def refused(self) -> tuple[Admission, ...]:
+        """Routes that are not admitted."""
+        return tuple(one for one in self.verdicts if not one.admitted)
+
+    @property
+    def headline(self) -> str:
+        """Count those admitted."""
+        admitted = len(self.verdicts) - len(self.refused)
+        return f"{admitted} of {len(self.verdicts)} routes admitted"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the routes that are refused, and why."""
+        rows = [(one.route.id, str(one.refusal)) for one in self.refused]
+        columns = ("route", "refused because")
+        return (table("Refused", columns, rows, words=2),) if rows else ()
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a route."""
+        return [
+            {"route": one.route.id, "admitted": one.admitted, "refusal": one.refusal}
+            for one in self.verdicts
+        ]
+
+    def to_json(self) -> object:
+        """Return how many were examined, and why some are refused."""
+        why = {one.route.id: one.refusal for one in self.refused}
+        return {"examined": len(self.verdicts), "refused": why}
+
+    def check(self) -> None:
+        """Go on if all are admitted.
+
+        Raises:
+            EvaluationError: one is not; names the first.
+        """
+        if self.refused:
+            first = self.refused[0]
+            raise EvaluationError(
+                f"{self.manifest}: {len(self.refused)} of {len(self.verdicts)} routes"
+                f" are not admitted, the first is {first.route.id}: {first.refusal}"
+            )
+
+
+def examine_routes(
+    manifest: str | Path, pick: str = "all", listener: Listener = SILENT
+) -> ExaminationResult:
+    """Put a set of routes through the gate again.
+
+    Args:
+        manifest: the set.
+        pick: ``all``, a number or ``ID,ID``.
+        listener: who is told how it goes.
+
+    Raises:
+        EvaluationError: no such route, or no file of routes.
+    """
+    manifest, verdicts = Path(manifest), list[Admission]()
+    picked = pick_routes(load_routes(manifest), pick)
+    for route in picked:
+        verdicts.append(examine(route))
+        listener.on_progress("examining", len(verdicts), len(picked), route.id)
+    return ExaminationResult(manifest, tuple(verdicts))

@@ -1,0 +1,122 @@
+"""Scores of results that are there: of one folder or of several."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.metrics import scores as metrics
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.result import Result, Table, number, table
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ScoreResult(Result):
+    """Scores by the name of their folder.
+
+    Attributes:
+        scores: in the order in which the folders were named.
+    """
+
+    scores: Mapping[str, Scores]
+
+    @property
+    def headline(self) -> str:
+        """The driving scores."""
+        return "; ".join(
+            f"{name}: {driving_score(scores)}" for name, scores in self.scores.items()
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the tables say it."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a table a folder."""
+        return tuple(scores_table(name, scores) for name, scores in self.scores.items())
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a score of a folder."""
+        return [
+            {"results": name, **record}
+            for name, scores in self.scores.items()
+            for record in score_records(scores)
+        ]
+
+    def to_json(self) -> object:
+        """Return the scores of a folder; a list of them for several."""
+        found = [{"results": name, **s.to_json()} for name, s in self.scores.items()]
+        return found[0] if len(found) == 1 else found
+
+
+def score(
+    *results: str | Path,
+    listener: Listener = SILENT,
+) -> ScoreResult:
+    """Score the episodes in folders of results.
+
+    Args:
+        results: folders that ``evaluate`` wrote.
+        listener: who is told of files that are damaged and left out.
+
+    Raises:
+        EvaluationError: not a folder of results.
+    """
+    return ScoreResult({str(path): _scores(Path(path), listener) for path in results})
+
+
+def _scores(path: Path, listener: Listener) -> Scores:
+    folder = ResultsFolder.open(path)
+    episodes = tuple(folder.episodes().values())
+    for file, reason in folder.corrupt.items():
+        listener.on_warning(f"{file}: {reason}: left out")
+    return metrics.score(episodes, folder.set_size)
+
+
+def driving_score(scores: Scores) -> str:
+    """Write the driving score with its interval, and the number of routes."""
+    found = scores.driving_score
+    routes = f"{scores.routes} of {scores.expected} routes"
+    if found.value is None:
+        return f"driving score not measured ({found.measure.reason}); {routes}"
+    between = f"{number(found.low, '.1f')} to {number(found.high, '.1f')}"
+    return f"driving score {found.value:.1f} ({between}); {routes}"
+
+
+def scores_table(name: str, scores: Scores) -> Table:
+    """Show every score with its unit, its interval and its number of routes."""
+    routes = f"{scores.routes} of {scores.expected} routes"
+    partial = ", PARTIAL: no comparison with a whole set" if scores.partial else ""
+    rows = [(label, *_cells(estimate)) for label, estimate in _each(scores)]
+    columns = ("score", "mean", "95 %", "n", "unit")
+    return table(f"{name}: {routes}{partial}", columns, rows)
+
+
+def score_records(scores: Scores) -> list[dict[str, object]]:
+    """Return a row a score: value, interval, routes, unit, reason."""
+    return [
+        {"score": label.strip(), **estimate.to_json()}
+        for label, estimate in _each(scores)
+    ]
+
+
+def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
+    yield "driving score", scores.driving_score
+    yield "success rate", scores.success_rate
+    yield "efficiency", scores.efficiency
+    yield "comfort", scores.comfort
+    yield "abilities, mean", scores.abilities
+    yield from ((f"  {name}", rate) for name, rate in scores.each_ability.items())
+    yield "Bench2Drive's efficiency", scores.bench2drive_efficiency
+    yield "Bench2Drive's smoothness", scores.bench2drive_smoothness
+
+
+def _cells(estimate: Estimate) -> Sequence[str]:
+    measure = estimate.measure
+    form = ".2f" if measure.unit == "%" else ".3f"
+    if measure.value is None:
+        return "-", "-", str(estimate.n), f"not measured: {measure.reason}"
+    between = f"{number(estimate.low, form)} to {number(estimate.high, form)}"
+    return number(measure.value, form), between, str(estimate.n), measure.unit

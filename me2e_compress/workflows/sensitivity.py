@@ -1,0 +1,257 @@
+"""What int8 costs per module and node, and a recipe within a limit."""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import EvaluationError, RecipeError
+from me2e_compress.sensitivity import (
+    Drive,
+    Int8Choice,
+    Score,
+    Sensitivity,
+    advise,
+    analyse,
+)
+from me2e_compress.workflows.extras import need_closed_loop
+from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
+from me2e_compress.workflows.limits import check_count, check_number
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.paths import check_folder, model_path
+from me2e_compress.workflows.result import Result, Table, megabytes, number, table
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SensitivityOptions(TrialOptions):
+    """How int8 is judged, and what it may cost.
+
+    Attributes:
+        limit: largest loss of the recipe: metres that the plan moves; of a model
+            whose plan is not known, noise of its worst output relative to the signal.
+        drive: drive each module's int8 over these routes: ``all``, a number,
+            ``ID,ID`` or a file.
+        drive_limit: most points of driving score that the recipe may lose.
+        adapter: TOML file that adapts the model to the policy contract.
+        workers: routes at a time.
+        node_trials: most trials on the nodes of a module; 0 leaves nodes out.
+
+    Raises:
+        RecipeError: a number that is negative or not finite, or how to drive without
+            routes.
+    """
+
+    limit: float = 0.1
+    drive: str | None = None
+    drive_limit: float | None = None
+    adapter: str | Path | None = None
+    workers: int = 1
+    node_trials: int = 24
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without a file."""
+        super().__post_init__()
+        check_number("--limit", self.limit, zero=True)
+        check_number("--drive-limit", self.drive_limit, zero=True)
+        check_count("--node-trials", self.node_trials)
+        if self.drive is None and (self.drive_limit, self.adapter) != (None, None):
+            raise RecipeError(
+                "--drive-limit and --adapter say how to drive: add --drive"
+            )
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class SensitivityResult(Result):
+    """What int8 costs, and the recipe.
+
+    Attributes:
+        output: the recipe that was written.
+        found: module by module.
+        choice: what the recipe makes int8.
+        score: of the choice; None where nothing is int8.
+        driving: driving score of the choice; None where nothing is driven.
+        limit: of the loss.
+        written: what was written, in words.
+    """
+
+    output: Path
+    found: Sensitivity
+    choice: Int8Choice
+    score: Score | None
+    driving: float | None
+    limit: float
+    written: str
+
+    @property
+    def headline(self) -> str:
+        """The recipe."""
+        return self.written
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the nodes to blame, the recipe and its loss."""
+        unit = self.found.together.unit
+        blamed = []
+        for each in self.found.findings:
+            for (first, *rest), alone in each.blamed:
+                more = f" and {len(rest)} more" if rest else ""
+                blamed.append(f"{each.module}: {first}{more}: {alone:.4g} {unit} alone")
+        cost = []
+        if self.score is not None:
+            loss = f"{self.score.loss:.4g} {self.score.unit}"
+            cost.append(f"its loss: {loss}, limit {self.limit:g}")
+        if self.driving is not None:
+            whole = number(self.found.float_driving, ".1f")
+            cost.append(f"its DS: {self.driving:.1f}, float {whole}")
+        return *blamed, self.written, *cost
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return what int8 costs module by module."""
+        found, driven = self.found, self.found.float_driving is not None
+        rows = [
+            (each.module, str(each.nodes), *_cells(each.score, each.driving))
+            for each in found.findings
+        ]
+        if driven:
+            whole = number(found.float_driving, ".1f")
+            rows.insert(0, ("none", "", "0", "", whole))
+        rows.append(("together", "", *_cells(found.together, found.driving)))
+        columns = ("module", "nodes", f"loss {found.together.unit}", "worst dB", "DS")
+        width = len(columns) if driven else len(columns) - 1
+        size = megabytes(found.together.weight_bytes)
+        return (
+            table(
+                "Int8 module by module",
+                columns[:width],
+                [row[:width] for row in rows],
+                f"{found.trials} variants run; together {size} MB of weights",
+            ),
+        )
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a module."""
+        return [
+            {
+                "module": each.module,
+                "nodes": each.nodes,
+                "loss": each.score.loss,
+                "unit": each.score.unit,
+                "weight_bytes": each.score.weight_bytes,
+                "driving": each.driving,
+            }
+            for each in self.found.findings
+        ]
+
+    def to_json(self) -> object:
+        """Return what was found."""
+        return self.found
+
+
+def measure_sensitivity(
+    model: str | Path,
+    frames: str | Path,
+    output: str | Path,
+    options: SensitivityOptions | None = None,
+    listener: Listener = SILENT,
+) -> SensitivityResult:
+    """Measure what int8 costs per module and node, and write a recipe within a limit.
+
+    Where modules are driven, the episodes stay in ``RECIPE.drives``; run again, it
+    goes on from them.
+
+    Args:
+        model: the float ONNX file, or the name of one that ships.
+        frames: folder of recorded frames.
+        output: the recipe; overrides lie beside it where nodes stay float.
+        options: None takes the defaults.
+        listener: who is told how it goes.
+
+    Raises:
+        GraphError: no such model, or an output would harm an input.
+        RecipeError: no such scheme, rule set or target.
+        FramesError: frames or saved ranges that do not fit.
+        PreconditionError: the graph is quantized already, or nothing can be int8.
+        EvaluationError: the model cannot drive.
+    """
+    options = options or SensitivityOptions()
+    files = TrialFiles(model_path(model), Path(frames), Path(output))
+    files.check(options, options.adapter, options.drive)
+    drive = None
+    if options.drive is not None:
+        folder = files.output.with_name(files.output.stem + ".drives")
+        check_folder(folder, (frames,))
+        drive = _on_routes(options.drive, files.model, folder, options)
+    target = options.target or "tensorrt"
+    trials, modules = files.trials(options, target, listener, drive)
+    found = analyse(
+        trials,
+        modules,
+        node_trials=options.node_trials,
+        progress=partial(listener.on_progress, "modules"),
+    )
+    choice = advise(trials, found, options.limit, options.drive_limit)
+    written = files.write(choice, options.rules, target)
+    score = trials.score(choice) if choice.modules else None
+    driving = trials.driving(choice) if choice.modules else None
+    return SensitivityResult(
+        files.output, found, choice, score, driving, options.limit, written
+    )
+
+
+def _on_routes(
+    routes: str, model: Path, folder: Path, options: SensitivityOptions
+) -> Drive:
+    """Drive variants over routes of highway-env; the score is their mean DS, percent.
+
+    Args:
+        routes: as ``evaluate`` takes them.
+        model: that the variants are made of; it is tried before anything else.
+        folder: keeps the episodes, a folder a variant; what is there is not driven
+            again.
+        options: adapter and workers.
+
+    Raises:
+        MissingExtraError: driving needs the extra ``highway``.
+        EvaluationError: no such route, or the model cannot drive.
+    """
+    need_closed_loop("what driving a variant needs")
+    from me2e_compress.evaluators.highway.drivers import image_size_of
+    from me2e_compress.evaluators.highway.engine import LocalEngine
+    from me2e_compress.evaluators.highway.evaluation_options import routes_named
+    from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
+    from me2e_compress.evaluators.highway.runner import Conditions
+    from me2e_compress.evaluators.highway.worker import Job
+    from me2e_compress.metrics.scores import score
+    from me2e_compress.workflows.evaluate import driver_of
+
+    picked, set_size = routes_named(routes)
+    size = image_size_of(driver_of(str(model), options.adapter).open())
+
+    def drive(choice: Int8Choice, variant: ir.Model) -> float:
+        results = folder / _name_of(choice, variant)
+        with TemporaryDirectory() as scratch:
+            path = Path(scratch) / "variant.onnx"
+            graph.save(variant, path)
+            driver = driver_of(str(path), options.adapter)
+            job = Job(driver, Conditions(image_size=size))
+            engine = LocalEngine(options.workers)
+            evaluator = HighwayEvaluator(job, picked, results, set_size, engine)
+            found = score(tuple(evaluator.episodes()), set_size).driving_score
+        if found.value is None:
+            raise EvaluationError(f"{results}: {found.measure.reason}")
+        return found.value
+
+    return drive
+
+
+def _name_of(choice: Int8Choice, model: ir.Model) -> str:
+    """Name a variant: its int8 modules, and what tells it from all other graphs."""
+    modules = "+".join(choice.modules) or "float"
+    return f"{modules}-{graph.digest(model)[:12]}"
+
+
+def _cells(score: Score, driving: float | None) -> tuple[str, str, str]:
+    worst = min(item.sqnr_db for item in score.fidelity.outputs)
+    return f"{score.loss:.4g}", f"{worst:.1f}", number(driving, ".1f")
