@@ -112,6 +112,10 @@ class StudyResult(Result):
             f" {study.set_size} routes"
         )
 
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the tables say it."""
+        return ()
+
     def tables(self) -> tuple[Table, ...]:
         """Return every table, in the order of reading."""
         return all_tables(self)

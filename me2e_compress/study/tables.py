@@ -58,7 +58,7 @@ def differences(outcome: "StudyResult") -> Table:
         name = f"{drive.scheme}, {drive.condition}" if several else drive.scheme
         rows.append((Cell(name), *_difference(drive.difference)))
     return Table(
-        f"PairedDifference to {baseline} on the same routes",
+        f"Difference to {baseline} on the same routes",
         ("scheme", "DS, points", "SR, points", "routes better", "routes worse"),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap: an interval that "

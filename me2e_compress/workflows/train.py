@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.training.course import NO_LATENCY, CourseProgress, Trained, run
+from me2e_compress.training.course import NO_LATENCY, CourseProgress, RoundResult, run
 from me2e_compress.training.curriculum import FULL, SMALL, SMALL_LATENCY
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.paths import check_folder
@@ -33,7 +33,7 @@ class TrainResult(Result):
         rounds: the last one's driver is the one that was asked for.
     """
 
-    rounds: tuple[Trained, ...]
+    rounds: tuple[RoundResult, ...]
 
     @property
     def headline(self) -> str:
