@@ -87,7 +87,7 @@ def test_no_folder_for_the_output(refused: Callable[..., str], files: Path) -> N
     [
         ("fold", "no pass 'fold'"),
         ("fold-constants{speed=9}", "fold-constants has no option 'speed'"),
-        ("ablate-modules{drop=[occ", "not a pipeline"),
+        ("ablate-modules{drop=[occ", "a comma or ] is expected"),
         ("ablate-modules{drop=7}", "ablate-modules: drop"),
     ],
 )

@@ -37,7 +37,7 @@ def test_what_would_be_refused_is_listed_and_fails(
     said = capsys.readouterr()
     assert "error plugin: 2 more" in said.out
     (line,) = said.err.strip().splitlines()
-    assert "tensorrt refuses it, 3 errors; plugin 'a': own::Twist is no op" in line
+    assert "tensorrt refuses it, 3 errors; plugin 'a': own::Twist is neither" in line
 
 
 def test_findings_for_programs(

@@ -31,7 +31,7 @@ class Here:
 
     def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
         for route in routes:
-            self.driven.append((job.driver.name, route.id))
+            self.driven.append((job.driver.label, route.id))
             yield Driven(drive(route, job.driver.open(), job.conditions), 0.0, 0)
 
 
