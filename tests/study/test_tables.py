@@ -55,6 +55,7 @@ def test_no_noise_is_not_a_gap(found: StudyResult) -> None:
 def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
     table = differences(found)
 
+    assert table.title == "Difference to slow on the same routes"
     assert [row[0].text for row in table.rows] == [
         f"{scheme}, {condition}"
         for condition in ("ideal", "slow")
