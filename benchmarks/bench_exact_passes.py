@@ -1,15 +1,18 @@
-"""Exact passes against onnxsim and onnxslim: time, nodes, bytes, error, latency.
+"""Recipe ``exact`` against onnxsim and onnxslim: time, nodes, bytes, error, latency.
 
-    python benchmarks/bench_exact_passes.py model.onnx frames/
-    python benchmarks/bench_exact_passes.py --scaling
+    python -m benchmarks.bench_exact_passes model.onnx frames/ --map vad
+    python -m benchmarks.bench_exact_passes --scaling
 
-Each tool works in a process of its own, from file to file; the seconds are the CPU
-time from after its imports to the written file. Latencies are interleaved: round by
-round every graph runs one frame.
+Each tool works in a started process of its own, from file to file, round by round in
+turn. Ours is what a user runs: the workflow ``compress``, with the manager's checks, its
+report and its hashes. Three numbers are kept apart: start-up (the CPU time until the
+imports are done), the work, and verification (what two frames add to it). Latencies
+are interleaved too: round by round every graph runs one frame.
 """
 
 import argparse
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -17,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,84 +35,112 @@ SYNTHETIC_MAP = """
 role = "feature"
 optional = ["stage.*"]
 """
-TOOLS = ("ours", "onnxsim", "onnxslim")
+TOOLS = ("ours", "ours, verified", "onnxsim", "onnxslim")
 Frame = dict[str, npt.NDArray[np.generic]]
+Work = Callable[[], None]
 
 
-def ours(source: Path, target: Path, preset: str) -> Callable[[], None]:
-    from me2e_compress import graph
-    from me2e_compress.graph import provenance
-    from me2e_compress.modules import ModuleMap
-    from me2e_compress.passes import PASSES, Context
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What a tool is to do.
 
-    if preset:
-        modules = ModuleMap.load(preset)
-    else:
-        modules = ModuleMap.parse(SYNTHETIC_MAP, "synthetic")
-    names = ("import-normalize", "fold-constants", "eliminate-redundant", "fuse-basic")
+    Attributes:
+        source: the model.
+        target: where the smaller one goes.
+        preset: a module map; empty for the synthetic graph's own.
+        frames: folder of recorded frames; None without.
+    """
+
+    source: Path
+    target: Path
+    preset: str
+    frames: Path | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Taken:
+    """What one run of a tool took, in seconds.
+
+    Attributes:
+        startup_s: CPU time until its imports were done.
+        cpu_s: CPU time of the work.
+        wall_s: wall time of the work.
+    """
+
+    startup_s: float
+    cpu_s: float
+    wall_s: float
+
+
+def ours(job: Job, verify_frames: int = 0) -> Work:
+    from me2e_compress.workflows.compress import CompressOptions, compress
+
+    module_map: str | Path = job.preset
+    if not job.preset:
+        module_map = job.target.with_name("synthetic.toml")
+        module_map.write_text(SYNTHETIC_MAP)
+    options = CompressOptions(module_map=module_map, verify_frames=verify_frames)
+    frames = job.frames if verify_frames else None
 
     def work() -> None:
-        model = graph.load(source)
-        for name in names:
-            result = PASSES.get(name)().run(model, Context(modules))
-            print(f"{name}: {result.changes} changes", *result.notes, sep="\n  ")
-        lost = provenance.missing(model)
-        print(f"nodes without a past: {len(lost)}")
-        graph.save(model, target)
+        done = compress(job.source, job.target, "exact", frames, options)
+        for step in done.report.steps:
+            print(f"{step.name}: {step.seconds:.2f} s, {step.changes} changes")
 
     return work
 
 
-def onnxsim(source: Path, target: Path, preset: str) -> Callable[[], None]:
+def verified(job: Job) -> Work:
+    return ours(job, verify_frames=2)
+
+
+def onnxsim(job: Job) -> Work:
     import onnx
     import onnxsim
 
     def work() -> None:
-        simplified, _ = onnxsim.simplify(onnx.load(source))
-        onnx.save(simplified, target)
+        simplified, _ = onnxsim.simplify(onnx.load(job.source))
+        onnx.save(simplified, job.target)
 
     return work
 
 
-def onnxslim(source: Path, target: Path, preset: str) -> Callable[[], None]:
+def onnxslim(job: Job) -> Work:
     import onnx
     import onnxslim
 
     def work() -> None:
-        slimmed = onnxslim.slim(onnx.load(source))
+        slimmed = onnxslim.slim(onnx.load(job.source))
         if not isinstance(slimmed, onnx.ModelProto):
             raise SystemExit(f"onnxslim gave {type(slimmed).__name__}, not a model")
-        onnx.save(slimmed, target)
+        onnx.save(slimmed, job.target)
 
     return work
 
 
-def work_alone(tool: str, source: Path, target: Path, preset: str) -> None:
+def work_alone(tool: str, job: Job) -> None:
     """Run one tool here and print what it took as the last line, in JSON."""
-    job = {"ours": ours, "onnxsim": onnxsim, "onnxslim": onnxslim}[tool]
-    work = job(source, target, preset)
-    cpu, wall = time.process_time(), time.perf_counter()
+    prepare = dict(zip(TOOLS, (ours, verified, onnxsim, onnxslim), strict=True))[tool]
+    work = prepare(job)
+    startup, wall = time.process_time(), time.perf_counter()
     with contextlib.redirect_stderr(io.StringIO()):
         work()
-    taken = {
-        "cpu_s": time.process_time() - cpu,
-        "wall_s": time.perf_counter() - wall,
-    }
-    print(json.dumps(taken))
+    taken = Taken(startup, time.process_time() - startup, time.perf_counter() - wall)
+    print(json.dumps(dataclasses.asdict(taken)))
 
 
-def measure(tool: str, source: Path, target: Path, preset: str) -> dict[str, float]:
+def measure(tool: str, job: Job) -> Taken:
     """Run one tool in its own process."""
-    command = [sys.executable, __file__, str(source), "--worker", tool]
-    command += ["--target", str(target), "--map", preset]
+    command = [sys.executable, __file__, str(job.source), "--worker", tool]
+    command += ["--target", str(job.target), "--map", job.preset]
+    command += [] if job.frames is None else ["--verify", str(job.frames)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{tool}: {done.stderr.strip().splitlines()[-1]}")
     *said, last = done.stdout.strip().splitlines()
     if tool == "ours":
         print(*said, sep="\n")
-    taken: dict[str, float] = json.loads(last)
-    return taken
+    return Taken(**json.loads(last))
 
 
 def session(path: Path) -> onnxruntime.InferenceSession:
@@ -161,36 +192,54 @@ def replay(
     return feeds, wanted
 
 
-def compare(source: Path, folder: Path, preset: str) -> None:
+def compare(source: Path, folder: Path, preset: str, rounds: int) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         files = {"original": source}
-        taken: dict[str, dict[str, float]] = {}
-        for tool in TOOLS:
-            files[tool] = Path(scratch) / f"{tool}.onnx"
-            taken[tool] = measure(tool, source, files[tool], preset)
-        sessions = {name: session(path) for name, path in files.items()}
-        shown = frames(folder, 2)
-        feeds, wanted = replay(sessions["original"], shown)
-        latency: dict[str, list[float]] = {name: [] for name in sessions}
-        for turn in range(ROUNDS):
-            for name, one in sessions.items():
-                start = time.perf_counter()
-                one.run(None, feeds[turn % len(feeds)])
-                latency[name].append(time.perf_counter() - start)
+        files |= {tool: Path(scratch) / f"{tool}.onnx" for tool in TOOLS}
+        taken: dict[str, list[Taken]] = {tool: [] for tool in TOOLS}
+        for _ in range(rounds):
+            for tool, runs in taken.items():
+                runs.append(measure(tool, Job(source, files[tool], preset, folder)))
+        show_times(taken)
+        show_graphs(files, frames(folder, 2))
+
+
+def show_times(taken: Mapping[str, Sequence[Taken]]) -> None:
+    """Print the least and the median CPU time of the rounds, start-up apart."""
+    print(f"\n{'':14}  start-up  CPU s min  median  wall s min")
+    for tool, runs in taken.items():
+        cpu = [each.cpu_s for each in runs]
         print(
-            f"\n{'':10}  CPU s  wall s  nodes        bytes  max rel err  min s  med s"
+            f"{tool:14} {min(each.startup_s for each in runs):9.2f} {min(cpu):10.2f}"
+            f" {np.median(cpu):7.2f} {min(each.wall_s for each in runs):11.2f}"
         )
-        for name, path in files.items():
-            off = max(
-                error(want, sessions[name].run(None, feed))
-                for want, feed in zip(wanted, feeds, strict=True)
-            )
-            spent = taken.get(name, {"cpu_s": 0.0, "wall_s": 0.0})
-            print(
-                f"{name:10} {spent['cpu_s']:6.2f} {spent['wall_s']:7.2f}"
-                f" {nodes(path):6} {os.path.getsize(path):12,} {off:12.2e}"
-                f" {min(latency[name]):6.3f} {np.median(latency[name]):6.3f}"
-            )
+    ratios = [
+        mine.cpu_s / theirs.cpu_s
+        for mine, theirs in zip(taken["ours"], taken["onnxsim"], strict=True)
+    ]
+    print(f"ours / onnxsim, round by round: {np.median(ratios):.2f} (median)")
+
+
+def show_graphs(files: Mapping[str, Path], shown: Sequence[Frame]) -> None:
+    """Print size, error and latency of every graph."""
+    sessions = {name: session(path) for name, path in files.items()}
+    feeds, wanted = replay(sessions["original"], shown)
+    latency: dict[str, list[float]] = {name: [] for name in sessions}
+    for turn in range(ROUNDS):
+        for name, one in sessions.items():
+            start = time.perf_counter()
+            one.run(None, feeds[turn % len(feeds)])
+            latency[name].append(time.perf_counter() - start)
+    print(f"\n{'':14}  nodes        bytes  max rel err  min s  med s")
+    for name, path in files.items():
+        off = max(
+            error(want, sessions[name].run(None, feed))
+            for want, feed in zip(wanted, feeds, strict=True)
+        )
+        print(
+            f"{name:14} {nodes(path):6} {os.path.getsize(path):12,} {off:12.2e}"
+            f" {min(latency[name]):6.3f} {np.median(latency[name]):6.3f}"
+        )
 
 
 def scaling() -> None:
@@ -206,8 +255,7 @@ def scaling() -> None:
             onnx.save(model, source)
             target = Path(scratch) / "ours.onnx"
             with contextlib.redirect_stdout(io.StringIO()):
-                taken = measure("ours", source, target, "")
-            cpu_s = taken["cpu_s"]
+                cpu_s = measure("ours", Job(source, target, "", None)).cpu_s
             size = len(model.graph.node)
             print(
                 f"{size:8} {nodes(target):10} {cpu_s:6.2f} {1e3 * cpu_s / size:12.3f}"
@@ -220,15 +268,19 @@ def main() -> None:
     parser.add_argument("frames", type=Path, nargs="?")
     parser.add_argument("--map", default="")
     parser.add_argument("--scaling", action="store_true")
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--worker", choices=TOOLS)
     parser.add_argument("--target", type=Path)
+    parser.add_argument("--verify", type=Path)
     given = parser.parse_args()
     if given.worker:
-        work_alone(given.worker, given.model, given.target, given.map)
+        work_alone(
+            given.worker, Job(given.model, given.target, given.map, given.verify)
+        )
     elif given.scaling:
         scaling()
     elif given.model and given.frames:
-        compare(given.model, given.frames, given.map)
+        compare(given.model, given.frames, given.map, given.rounds)
     else:
         parser.error("name a model and its frames, or --scaling")
 
