@@ -4,8 +4,8 @@
     python -m benchmarks.bench_exact_passes --scaling
 
 Each tool works in a started process of its own, from file to file, round by round in
-turn. Ours is what a user runs: the workflow ``compress``, with the manager's checks, its
-report and its hashes. Three numbers are kept apart: start-up (the CPU time until the
+turn. Ours is what a user runs: the workflow ``compress``, the manager's checks, report
+and hashes included. Three numbers are kept apart: start-up (the CPU time until the
 imports are done), the work, and verification (what two frames add to it). Latencies
 are interleaved too: round by round every graph runs one frame.
 """

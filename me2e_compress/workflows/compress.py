@@ -19,6 +19,7 @@ from me2e_compress.workflows.compress_result import CompressResult, beside
 from me2e_compress.workflows.limits import check_count
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.paths import check_output, load_map, model_path
+from me2e_compress.zoo.shipped import sample_frames
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -128,7 +129,8 @@ def compress(
         model: the ONNX file, or the name of one that ships; it is not changed.
         output: the smaller one.
         recipe: a shipped recipe's name, a TOML file, or passes.
-        frames: folder of recorded frames.
+        frames: folder of recorded frames; without them exact passes are checked on
+            seeded inputs, a model that ships on the frames that ship with it.
         options: None takes the defaults.
         listener: who is told how it goes.
 
@@ -150,7 +152,13 @@ def compress(
     if frames is not None:
         recording = CalibrationSet(Path(frames))
         recording.check(loaded)
-    manager = PassManager(passes, options.verify_frames, output.parent)
+    samples = None if recording is not None else sample_frames(source)
+    manager = PassManager(
+        passes,
+        options.verify_frames,
+        output.parent,
+        None if samples is None else CalibrationSet(samples),
+    )
     report = manager.run(
         loaded,
         Context(modules, recording, options.seed),

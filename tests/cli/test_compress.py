@@ -63,3 +63,15 @@ def test_a_graph_of_no_known_stack_is_one_module(command: Command, files: Path) 
     output = ("-r", "exact", "-o", files / "out.onnx")
     assert command("compress", files / "plain.onnx", *output) == 0
     assert len(graph.load(files / "out.onnx").graph) == 1
+
+
+def test_the_driver_that_ships_is_judged_on_its_own_frames(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its planner tosses a coin on made-up inputs: the plan would go unjudged."""
+    output = ("-r", "exact", "-o", tmp_path / "out.onnx", "--json")
+    assert command("compress", "highway", *output) == 0
+    (check,) = json.loads(capsys.readouterr().out)["verifications"]
+    assert check["inputs"] == "recorded"
+    assert "plan" not in check["unsteady"]
+    assert check["errors"]["plan"] < 1e-5
