@@ -45,7 +45,7 @@ from me2e_compress.study import (
 )
 from me2e_compress.study.tables import all_tables
 from me2e_compress.study.workspace import MARKDOWN, Workspace
-from me2e_compress.study.write import write
+from me2e_compress.study.write import write_study
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.paths import model_path
 
@@ -226,7 +226,7 @@ def run(bench: Bench, name: str, workers: int) -> None:
     """Run one study and write its tables."""
     study, folder = STUDIES[name](bench), bench.out / name
     outcome = run_study(study, bench.out, LocalEngine(workers), told())
-    write(outcome, folder, (*COMMAND, str(bench.out), "--only", name))
+    write_study(outcome, folder, (*COMMAND, str(bench.out), "--only", name))
     parts = [table.markdown() for table in all_tables(outcome)]
     if name in BESIDES:
         parts.append(BESIDES[name](bench))

@@ -1,4 +1,9 @@
-"""Compress modular end-to-end driving models and measure what it costs on the road."""
+"""Compress modular end-to-end driving models and measure what it costs on the road.
+
+The functions are what the commands do, silently: ``compress``, ``compare``,
+``evaluate`` and so on take files, then options, and return a result, which shows
+itself in a notebook.
+"""
 
 import importlib
 from typing import TYPE_CHECKING
@@ -12,37 +17,128 @@ if TYPE_CHECKING:
     from me2e_compress.manager import PassManager, Report, Step, Verification
     from me2e_compress.modules import ModuleMap
     from me2e_compress.passes import PASSES, Context, Pass, PassResult
+    from me2e_compress.study import StudyResult, load_study, run_study
+    from me2e_compress.study.write import write_study
+    from me2e_compress.workflows.calibrate import (
+        CalibrateOptions,
+        CalibrateResult,
+        calibrate,
+    )
+    from me2e_compress.workflows.compare import CompareResult, compare
+    from me2e_compress.workflows.compress import CompressOptions, compress
+    from me2e_compress.workflows.compress_result import CompressResult
+    from me2e_compress.workflows.evaluate import (
+        EvaluateOptions,
+        EvaluateResult,
+        evaluate,
+    )
+    from me2e_compress.workflows.frames import FramesOptions, record_frames
+    from me2e_compress.workflows.inspect import InspectResult, inspect
+    from me2e_compress.workflows.lint import LintOptions, LintResult, lint
+    from me2e_compress.workflows.listener import Listener
+    from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
+    from me2e_compress.workflows.profile import ProfileOptions, ProfileResult, profile
+    from me2e_compress.workflows.score import ScoreResult, score
+    from me2e_compress.workflows.search import SearchOptions, SearchResult, search
+    from me2e_compress.workflows.sensitivity import (
+        SensitivityOptions,
+        SensitivityResult,
+        measure_sensitivity,
+    )
 
 __all__ = [
     "PASSES",
+    "CalibrateOptions",
+    "CalibrateResult",
     "CalibrationSet",
+    "CompareResult",
+    "CompressOptions",
+    "CompressResult",
     "Context",
+    "EvaluateOptions",
+    "EvaluateResult",
+    "FramesOptions",
+    "InspectResult",
+    "LintOptions",
+    "LintResult",
+    "Listener",
     "Me2eError",
     "ModuleMap",
     "Pass",
     "PassManager",
     "PassResult",
+    "PlanOptions",
+    "PlanResult",
+    "ProfileOptions",
+    "ProfileResult",
     "Report",
+    "ScoreResult",
+    "SearchOptions",
+    "SearchResult",
+    "SensitivityOptions",
+    "SensitivityResult",
     "Step",
+    "StudyResult",
     "Verification",
     "__version__",
+    "calibrate",
+    "compare",
+    "compress",
+    "evaluate",
     "graph",
+    "inspect",
+    "lint",
+    "load_study",
+    "measure_sensitivity",
+    "plan",
+    "profile",
     "recipe",
+    "record_frames",
+    "run_study",
+    "score",
+    "search",
+    "write_study",
 ]
 
 _ROOMS = {
-    "CalibrationSet": "calibration.dataset",
-    "Me2eError": "errors",
-    "ModuleMap": "modules",
-    **dict.fromkeys(("PassManager", "Report", "Step", "Verification"), "manager"),
-    **dict.fromkeys(("PASSES", "Context", "Pass", "PassResult"), "passes"),
+    "calibration.dataset": ("CalibrationSet",),
+    "errors": ("Me2eError",),
+    "manager": ("PassManager", "Report", "Step", "Verification"),
+    "modules": ("ModuleMap",),
+    "passes": ("PASSES", "Context", "Pass", "PassResult"),
+    "study": ("StudyResult", "load_study", "run_study"),
+    "study.write": ("write_study",),
+    "workflows.calibrate": ("CalibrateOptions", "CalibrateResult", "calibrate"),
+    "workflows.compare": ("CompareResult", "compare"),
+    "workflows.compress": ("CompressOptions", "compress"),
+    "workflows.compress_result": ("CompressResult",),
+    "workflows.evaluate": ("EvaluateOptions", "EvaluateResult", "evaluate"),
+    "workflows.frames": ("FramesOptions", "record_frames"),
+    "workflows.inspect": ("InspectResult", "inspect"),
+    "workflows.lint": ("LintOptions", "LintResult", "lint"),
+    "workflows.listener": ("Listener",),
+    "workflows.plan": ("PlanOptions", "PlanResult", "plan"),
+    "workflows.profile": ("ProfileOptions", "ProfileResult", "profile"),
+    "workflows.score": ("ScoreResult", "score"),
+    "workflows.search": ("SearchOptions", "SearchResult", "search"),
+    "workflows.sensitivity": (
+        "SensitivityOptions",
+        "SensitivityResult",
+        "measure_sensitivity",
+    ),
 }
+_HOMES = {name: room for room, names in _ROOMS.items() for name in names}
 
 
 def __getattr__(name: str) -> object:
     """Load a public name when it is asked for: a worker pays only for what it uses."""
     if name in ("graph", "recipe"):
         return importlib.import_module(f"me2e_compress.{name}")
-    if name in _ROOMS:
-        return getattr(importlib.import_module(f"me2e_compress.{_ROOMS[name]}"), name)
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"me2e_compress.{_HOMES[name]}"), name)
     raise AttributeError(f"me2e_compress has no {name}")
+
+
+def __dir__() -> list[str]:
+    """List the public names, for completion."""
+    return __all__

@@ -11,7 +11,7 @@ from me2e_compress.study.definition import Condition, Scheme, Study, Timing
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
 from me2e_compress.study.tables import differences, scoreboards
-from me2e_compress.study.write import Written, write
+from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
@@ -39,7 +39,7 @@ class DriveResult(Result):
     """
 
     study: StudyResult
-    written: Written
+    written: StudyFiles
     ending: tuple[str, ...]
 
     @property
@@ -143,7 +143,7 @@ class DriverDemo:
         found = run_study(study, self.out, LocalEngine(self.workers), listener)
         words = ("me2e-compress", "demo", "--out", str(self.out))
         chosen = ("--routes", self.routes, "--scheme", self.scheme)
-        written = write(found, self.out, (*words, *chosen))
+        written = write_study(found, self.out, (*words, *chosen))
         ending = (
             f"{self._small} and {written.report} are yours.",
             f"Its int8 is for {TARGET}, which drives here. For TensorRT: me2e-compress"

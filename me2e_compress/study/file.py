@@ -1,7 +1,6 @@
 """A study as a TOML file."""
 
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -14,27 +13,27 @@ from me2e_compress.passes import Pass
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study.check_frames import check_recordings
 from me2e_compress.study.definition import Condition, Scheme, Study, Timing
-
-Resolve = Callable[[str], Path]
-"""From the name of a model that ships to its file; the name itself if none does."""
+from me2e_compress.workflows.paths import model_path
 
 
-def load_study(path: Path, resolve: Resolve = Path, routes: str | None = None) -> Study:
+def load_study(path: str | Path, routes: str | None = None) -> Study:
     """Read a study.
 
-    Files are looked for beside the study's own file.
+    Files are looked for beside the study's own file; a policy that is not one there
+    is a model that ships.
 
     Args:
         path: The TOML file.
-        resolve: Finds models that are no files.
         routes: Drive these instead of the study's.
 
     Raises:
+        GraphError: A policy is neither a file nor a model that ships.
         StudyError: No such file, not TOML, a key that is unknown, missing or of
             another type, frames that are none, or a study that could not be finished.
         RecipeError: An unknown recipe or pass.
         EvaluationError: Unknown routes or latency.
     """
+    path = Path(path)
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -45,7 +44,7 @@ def load_study(path: Path, resolve: Resolve = Path, routes: str | None = None) -
         table = _Study.model_validate(content)
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
-    study = _Reader(path, resolve).study(table, routes)
+    study = _Reader(path).study(table, routes)
     check_recordings(study)
     return study
 
@@ -109,8 +108,8 @@ def _complaint(error: ValidationError) -> str:
 class _Reader:
     """Turns tables into a study; knows where its file lies."""
 
-    def __init__(self, path: Path, resolve: Resolve) -> None:
-        self.path, self.resolve = path, resolve
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
     def study(self, table: _Study, routes: str | None) -> Study:
         timing = table.latency
@@ -134,7 +133,7 @@ class _Reader:
         policy, adapter = table.policy, table.adapter
         driver = driver_named(policy)
         if isinstance(driver, OnnxDriver):
-            policy = str(self._model(str(driver.path)))
+            policy = str(model_path(driver.path, self.path.parent))
             if adapter is None and driver.adapter is not None:
                 adapter = str(driver.adapter)
         return Scheme(
@@ -145,14 +144,6 @@ class _Reader:
             self._file(adapter),
             self._file(table.trace),
         )
-
-    def _model(self, policy: str) -> Path:
-        """Find a model beside the study or by its name, and nowhere else."""
-        beside = self._beside(policy)
-        if beside.is_file():
-            return beside
-        found = self.resolve(policy)
-        return beside if found == Path(policy) else found
 
     def _passes(self, table: _Scheme) -> tuple[Pass, ...]:
         if table.recipe is not None and table.passes is not None:

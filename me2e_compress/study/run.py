@@ -7,6 +7,7 @@ from me2e_compress.manager.report import versions
 from me2e_compress.study.check_frames import check_recordings
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import Road
+from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import SchemeOutcome, StudyResult, this_machine
 from me2e_compress.study.plan_fidelity import judge
 from me2e_compress.study.prepared import PreparedScheme, prepare_scheme
@@ -18,8 +19,8 @@ from me2e_compress.workflows.paths import check_folder
 
 
 def run_study(
-    study: Study,
-    folder: Path,
+    study: Study | str | Path,
+    folder: str | Path,
     engine: Engine | None = None,
     listener: Listener = SILENT,
     pictures: int = 3,
@@ -30,7 +31,7 @@ def run_study(
     are not made again. Studies may share a folder where they share schemes.
 
     Args:
-        study: What is asked.
+        study: What is asked, or its TOML file.
         folder: Where models, traces and results go.
         engine: Where routes are driven; None for one process of this machine.
         listener: Who is told how it goes.
@@ -41,7 +42,7 @@ def run_study(
         Me2eError: A model cannot drive, a pass refused its graph, frames do not fit,
             or the folder is of another study; one line that names the culprit.
     """
-    check_recordings(study)
+    study, folder = _read(study), Path(folder)
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     workspace = Workspace(folder)
     contenders = [
@@ -65,6 +66,13 @@ def run_study(
         this_machine(),
         versions(),
     )
+
+
+def _read(study: Study | str | Path) -> Study:
+    if isinstance(study, str | Path):
+        return load_study(study)
+    check_recordings(study)
+    return study
 
 
 def _schemes(

@@ -13,7 +13,7 @@ from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 
 
 @dataclass(frozen=True)
-class Written:
+class StudyFiles:
     """The files of a study.
 
     Attributes:
@@ -27,7 +27,9 @@ class Written:
     report: Path
 
 
-def write(outcome: StudyResult, folder: Path, command: Sequence[str] = ()) -> Written:
+def write_study(
+    outcome: StudyResult, folder: str | Path, command: Sequence[str] = ()
+) -> StudyFiles:
     """Write JSON, Markdown and HTML, each whole or not at all.
 
     Args:
@@ -38,7 +40,8 @@ def write(outcome: StudyResult, folder: Path, command: Sequence[str] = ()) -> Wr
     Raises:
         StudyError: The folder cannot be written.
     """
-    written = Written(folder / JSON, folder / MARKDOWN, folder / HTML)
+    folder = Path(folder)
+    written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     heading = f"# {outcome.study.title}\n\n"
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
     try:

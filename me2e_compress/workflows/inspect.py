@@ -18,7 +18,7 @@ _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Inspection(Result):
+class InspectResult(Result):
     """What a file holds.
 
     Attributes:
@@ -82,7 +82,7 @@ class Inspection(Result):
         return dataclasses.asdict(self)
 
 
-def inspect(model: str | Path, module_map: str | Path | None = None) -> Inspection:
+def inspect(model: str | Path, module_map: str | Path | None = None) -> InspectResult:
     """Read a graph and weigh its modules.
 
     Args:
@@ -100,7 +100,7 @@ def inspect(model: str | Path, module_map: str | Path | None = None) -> Inspecti
     inputs, outputs = graph.interface(loaded)
     items = itemise(loaded, modules, placed.module_of)
     costs = {item.module: item.macs for item in weigh(loaded, modules)}
-    return Inspection(
+    return InspectResult(
         path.name,
         graph.file_bytes(path),
         loaded.opset_imports.get(""),

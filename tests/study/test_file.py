@@ -7,6 +7,7 @@ import pytest
 from me2e_compress.errors import EvaluationError, GraphError, RecipeError, StudyError
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
+from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
 
@@ -46,10 +47,6 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-def named(text: str) -> Path:
-    raise GraphError(f"{text}: no such file; models that ship: highway")
-
-
 def test_everything_that_a_file_says(models: Path) -> None:
     study = load_study(write(models, GOOD))
 
@@ -80,9 +77,9 @@ def test_files_lie_beside_the_study(models: Path, tmp_path: Path) -> None:
 def test_a_name_that_is_no_file_is_one_that_ships(models: Path) -> None:
     text = GOOD.replace('"slow.onnx"', '"highway"')
 
-    study = load_study(write(models, text), lambda name: Path("/shipped") / name)
+    study = load_study(write(models, text))
 
-    assert study.schemes[0].policy == "/shipped/highway"
+    assert study.schemes[0].policy == str(shipped("highway"))
 
 
 def test_a_file_where_you_are_is_not_beside_the_study(
@@ -92,9 +89,8 @@ def test_a_file_where_you_are_is_not_beside_the_study(
     (tmp_path / "other.onnx").write_bytes((models / "slow.onnx").read_bytes())
     monkeypatch.chdir(tmp_path)
 
-    study = load_study(path)
-
-    assert study.schemes[0].policy == str(models / "other.onnx")
+    with pytest.raises(GraphError, match=r"^other\.onnx: no such file; models"):
+        load_study(path)
 
 
 def test_routes_of_the_command_line_win(models: Path) -> None:
@@ -153,7 +149,7 @@ def test_what_is_wrong_is_one_line(
     path = write(models, GOOD.replace(old, new))
 
     with pytest.raises(error, match=message) as caught:
-        load_study(path, named)
+        load_study(path)
     assert "\n" not in str(caught.value)
 
 
@@ -177,7 +173,7 @@ def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
     for name in ("frames", "held-out"):
         write_frames(tmp_path / name, command=np.array([3]))
 
-    study = load_study(write(tmp_path, block), lambda name: Path("/shipped") / name)
+    study = load_study(write(tmp_path, block))
 
     assert [scheme.name for scheme in study.schemes] == ["expert", "float", "int8"]
     assert study.conditions[1].traced

@@ -14,7 +14,7 @@ from me2e_compress.study.report import html
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
 from me2e_compress.study.report.findings import TIMES, findings, sure
-from me2e_compress.study.write import write
+from me2e_compress.study.write import write_study
 from tests.study.conftest import IDEAL, SLOW
 
 pytestmark = pytest.mark.xdist_group("study")
@@ -132,7 +132,7 @@ def test_what_is_shown_as_zero_is_no_difference(
 def test_files_are_written_beside_each_other(
     found: StudyResult, tmp_path: Path
 ) -> None:
-    written = write(found, tmp_path / "new" / "study")
+    written = write_study(found, tmp_path / "new" / "study")
 
     assert json.loads(written.record.read_text()) == found.to_json()
     assert written.tables.read_text().startswith("# Slow & <fast>\n\n**Scoreboard, ")
@@ -144,4 +144,4 @@ def test_a_folder_that_cannot_be_written(found: StudyResult, tmp_path: Path) -> 
     (tmp_path / "file").write_text("")
 
     with pytest.raises(StudyError, match="file/study: cannot be written"):
-        write(found, tmp_path / "file" / "study")
+        write_study(found, tmp_path / "file" / "study")

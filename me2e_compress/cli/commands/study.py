@@ -1,6 +1,5 @@
 """``me2e-compress study``."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +10,8 @@ from me2e_compress.cli.console import listening, say, show
 from me2e_compress.evaluators.highway.evaluation_options import engine_of
 from me2e_compress.study import load_study, run_study
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-from me2e_compress.study.write import write
-from me2e_compress.workflows.paths import check_folder, model_path
+from me2e_compress.study.write import write_study
+from me2e_compress.workflows.paths import check_folder
 
 Routes = Annotated[
     str | None, typer.Option(help="instead of the study's: all, N, ID,ID")
@@ -29,14 +28,13 @@ def study(
     as_json: given.Json = False,
 ) -> None:
     """Drive schemes under conditions and compare them; run it again to go on."""
-    ours = partial(model_path, beside=definition.parent)
-    asked = load_study(definition, ours, routes)
+    asked = load_study(definition, routes)
     check_folder(output, (definition,), (JSON, MARKDOWN, HTML))
     with listening() as listener:
         found = run_study(asked, output, engine_of(engine, workers, address), listener)
     chosen = () if routes is None else ("--routes", routes)
     words = ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
-    written = write(found, output, words)
+    written = write_study(found, output, words)
     show(found, as_json)
     if not as_json:
         say(f"{written.report}, {written.tables} and {written.record} are yours.")

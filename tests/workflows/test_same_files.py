@@ -1,0 +1,239 @@
+"""Every workflow is silent, and writes what its command writes."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import me2e_compress as me2e
+from me2e_compress.workflows.export import export_stack
+from me2e_compress.workflows.result import Result
+from me2e_compress.workflows.routes import RoutesOptions, examine_routes, make_routes
+from tests.cli.conftest import Command
+
+Call = Callable[[], object]
+MAP = "map.toml"
+STOP = "VanillaNonSignalizedTurnEncounterStopsign"
+
+CASES: dict[str, tuple[str, Call]] = {
+    "compress": (
+        "compress dense.onnx -o out.onnx -r full --frames frames --map map.toml",
+        lambda: me2e.compress(
+            "dense.onnx",
+            "out.onnx",
+            recipe="full",
+            frames="frames",
+            options=me2e.CompressOptions(module_map=MAP),
+        ),
+    ),
+    "compress, int8 by options": (
+        "compress dense.onnx -o out.onnx --scheme prediction --target onnxruntime"
+        " --frames frames --map map.toml",
+        lambda: me2e.compress(
+            "dense.onnx",
+            "out.onnx",
+            frames="frames",
+            options=me2e.CompressOptions(
+                scheme="prediction", target="onnxruntime", module_map=MAP
+            ),
+        ),
+    ),
+    "compress, passes": (
+        "compress in.onnx -o out.onnx --passes fold-constants,fuse-basic",
+        lambda: me2e.compress(
+            "in.onnx", "out.onnx", me2e.recipe.parse("fold-constants,fuse-basic")
+        ),
+    ),
+    "calibrate": (
+        "calibrate dense.onnx frames -o r.json --map map.toml --method mse"
+        " --tensorrt-cache c.cache --onnxruntime-table table",
+        lambda: me2e.calibrate(
+            "dense.onnx",
+            "frames",
+            "r.json",
+            me2e.CalibrateOptions(
+                method="mse",
+                module_map=MAP,
+                tensorrt_cache="c.cache",
+                onnxruntime_table="table",
+            ),
+        ),
+    ),
+    "plan": (
+        "plan dense.onnx -o p.json --map map.toml --rules tensorrt",
+        lambda: me2e.plan(
+            "dense.onnx",
+            "p.json",
+            options=me2e.PlanOptions(rules="tensorrt", module_map=MAP),
+        ),
+    ),
+    "compare": (
+        "compare dense.onnx dense.onnx frames",
+        lambda: me2e.compare("dense.onnx", "dense.onnx", "frames"),
+    ),
+    "inspect": (
+        "inspect dense.onnx --map map.toml",
+        lambda: me2e.inspect("dense.onnx", MAP),
+    ),
+    "lint": (
+        "lint dense.onnx --target onnxruntime",
+        lambda: me2e.lint("dense.onnx", me2e.LintOptions("onnxruntime")),
+    ),
+    "sensitivity": (
+        "sensitivity dense.onnx frames -o s.toml --map map.toml --limit 1",
+        lambda: me2e.measure_sensitivity(
+            "dense.onnx",
+            "frames",
+            "s.toml",
+            me2e.SensitivityOptions(limit=1.0, module_map=MAP),
+        ),
+    ),
+    "search": (
+        "search dense.onnx frames -o s.toml --map map.toml --max-mb 0.0004",
+        lambda: me2e.search(
+            "dense.onnx",
+            "frames",
+            "s.toml",
+            me2e.SearchOptions(max_mb=0.0004, module_map=MAP),
+        ),
+    ),
+    "export": (
+        "export highway -o hw.onnx",
+        lambda: export_stack("highway", "hw.onnx"),
+    ),
+    "record_frames": (
+        "frames vad-tiny -n 1 -o made --seed 3",
+        lambda: me2e.record_frames("vad-tiny", "made", me2e.FramesOptions(1, 3)),
+    ),
+    "evaluate": (
+        "evaluate blind -o results --routes ParkedObstacle_0 --latency fps:4",
+        lambda: me2e.evaluate(
+            "blind",
+            "results",
+            me2e.EvaluateOptions(routes="ParkedObstacle_0", latency="fps:4"),
+        ),
+    ),
+    "make_routes": (
+        f"routes -o routes.json --seed 4 --variants 1 --scenarios {STOP}",
+        lambda: make_routes("routes.json", RoutesOptions(4, 1, STOP)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_workflow_is_silent_and_writes_what_its_command_writes(
+    command: Command,
+    dense: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    line, call = CASES[name]
+    other = tmp_path_factory.mktemp("python") / "folder"
+    shutil.copytree(dense, other)
+    monkeypatch.chdir(dense)
+    assert command(*line.split()) == 0
+    capfd.readouterr()
+
+    monkeypatch.chdir(other)
+    call()
+
+    assert capfd.readouterr() == ("", "")
+    assert written(other) == written(dense)
+
+
+def test_a_profile_is_silent_and_its_trace_may_be_charged(
+    dense: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    found = me2e.profile(
+        dense / "dense.onnx",
+        dense / "frames",
+        dense / "trace.json",
+        me2e.ProfileOptions(samples=3),
+    )
+
+    assert capfd.readouterr() == ("", "")
+    assert json.loads((dense / "trace.json").read_text()) == found.to_json()
+    assert len(found.trace.samples_us) == 3
+
+
+def test_results_that_are_there_are_scored_silently(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    asked = me2e.EvaluateOptions(routes="ParkedObstacle_0")
+    driven = me2e.evaluate("blind", tmp_path / "results", asked)
+
+    found = me2e.score(tmp_path / "results")
+
+    assert capfd.readouterr() == ("", "")
+    assert found.scores == {str(tmp_path / "results"): driven.scores}
+
+
+def test_a_set_of_routes_is_examined_silently(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    make_routes(tmp_path / "routes.json", RoutesOptions(4, 1, STOP))
+
+    found = examine_routes(tmp_path / "routes.json")
+
+    assert capfd.readouterr() == ("", "")
+    assert found.refused == ()
+
+
+def test_who_listens_hears_every_stage(dense: Path) -> None:
+    heard = list[str]()
+    listener = me2e.Listener(lambda stage, *_: heard.append(stage))
+
+    me2e.measure_sensitivity(
+        dense / "dense.onnx",
+        dense / "frames",
+        dense / "s.toml",
+        me2e.SensitivityOptions(module_map=dense / MAP),
+        listener,
+    )
+
+    assert list(dict.fromkeys(heard)) == ["calibrate", "modules"]
+
+
+@pytest.mark.parametrize(
+    "name", ["compress", "calibrate", "plan", "compare", "inspect", "lint", "search"]
+)
+def test_a_result_shows_itself(
+    dense: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(dense)
+
+    found = CASES[name][1]()
+
+    assert isinstance(found, Result)
+    assert "\n" not in found.headline
+    assert found.headline.replace("->", "-&gt;") in found._repr_html_()
+    columns = {tuple(record) for record in found.records()}
+    assert len(columns) == (name != "lint")
+
+
+def test_a_result_says_in_one_line_what_it_is(dense: Path) -> None:
+    found: Result = me2e.inspect(dense / "dense.onnx")
+
+    assert repr(found) == "<InspectResult: dense.onnx: 0.00 MB, opset 17>"
+
+
+def written(folder: Path) -> dict[str, object]:
+    """Read every file; of a report all but the seconds, of episodes all but logs."""
+    return {
+        str(path.relative_to(folder)): content(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".log"
+    }
+
+
+def content(path: Path) -> object:
+    if not path.name.endswith(".report.json"):
+        return path.read_bytes()
+    record = json.loads(path.read_text(encoding="utf-8"))
+    for step in record["steps"]:
+        del step["seconds"]
+    return record
