@@ -90,6 +90,7 @@ def test_macs_of_every_module_are_torch_s(vad: "Reference") -> None:
     modules = ModuleMap.load("vad")
     context = Context(modules)
     model = ImportNormalize().run(vad.model.clone(), context).model
+    graph.infer_shapes(model)
     model = FoldConstants(through_compute=False).run(model, context).model
     graph.infer_shapes(model)
     items = itemise(model, modules, provenance.module_of, graph.macs)

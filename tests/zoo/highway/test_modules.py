@@ -7,6 +7,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
+from me2e_compress.manager import PassManager
 from me2e_compress.modules import detect
 from me2e_compress.passes import Context
 from me2e_compress.passes.ablate_modules import AblateModules
@@ -28,10 +29,9 @@ MADE_BY = {
 @pytest.fixture(scope="module")
 def folded(exported: Path) -> ir.Model:
     model = graph.load(exported)
-    context = Context(detect(model))
-    for step in (ImportNormalize(), FoldConstants(through_compute=False)):
-        model = step.run(model, context).model
-    return model
+    steps = (ImportNormalize(), FoldConstants(through_compute=False))
+    manager = PassManager(steps, verify_frames=0)
+    return manager.run(model, Context(detect(model))).model
 
 
 def test_every_output_is_of_its_own_module(folded: ir.Model) -> None:
