@@ -12,13 +12,13 @@ from me2e_compress.graph.files import (
     save,
     sha256_of,
 )
-from me2e_compress.graph.interface import Port, interface
 from me2e_compress.graph.layers import (
     CONVOLUTIONS,
     WEIGHTED,
     bias_of,
     channel_axis,
 )
+from me2e_compress.graph.macs import macs, macs_counter, total_macs
 from me2e_compress.graph.nodes import (
     array_of,
     graphs_of,
@@ -31,7 +31,7 @@ from me2e_compress.graph.nodes import (
 )
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.graph.shapes import infer_shapes, open_shape, rank_of, static_shape
-from me2e_compress.graph.size_of import Size, macs, node_count, size
+from me2e_compress.graph.summary import Port, Size, interface, node_count, size
 
 __all__ = [
     "CONVOLUTIONS",
@@ -53,6 +53,7 @@ __all__ = [
     "is_standard",
     "load",
     "macs",
+    "macs_counter",
     "node_count",
     "nodes_of",
     "open_shape",
@@ -63,4 +64,5 @@ __all__ = [
     "sha256_of",
     "size",
     "static_shape",
+    "total_macs",
 ]

@@ -1,7 +1,7 @@
 """What a graph holds: module by module, and against a state dict."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import onnx_ir as ir
 
@@ -22,7 +22,9 @@ class Item:
         parameters: elements of its initializers that hold weights: of any type but
             int32, int64, bool and string, which hold shapes, indices and masks.
         weight_bytes: bytes of all its initializers.
-        macs: multiply-accumulates; None where one of its nodes' is not known, or
+        macs: multiply-accumulates of the nodes whose count is known: where others are
+            unknown, a lower bound, and None instead of 0; None where nobody counts.
+        unknown_macs_nodes: how many of its nodes are not in ``macs``; None where
             nobody counts.
     """
 
@@ -31,6 +33,7 @@ class Item:
     parameters: int
     weight_bytes: int
     macs: int | None
+    unknown_macs_nodes: int | None
 
 
 def itemise(
@@ -50,23 +53,29 @@ def itemise(
         module_of: the module of a node: an assignment's, or what imported nodes say.
         macs: counts a node's multiply-accumulates, None where it cannot.
     """
-    nodes = dict.fromkeys(modules.names(), 0)
-    counts: dict[str, int | None] = dict.fromkeys(modules.names(), 0 if macs else None)
+    nodes: dict[str, list[ir.Node]] = {name: [] for name in modules.names()}
     for node in model.graph.all_nodes():
-        module = module_of(node)
-        nodes[module] = nodes.get(module, 0) + 1
-        so_far = counts.setdefault(module, 0 if macs else None)
-        count = None if macs is None else macs(node)
-        counts[module] = None if so_far is None or count is None else so_far + count
+        nodes.setdefault(module_of(node), []).append(node)
     elements, size = dict.fromkeys(nodes, 0), dict.fromkeys(nodes, 0)
     for owner, tensor in _owned(model, modules, module_of):
         size[owner] = size.get(owner, 0) + tensor.nbytes
         if tensor.dtype not in _NOT_WEIGHTS:
             elements[owner] = elements.get(owner, 0) + tensor.size
     return tuple(
-        Item(module, nodes[module], elements[module], size[module], counts[module])
-        for module in nodes
+        Item(module, len(own), elements[module], size[module], *_total(own, macs))
+        for module, own in nodes.items()
     )
+
+
+def _total(
+    nodes: Sequence[ir.Node], macs: Callable[[ir.Node], int | None] | None
+) -> tuple[int | None, int | None]:
+    """Add up the MACs of nodes; return the sum and how many nodes it leaves out."""
+    if macs is None:
+        return None, None
+    counts = [macs(node) for node in nodes]
+    known, unknown = sum(count or 0 for count in counts), counts.count(None)
+    return (known if known or not unknown else None), unknown
 
 
 def _owner_of(

@@ -5,7 +5,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from me2e_compress.manager import Report, Step, Verification
-from me2e_compress.workflows.result import Result, Table, megabytes, number, table
+from me2e_compress.workflows.result import Result, Table, megabytes, table
+
+AT_LEAST = "≥: nodes of unknown MACs, such as plugins, are not counted"
+"""What a table says of MACs that are a lower bound."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -57,6 +60,7 @@ class CompressResult(Result):
                 "nodes": step.after.nodes,
                 "weight_bytes": step.after.weight_bytes,
                 "macs": step.after.macs,
+                "unknown_macs_nodes": step.after.unknown_macs_nodes,
                 "seconds": step.seconds,
             }
             for step in self.report.steps
@@ -74,7 +78,9 @@ def beside(output: Path, what: str) -> Path:
 
 def steps_table(steps: Sequence[Step]) -> Table:
     """Show pass by pass what changed and what it cost, and what the passes say."""
-    notes = (f"{step.name}: {note}" for step in steps for note in step.notes)
+    notes = [f"{step.name}: {note}" for step in steps for note in step.notes]
+    if any(step.after.unknown_macs_nodes for step in steps):
+        notes.append(AT_LEAST)
     return table(
         "Pass by pass",
         ("pass", "changes", "nodes", "weights MB", "GMACs", "CPU s"),
@@ -85,7 +91,7 @@ def steps_table(steps: Sequence[Step]) -> Table:
                 f"{step.before.nodes} → {step.after.nodes}",
                 f"{megabytes(step.before.weight_bytes)} →"
                 f" {megabytes(step.after.weight_bytes)}",
-                giga(step.after.macs),
+                giga(step.after.macs, step.after.unknown_macs_nodes),
                 f"{step.seconds:.2f}",
             )
             for step in steps
@@ -94,9 +100,17 @@ def steps_table(steps: Sequence[Step]) -> Table:
     )
 
 
-def giga(count: int | None) -> str:
-    """Write a count in billions."""
-    return number(None if count is None else count / 1e9, ".2f")
+def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
+    """Write MACs in billions, as a lower bound where those of some nodes are unknown.
+
+    Args:
+        macs: those that are known; None if none are.
+        unknown: of how many nodes they are not known.
+        form: of the number.
+    """
+    if macs is None:
+        return "-"
+    return ("≥ " if unknown else "") + format(macs / 1e9, form)
 
 
 def verification_table(verifications: Iterable[Verification]) -> Table:

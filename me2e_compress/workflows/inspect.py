@@ -10,7 +10,7 @@ from me2e_compress.graph import Port, provenance
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
-from me2e_compress.workflows.compress_result import giga
+from me2e_compress.workflows.compress_result import AT_LEAST, giga
 from me2e_compress.workflows.paths import load_map, model_path
 from me2e_compress.workflows.result import Result, Table, megabytes, number, table
 
@@ -31,6 +31,9 @@ class InspectResult(Result):
         outputs: what it answers.
         modules: module by module.
         rules: how many nodes each rule of the map placed.
+        macs: multiply-accumulates of the nodes whose count is known, all modules
+            together; None if none is.
+        unknown_macs_nodes: how many nodes are not in ``macs``.
     """
 
     file: str
@@ -42,6 +45,8 @@ class InspectResult(Result):
     outputs: tuple[Port, ...]
     modules: tuple[Item, ...]
     rules: dict[str, int]
+    macs: int | None
+    unknown_macs_nodes: int
 
     @property
     def headline(self) -> str:
@@ -62,16 +67,26 @@ class InspectResult(Result):
                 number(item.nodes),
                 number(item.parameters),
                 megabytes(item.weight_bytes),
-                number(None if item.macs is None else item.macs / 1e9, ".3f"),
+                giga(item.macs, item.unknown_macs_nodes, ".3f"),
             )
             for item in self.modules
         ]
         rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
+        note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
         columns = ("module", "nodes", "parameters", "MB", "GMACs")
         return (
             table("Interface", ("", "name", "type", "shape"), ports, words=4),
-            table(f"Modules (map {self.map})", columns, rows, f"nodes placed: {rules}"),
+            table(f"Modules (map {self.map})", columns, rows, note),
         )
+
+    def _total_macs(self) -> str:
+        """Write the MACs of the graph, and of how many nodes they are not known."""
+        total = giga(self.macs, 0, ".3f")
+        if not self.unknown_macs_nodes:
+            return total
+        known = "" if self.macs is None else f"at least {total}, "
+        nodes = "node" if self.unknown_macs_nodes == 1 else "nodes"
+        return f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted"
 
     def records(self) -> list[dict[str, object]]:
         """Return a row a module."""
@@ -99,7 +114,9 @@ def inspect(model: str | Path, module_map: str | Path | None = None) -> InspectR
     placed = assign(loaded, modules)
     inputs, outputs = graph.interface(loaded)
     items = itemise(loaded, modules, placed.module_of)
-    costs = {item.module: item.macs for item in weigh(loaded, modules)}
+    costs = {item.module: item for item in weigh(loaded, modules)}
+    total = sum(item.macs or 0 for item in costs.values())
+    unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
     return InspectResult(
         path.name,
         graph.file_bytes(path),
@@ -108,8 +125,19 @@ def inspect(model: str | Path, module_map: str | Path | None = None) -> InspectR
         modules.name,
         inputs,
         outputs,
-        tuple(dataclasses.replace(i, macs=costs.get(i.module)) for i in items),
+        tuple(_with_cost(item, costs.get(item.module)) for item in items),
         {str(rule): count for rule, count in placed.rules().items()},
+        total if total or not unknown else None,
+        unknown,
+    )
+
+
+def _with_cost(item: Item, cost: Item | None) -> Item:
+    """Return what a module holds as it stands in the file, with its MACs."""
+    if cost is None:
+        return item
+    return dataclasses.replace(
+        item, macs=cost.macs, unknown_macs_nodes=cost.unknown_macs_nodes
     )
 
 
@@ -119,7 +147,7 @@ def weigh(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
         manager = PassManager(recipe.parse(_SHAPES), verify_frames=0)
         model = manager.run(model, Context(modules)).model
     graph.infer_shapes(model)
-    return itemise(model, modules, provenance.module_of, graph.macs)
+    return itemise(model, modules, provenance.module_of, graph.macs_counter(model))
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -157,11 +185,13 @@ class ModuleChanges(Result):
                     f"{item.nodes} → {nodes}",
                     number(item.parameters),
                     f"{megabytes(item.weight_bytes)} → {megabytes(size)}",
-                    f"{giga(item.macs)} → {giga(now.macs if now else 0)}",
+                    f"{_gmacs(item)} → {_gmacs(now)}",
                 )
             )
         columns = ("module", "nodes", "parameters", "weights MB", "GMACs")
         note = "before: once imported, its shape arithmetic done"
+        if any(item.unknown_macs_nodes for item in (*self.before, *self.after)):
+            note += f"\n{AT_LEAST}"
         return (table("Module by module", columns, rows, note),)
 
     def records(self) -> list[dict[str, object]]:
@@ -184,6 +214,10 @@ class ModuleChanges(Result):
     def _pairs(self) -> list[tuple[Item, Item | None]]:
         held = {item.module: item for item in self.after}
         return [(item, held.get(item.module)) for item in self.before]
+
+
+def _gmacs(item: Item | None) -> str:
+    return giga(0) if item is None else giga(item.macs, item.unknown_macs_nodes)
 
 
 def compare_modules(before: Path, after: Path) -> ModuleChanges:

@@ -2,9 +2,11 @@ import json
 import re
 from pathlib import Path
 
+import onnx_ir as ir
 import pytest
 import typer.main
 
+from me2e_compress import graph
 from me2e_compress.cli.app import app
 from tests.cli.conftest import Command, strict
 
@@ -45,6 +47,44 @@ def test_inspect_for_people(
 ) -> None:
     assert command("inspect", files / "in.onnx", "--map", files / "map.toml") == 0
     assert "3 by scope" in capsys.readouterr().out
+
+
+@pytest.fixture
+def plugin(files: Path) -> Path:
+    """A graph in which a plugin reads a product of 2e9 MACs."""
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
+        "m (float[1000,1000] camera, float[1000,2000] w) => (float[1000,2000] y)"
+        ' { ["/backbone/MatMul"] a = MatMul(camera, w)'
+        ' ["/plan_head/Rotate"] y = trt.Rotate(a) }'
+    )
+    graph.save(model, files / "plugin.onnx")
+    return files / "plugin.onnx"
+
+
+def test_inspect_counts_a_plugin_s_macs_as_unknown(
+    command: Command, plugin: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--map", plugin.with_name("map.toml"), "--json")
+    assert command("inspect", plugin, *words) == 0
+    found = json.loads(capsys.readouterr().out)
+    costs = {
+        item["module"]: (item["macs"], item["unknown_macs_nodes"])
+        for item in found["modules"]
+    }
+    assert costs == {
+        "backbone": (2_000_000_000, 0),
+        "occ": (0, 0),
+        "planner": (None, 1),
+    }
+    assert (found["macs"], found["unknown_macs_nodes"]) == (2_000_000_000, 1)
+
+
+def test_inspect_says_that_a_sum_is_a_lower_bound(
+    command: Command, plugin: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("inspect", plugin, "--map", plugin.with_name("map.toml")) == 0
+    assert "at least 2.000, 1 node not counted" in capsys.readouterr().out
 
 
 def test_a_graph_compared_with_itself_is_equal(

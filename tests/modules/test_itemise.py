@@ -39,22 +39,46 @@ def test_shared_weights_count_once_and_sizes_are_no_parameters() -> None:
     graph = model()
     found = itemise(graph, MAP, assign(graph, MAP).module_of, two_each)
     assert found == (
-        Item("neck", nodes=1, parameters=2, weight_bytes=8, macs=2),
-        Item("det", nodes=3, parameters=2, weight_bytes=16, macs=6),
-        Item("occ", nodes=0, parameters=0, weight_bytes=0, macs=0),
+        Item(
+            "neck", nodes=1, parameters=2, weight_bytes=8, macs=2, unknown_macs_nodes=0
+        ),
+        Item(
+            "det", nodes=3, parameters=2, weight_bytes=16, macs=6, unknown_macs_nodes=0
+        ),
+        Item(
+            "occ", nodes=0, parameters=0, weight_bytes=0, macs=0, unknown_macs_nodes=0
+        ),
     )
 
 
-def test_macs_are_unknown_where_one_of_them_is() -> None:
+def cost(item: Item) -> tuple[int | None, int | None]:
+    return item.macs, item.unknown_macs_nodes
+
+
+def test_unknown_macs_leave_a_lower_bound_and_say_how_many_nodes_it_lacks() -> None:
     graph = model()
     placed = assign(graph, MAP).module_of
 
     def unknown_sub(node: ir.Node) -> int | None:
         return None if node.op_type == "Sub" else 1
 
-    macs = {item.module: item.macs for item in itemise(graph, MAP, placed, unknown_sub)}
-    assert macs == {"neck": 1, "det": None, "occ": 0}
-    assert all(item.macs is None for item in itemise(graph, MAP, placed))
+    found = itemise(graph, MAP, placed, unknown_sub)
+    assert list(map(cost, found)) == [(1, 0), (2, 1), (0, 0)]
+
+
+def test_macs_of_which_none_is_known_are_not_zero() -> None:
+    graph = model()
+    placed = assign(graph, MAP).module_of
+
+    found = itemise(graph, MAP, placed, lambda node: None)
+    assert list(map(cost, found)) == [(None, 1), (None, 3), (0, 0)]
+
+
+def test_macs_that_nobody_counts_are_not_measured() -> None:
+    graph = model()
+
+    found = itemise(graph, MAP, assign(graph, MAP).module_of)
+    assert list(map(cost, found)) == [(None, None)] * 3
 
 
 def test_int8_weights_are_parameters() -> None:

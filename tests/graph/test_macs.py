@@ -1,0 +1,137 @@
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17, "f" : 1, "trt" : 1]>\n'
+
+
+def only_node(text: str) -> ir.Node:
+    model = ir.from_onnx_text(HEAD + text)
+    graph.infer_shapes(model)
+    return model.graph[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "m (float[2,3,8,8] x, float[4,3,3,3] w) => (float[2,4,6,6] y)"
+            " { y = Conv(x, w) }",
+            2 * 4 * 6 * 6 * 3 * 3 * 3,
+        ),
+        (
+            "m (float[1,6,8,8] x, float[6,1,3,3] w) => (float[1,6,6,6] y)"
+            " { y = Conv<group=6>(x, w) }",
+            6 * 6 * 6 * 3 * 3,
+        ),
+        (
+            "m (float[1,3,4,4] x, float[3,5,2,2] w) => (float[1,5,5,5] y)"
+            " { y = ConvTranspose(x, w) }",
+            3 * 4 * 4 * 5 * 2 * 2,
+        ),
+        (
+            "m (float[7,4] x, float[4,5] w) => (float[7,5] y) { y = Gemm(x, w) }",
+            7 * 4 * 5,
+        ),
+        (
+            "m (float[4,7] x, float[5,4] w) => (float[7,5] y)"
+            " { y = Gemm<transA=1, transB=1>(x, w) }",
+            7 * 4 * 5,
+        ),
+        (
+            "m (float[2,8,10,4] x, float[2,8,4,6] w) => (float[2,8,10,6] y)"
+            " { y = MatMul(x, w) }",
+            2 * 8 * 10 * 4 * 6,
+        ),
+        ("m (float[9] x, float[9] w) => (float y) { y = MatMul(x, w) }", 9),
+        (
+            "m (float[2,7,4] x, float[2,4,5] w) => (float[2,7,5] y)"
+            ' { y = Einsum<equation="bij, bjk -> bik">(x, w) }',
+            2 * 7 * 4 * 5,
+        ),
+        (
+            'm (float[7,4] x) => (float[4,7] y) { y = Einsum<equation="ij->ji">(x) }',
+            0,
+        ),
+        (
+            "m (uint8[1,3,8,8] x, float s, uint8 z, int8[4,3,3,3] w)"
+            " => (uint8[1,4,6,6] y) { y = QLinearConv(x, s, z, w, s, z, s, z) }",
+            4 * 6 * 6 * 3 * 3 * 3,
+        ),
+        ("m (float[9] x) => (float[9] y) { y = Relu(x) }", 0),
+    ],
+)
+def test_macs_by_hand(text: str, expected: int) -> None:
+    assert graph.macs(only_node(text)) == expected
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "m (float[N,4] x, float[4,5] w) => (float[N,5] y) { y = MatMul(x, w) }",
+        "m (float[1,2,4,4] x, float t) => (float[1,2,4,4] y) { y = RotateTRT(x, t) }",
+        "m (float[2] x) => (float[2] y) { y = trt.Rotate(x) }",
+        "m (float[3,1,4] x, float[1,8,4] w, float[1,8,2] r)"
+        " => (float[3,1,1,2] y) { y = LSTM<hidden_size=2>(x, w, r) }",
+        "m (float[2,3] x, float[3,4] w) => (float[2,4] y)"
+        ' { y = Einsum<equation="...j,jk->...k">(x, w) }',
+        "m (int64 n, bool c, float[2,2] x) => (float[2,2] y) {"
+        " y = Loop (n, c, x) <body = b (int64 i, bool d, float[2,2] a)"
+        " => (bool d, float[2,2] e) { e = MatMul(a, a) }> }",
+    ],
+    ids=["open shape", "plugin", "domain", "uncounted", "ellipsis", "loop"],
+)
+def test_macs_that_are_not_known(text: str) -> None:
+    assert graph.macs(only_node(text)) is None
+
+
+def test_a_plugin_leaves_the_sum_a_lower_bound() -> None:
+    model = ir.from_onnx_text(
+        HEAD + "m (float[2,3] x, float[3,4] w) => (float[2,4] y)"
+        " { a = MatMul(x, w)\n y = trt.Rotate(a) }"
+    )
+    graph.infer_shapes(model)
+    found = graph.size(model)
+    assert (found.macs, found.unknown_macs_nodes) == (2 * 3 * 4, 1)
+
+
+def test_a_sum_of_which_nothing_is_known_is_not_zero() -> None:
+    model = ir.from_onnx_text(
+        HEAD + "m (float[2] x) => (float[2] y) { y = trt.Rotate(x) }"
+    )
+    found = graph.size(model)
+    assert (found.macs, found.unknown_macs_nodes) == (None, 1)
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"), [("y = Relu(x)", (0, 0)), ("y = MatMul(x, x)", (None, 1))]
+)
+def test_a_function_is_worth_its_body(
+    body: str, expected: tuple[int | None, int]
+) -> None:
+    model = ir.from_onnx_text(
+        HEAD + "m (float[2,2] x) => (float[2,2] y) { y = f.local(x) }\n"
+        '<domain: "f", opset_import: ["" : 17]> local (x) => (y)'
+        f" {{ {body} }}"
+    )
+    found = graph.size(model)
+    assert (found.macs, found.unknown_macs_nodes) == expected
+
+
+def test_a_function_counts_at_every_call() -> None:
+    model = ir.from_onnx_text(
+        HEAD + "m (float[2] x) => (float[2] y) { a = f.twice(x)\n y = f.twice(a) }\n"
+        '<domain: "f", opset_import: ["" : 17]> twice (x) => (y)'
+        " { a = Relu(x)\n y = Relu(a) }"
+    )
+    assert graph.node_count(model) == 4
+
+
+def test_nodes_in_branches_count() -> None:
+    model = ir.from_onnx_text(
+        HEAD + "m (bool c, float[2] x) => (float[2] y) {"
+        " y = If(c) <then_branch = t () => (float[2] a) { a = Relu(x) },"
+        " else_branch = e () => (float[2] b) { b = Neg(x) }> }"
+    )
+    assert graph.node_count(model) == 3
