@@ -42,7 +42,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.constant_values import constant_values
-from me2e_compress.runtime.interleaved import race
+from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers
 
@@ -205,9 +205,9 @@ def measure(
             rows[name] = Row(**found)
     for _ in range(chosen.rounds):
         for name, row in rows.items():
-            lap = ask(own(subject, "time", name, chosen))
-            row.cpu_s += lap["cpu_s"]
-            row.wall_s += lap["wall_s"]
+            found = ask(own(subject, "time", name, chosen))
+            row.cpu_s += found["cpu_s"]
+            row.wall_s += found["wall_s"]
     return rows
 
 
@@ -258,8 +258,8 @@ def clock(chosen: argparse.Namespace) -> dict[str, tuple[float, ...]]:
     subject = subjects.at(chosen.out)
     session = Session(path_of(subject, chosen.file), threads=chosen.threads)
     frames = [CalibrationSet(subject.held_out)[0]]
-    lap = race({chosen.file: session}, frames, RUNS)[chosen.file]
-    return {"cpu_s": lap.cpu_s, "wall_s": lap.wall_s}
+    found = time_interleaved({chosen.file: session}, frames, RUNS)[chosen.file]
+    return {"cpu_s": found.cpu_s, "wall_s": found.wall_s}
 
 
 def show(rows: dict[str, Row], missing: dict[str, str]) -> None:

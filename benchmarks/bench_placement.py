@@ -45,7 +45,7 @@ from me2e_compress.quantization.plan import (
 from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
-from me2e_compress.runtime.interleaved import race
+from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import tensorrt
 
@@ -214,8 +214,8 @@ def report(
         name: {e.name: e.sqnr_db for e in compare(reference, each, held_out).outputs}
         for name, each in sessions.items()
     }
-    laps = race(sessions, [held_out[0]], rounds)
-    ours = min(laps["ours"].cpu_s)
+    times = time_interleaved(sessions, [held_out[0]], rounds)
+    ours = min(times["ours"].cpu_s)
     outputs = list(quality["ours"])
     print(
         "\nSQNR in dB; rows below the first: ModelOpt's decision for that rule alone,"
@@ -227,7 +227,7 @@ def report(
             f"{decibels[n]:7.1f} ({quality['ours'][n] - decibels[n]:+5.1f})"
             for n in outputs
         ]
-        cpu = min(laps[name].cpu_s)
+        cpu = min(times[name].cpu_s)
         print(
             f"{name:20} {chosen[name]:5} "
             + " ".join(f"{cell:>16}" for cell in cells)

@@ -1,4 +1,4 @@
-"""Models timed side by side, so that a noisy machine is noisy to all of them."""
+"""Interleaved timing: models measured in turn, so that noise falls on all of them."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,10 +8,9 @@ from statistics import median
 from time import perf_counter, process_time
 
 from me2e_compress import graph
-from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.profile import WARM_UP, TimedSession, processor
+from me2e_compress.runtime.profile import WARM_UP, TimedSession, check_work, processor
 from me2e_compress.runtime.session import Session, replay
 
 BLOCK = 10
@@ -22,8 +21,8 @@ RE_WARM = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class Lap:
-    """What one model took, round by round.
+class RunTimes:
+    """Times of one model, round by round.
 
     Attributes:
         wall_s: seconds on the clock.
@@ -40,23 +39,23 @@ class Lap:
 
     @property
     def best_wall_s(self) -> float:
-        """Least wall time, seconds: what an idle machine would take."""
+        """Least wall time, seconds: that of an idle machine."""
         return min(self.wall_s)
 
 
-def race(
+def time_interleaved(
     sessions: Mapping[str, Session],
     frames: Sequence[Frame],
     rounds: int,
     on_run: Callable[[int, int, str], None] | None = None,
-) -> dict[str, Lap]:
+) -> dict[str, RunTimes]:
     """Time one frame of every model in turn, A B C A B C, after a round unmeasured.
 
     Args:
         sessions: the models by name, all with the same number of threads.
         frames: the first one is run, with recurrent state at zeros.
         rounds: how often each is measured.
-        on_run: told runs done, runs in all and the model's name.
+        on_run: called with runs done, runs in all and the model's name.
     """
     wall: dict[str, list[float]] = {name: [] for name in sessions}
     cpu: dict[str, list[float]] = {name: [] for name in sessions}
@@ -71,10 +70,10 @@ def race(
             if turn:
                 wall[name].append(perf_counter() - start)
                 cpu[name].append(process_time() - used)
-    return {name: Lap(tuple(wall[name]), tuple(cpu[name])) for name in sessions}
+    return {name: RunTimes(tuple(wall[name]), tuple(cpu[name])) for name in sessions}
 
 
-def traces_in_turn(
+def record_traces(
     models: Mapping[str, Path],
     frames: Frames,
     *,
@@ -90,22 +89,18 @@ def traces_in_turn(
 
     Args:
         models: ONNX files by name.
-        frames: what they see.
+        frames: the recording.
         samples: latencies of each model.
         warm_up: inferences of each before the first block.
         threads: of onnxruntime.
-        on_sample: told samples done, samples in all and the model's name.
+        on_sample: called with samples done, samples in all and the model's name.
 
     Raises:
         EvaluationError: there is nothing to measure.
         GraphError: a model cannot be run.
         FramesError: a frame does not fit.
     """
-    if samples < 1 or warm_up < 0 or not len(frames):
-        raise EvaluationError(
-            f"{samples} samples after {warm_up} of warm-up on {len(frames)} frames: "
-            "at least one sample and one frame are needed"
-        )
+    check_work(samples, warm_up, frames)
     sessions = {
         name: TimedSession(path, threads=threads) for name, path in models.items()
     }
@@ -122,15 +117,15 @@ def traces_in_turn(
             _advance(runs[name], RE_WARM + block)
             kept[name] += session.taken_us[-block:]
             on_sample(done * len(models) + place * block, samples * len(models), name)
-    machine = machine_in_turn(threads)
+    machine = describe_machine(threads)
     return {
         name: LatencyTrace(graph.sha256_of(path), machine, tuple(kept[name]))
         for name, path in models.items()
     }
 
 
-def machine_in_turn(threads: int) -> str:
-    """Name what `traces_in_turn` measures on: processor and threads, in words."""
+def describe_machine(threads: int) -> str:
+    """Return the machine of `record_traces`, in words: processor and threads."""
     return f"{processor()}, onnxruntime on {threads or 'all'} threads, in turn"
 
 

@@ -43,11 +43,7 @@ def profile(
         FramesError: A frame does not fit.
     """
     wanted = len(frames) if samples is None else samples
-    if wanted < 1 or warm_up < 0 or not len(frames):
-        raise EvaluationError(
-            f"{wanted} samples after {warm_up} of warm-up on {len(frames)} frames: "
-            "at least one sample and one frame are needed"
-        )
+    check_work(wanted, warm_up, frames)
     session = TimedSession(model, threads=threads)
     endless = chain.from_iterable(repeat(frames))
     for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
@@ -55,6 +51,19 @@ def profile(
     machine = f"{processor()}, onnxruntime on {threads or 'all'} threads"
     taken = tuple(session.taken_us[warm_up:])
     return LatencyTrace(graph.sha256_of(model), machine, taken)
+
+
+def check_work(samples: int, warm_up: int, frames: Frames) -> None:
+    """Check that there is something to measure.
+
+    Raises:
+        EvaluationError: no sample, no frame, or a negative warm-up.
+    """
+    if samples < 1 or warm_up < 0 or not len(frames):
+        raise EvaluationError(
+            f"{samples} samples after {warm_up} of warm-up on {len(frames)} frames: "
+            "at least one sample and one frame are needed"
+        )
 
 
 class TimedSession(Session):

@@ -10,7 +10,7 @@ from me2e_compress.driving.latency import (
     parse_latency,
 )
 from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.interleaved import machine_in_turn, traces_in_turn
+from me2e_compress.runtime.interleaved import describe_machine, record_traces
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.study.definition import Condition, Scheme, Study
 from me2e_compress.study.prepared import PreparedScheme
@@ -128,7 +128,7 @@ def _measured(
         return {}
     name = baseline.scheme.name
     timed = missing if kept is None else (baseline, *missing)
-    found = traces_in_turn(
+    found = record_traces(
         {each.scheme.name: each.model for each in timed if each.model is not None},
         frames,
         samples=study.timing.samples,
@@ -173,7 +173,7 @@ def _other(
     trace: LatencyTrace, each: PreparedScheme, frames: str | None, study: Study
 ) -> str | None:
     """Say what a trace is of that this study does not measure; None: the same."""
-    wanted, machine = study.timing.samples, machine_in_turn(study.timing.threads)
+    wanted, machine = study.timing.samples, describe_machine(study.timing.threads)
     if trace.model_sha256 != each.sha256:
         return "another model"
     if len(trace.samples_us) != wanted:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.runtime.interleaved import Lap, race
+from me2e_compress.runtime.interleaved import RunTimes, time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
@@ -29,13 +29,13 @@ class FilesResult(Result):
     """Size and latency of files, measured in turn on one frame.
 
     Attributes:
-        laps: by file, the first is what the others are held against.
+        times: by file, the others are compared with the first.
         threads: of onnxruntime.
         rounds: how often each was run.
         ending: what the user has now, in words.
     """
 
-    laps: dict[Path, Lap]
+    times: dict[Path, RunTimes]
     threads: int
     rounds: int
     ending: str
@@ -47,17 +47,17 @@ class FilesResult(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Return a row a file."""
-        first = next(iter(self.laps.values()))
+        first = next(iter(self.times.values()))
         rows = [
             (
                 path.name,
                 megabytes(graph.file_bytes(path)),
-                f"{lap.median_wall_s:.3f}",
-                f"{lap.best_wall_s:.3f}",
-                f"{min(lap.cpu_s):.3f}",
-                f"{lap.median_wall_s / first.median_wall_s:.3f}",
+                f"{each.median_wall_s:.3f}",
+                f"{each.best_wall_s:.3f}",
+                f"{min(each.cpu_s):.3f}",
+                f"{each.median_wall_s / first.median_wall_s:.3f}",
             )
-            for path, lap in self.laps.items()
+            for path, each in self.times.items()
         ]
         how = f"{self.threads} threads, {self.rounds} rounds in turn"
         return (
@@ -76,11 +76,11 @@ class FilesResult(Result):
             {
                 "file": path.name,
                 "bytes": graph.file_bytes(path),
-                "median_wall_s": lap.median_wall_s,
-                "best_wall_s": lap.best_wall_s,
-                "cpu_s": min(lap.cpu_s),
+                "median_wall_s": each.median_wall_s,
+                "best_wall_s": each.best_wall_s,
+                "cpu_s": min(each.cpu_s),
             }
-            for path, lap in self.laps.items()
+            for path, each in self.times.items()
         ]
 
     def to_json(self) -> object:
@@ -153,10 +153,10 @@ class StackDemo:
         }
         frame = CalibrationSet(self._held_out)[0]
         told = partial(listener.on_progress, "latency")
-        laps = race(sessions, [frame], self.rounds, told)
+        times = time_interleaved(sessions, [frame], self.rounds, told)
         report = self._small.with_name(self._small.stem + ".report.json")
         return FilesResult(
-            {paths[name]: lap for name, lap in laps.items()},
+            {paths[name]: each for name, each in times.items()},
             self.threads,
             self.rounds,
             f"{self._small} and {report} are yours.",

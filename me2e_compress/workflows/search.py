@@ -8,7 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import RecipeError
-from me2e_compress.runtime.interleaved import race
+from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity import Budget, Candidate, Int8Choice, Trials
 from me2e_compress.sensitivity import search as find
@@ -154,4 +154,4 @@ def _seconds(trials: Trials, threads: int, made: ir.Model) -> float:
     """Return the least wall time of a frame, of 5."""
     session = Session(made, threads=threads, release=True)
     first = next(iter(trials.reference.frames))
-    return race({"int8": session}, [first], 5)["int8"].best_wall_s
+    return time_interleaved({"int8": session}, [first], 5)["int8"].best_wall_s

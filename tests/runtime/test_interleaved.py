@@ -7,7 +7,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, FramesError
-from me2e_compress.runtime.interleaved import BLOCK, traces_in_turn
+from me2e_compress.runtime.interleaved import BLOCK, record_traces
 from tests.cli.conftest import write_frames
 
 TEXT = """<ir_version: 8, opset_import: ["" : 17]>
@@ -34,7 +34,7 @@ def test_every_model_has_its_samples(
 ) -> None:
     told = list[tuple[int, int, str]]()
 
-    traces = traces_in_turn(
+    traces = record_traces(
         models,
         CalibrationSet(tmp_path / "frames"),
         samples=samples,
@@ -58,11 +58,11 @@ def test_nothing_to_measure(
     frames = CalibrationSet(tmp_path / "frames")
 
     with pytest.raises(EvaluationError, match="at least one sample and one frame"):
-        traces_in_turn(models, frames, samples=samples, warm_up=warm_up)
+        record_traces(models, frames, samples=samples, warm_up=warm_up)
 
 
 def test_frames_that_do_not_fit(models: dict[str, Path], tmp_path: Path) -> None:
     write_frames(tmp_path / "wrong", x=np.ones(4, np.float32))
 
     with pytest.raises(FramesError, match="frame 0"):
-        traces_in_turn(models, CalibrationSet(tmp_path / "wrong"), samples=1)
+        record_traces(models, CalibrationSet(tmp_path / "wrong"), samples=1)

@@ -10,7 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import NoLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
-from me2e_compress.runtime.interleaved import machine_in_turn
+from me2e_compress.runtime.interleaved import describe_machine
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.study import Condition, Listener, Scheme, Study, Timing, timing
 from me2e_compress.study.prepared import prepare_scheme
@@ -21,7 +21,7 @@ from tests.study.conftest import BLIND, IDEAL, Make
 
 DEVICE = Condition("device", "trace")
 SAMPLES = (100, 110, 120, 130, 140)
-HERE = machine_in_turn(1)
+HERE = describe_machine(1)
 
 
 def clock_of(study: Study, folder: Path, listener: Listener = SILENT) -> Clock:
@@ -48,7 +48,7 @@ def paced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
             for name, path in models.items()
         }
 
-    monkeypatch.setattr(timing, "traces_in_turn", measured)
+    monkeypatch.setattr(timing, "record_traces", measured)
     return days
 
 
