@@ -12,18 +12,18 @@ from me2e_compress.graph.files import (
     save,
     sha256_of,
 )
-from me2e_compress.graph.layers import (
-    CONVOLUTIONS,
-    WEIGHTED,
-    bias_of,
-    channel_axis,
-)
 from me2e_compress.graph.macs import macs, macs_counter, total_macs
 from me2e_compress.graph.nodes import (
+    CONVOLUTIONS,
+    WEIGHTED,
+    Port,
     array_of,
+    bias_of,
+    channel_axis,
     graphs_of,
     has_subgraph,
     input_at,
+    interface,
     is_standard,
     nodes_of,
     opset_of,

@@ -8,8 +8,11 @@ from typing import ClassVar, Self
 
 import onnx_ir as ir
 
+from me2e_compress import graph
+from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import RecipeError
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.modules import ModuleMap
 
 
@@ -26,6 +29,44 @@ class Context:
     modules: ModuleMap
     frames: CalibrationSet | None = None
     seed: int = 0
+
+    def ranges(
+        self,
+        name: str,
+        model: ir.Model,
+        tensors: tuple[str, ...],
+        *,
+        method: str,
+        saved: Path | None,
+    ) -> Ranges:
+        """Read the ranges of some tensors from a file, or measure them on the frames.
+
+        Args:
+            name: of the pass that asks.
+            model: the graph that is quantized.
+            tensors: what it needs a range of.
+            method: how ranges are read from the frames.
+            saved: file of saved ranges; None to measure.
+
+        Raises:
+            FramesError: neither frames nor a file, or they are of another graph.
+            RecipeError: no such method.
+        """
+        if saved is not None:
+            found = Ranges.load(saved)
+            found.check(
+                model=graph.digest(model),
+                tensors=tensors,
+                method=method,
+                source=None if self.frames is None else self.frames.fingerprint,
+            )
+            return found
+        if self.frames is None:
+            raise FramesError(
+                f"{name} needs recorded frames (--frames) or saved ranges (--ranges):"
+                " int8 ranges are never made up"
+            )
+        return Calibrator(method).run(model, tensors, self.frames)
 
 
 @dataclasses.dataclass(frozen=True)

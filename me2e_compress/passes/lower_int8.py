@@ -9,7 +9,6 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.measured import measured_ranges
 from me2e_compress.targets import onnxruntime
 
 
@@ -48,11 +47,10 @@ class LowerInt8(Pass):
         missing = self.ranged_tensors(model, context)
         ranges = None
         if missing:
-            ranges = measured_ranges(
+            ranges = context.ranges(
                 self.name,
                 model,
                 missing,
-                context,
                 method=self.method,
                 saved=self.ranges,
             )

@@ -9,7 +9,6 @@ import onnx_ir as ir
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.measured import measured_ranges
 from me2e_compress.quantization.plan import (
     INT8,
     Overrides,
@@ -21,7 +20,6 @@ from me2e_compress.quantization.plan import (
 from me2e_compress.quantization.rules import RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
-from me2e_compress.targets.lint import lint
 from me2e_compress.targets.quantized import describe_quantized
 
 _SHOWN = 5
@@ -98,11 +96,10 @@ class QuantizeInt8(Pass):
             return PassResult(
                 model, 0, ("nothing to quantize", *_notes(plan, self.target))
             )
-        ranges = measured_ranges(
+        ranges = context.ranges(
             self.name,
             model,
             tensors,
-            context,
             method=self.method,
             saved=self.ranges,
         )
@@ -197,7 +194,7 @@ def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
 
 
 def _lint(model: ir.Model, target: str) -> str:
-    found = lint(model, target)
+    found = TARGETS.parse(target).lint(model)
     if not found:
         return f"lint for {target}: nothing found"
     first = found[0]

@@ -5,9 +5,28 @@ To add a target: write its class, then add it to this table.
 
 from me2e_compress.errors import RecipeError
 from me2e_compress.registry import Registry
-from me2e_compress.targets.base import Target
+from me2e_compress.targets.base import (
+    LintFinding,
+    LintRule,
+    Severity,
+    Target,
+    error,
+    of_opset,
+    valid,
+    warning,
+)
 
-__all__ = ["TARGETS", "Target"]
+__all__ = [
+    "TARGETS",
+    "LintFinding",
+    "LintRule",
+    "Severity",
+    "Target",
+    "error",
+    "of_opset",
+    "valid",
+    "warning",
+]
 
 _HERE = "me2e_compress.targets"
 

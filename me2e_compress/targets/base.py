@@ -1,14 +1,97 @@
-"""What every target is."""
+"""What every target is, what its lint finds, and the lint rules that all share."""
 
 import abc
 import dataclasses
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Iterator
+from typing import ClassVar, Literal, TypeAlias
 
+import onnx
 import onnx_ir as ir
+import onnx_ir.passes.common as common
 
+from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.graph import is_standard, opset_of
 from me2e_compress.quantization.plan import KeptFloat, QuantPlan
-from me2e_compress.targets.finding import LintRule
+
+Severity = Literal["error", "warning"]
+
+
+@dataclasses.dataclass(frozen=True)
+class LintFinding:
+    """One problem of a graph for its target.
+
+    Attributes:
+        severity: ``error``: the target refuses the graph, or computes something else;
+            ``warning``: it runs, but not as int8 or not as fast as it could.
+        rule: id of the rule.
+        node: name of the node; empty where the finding is about the whole graph.
+        message: what was found and what is expected.
+    """
+
+    severity: Severity
+    rule: str
+    node: str
+    message: str
+
+
+LintRule: TypeAlias = Callable[[ir.Model], Iterator[LintFinding]]
+"""Inspects a graph whose shapes are inferred and yields what it finds."""
+
+
+def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
+    """Return a finding that makes the target refuse the graph."""
+    return LintFinding("error", rule, _name(node), message)
+
+
+def warning(rule: str, node: ir.Node | None, message: str) -> LintFinding:
+    """Return a finding with which the target runs the graph badly."""
+    return LintFinding("warning", rule, _name(node), message)
+
+
+def valid(model: ir.Model) -> Iterator[LintFinding]:
+    """Run ONNX's checker."""
+    try:
+        common.CheckerPass()(model)
+    except (onnx.checker.ValidationError, ir.passes.PassError) as failure:
+        reason = str(failure.__cause__ or failure).strip().splitlines()[0]
+        yield error("onnx", None, f"not valid ONNX: {reason}")
+
+
+def of_opset(model: ir.Model) -> Iterator[LintFinding]:
+    """Find operators that are newer than the opset of the graph.
+
+    TensorRT's parser does not look at the opset; onnxruntime does.
+    """
+    main = opset_of(model)
+    yield from _too_new(model.graph.all_nodes(), main)
+    for function in model.functions.values():
+        yield from _too_new(function.all_nodes(), opset_of(function) or main)
+
+
+def _too_new(nodes: Iterable[ir.Node], opset: int) -> Iterator[LintFinding]:
+    for node in nodes:
+        if not is_standard(node) or not onnx.defs.has(node.op_type, domain=""):
+            continue
+        if not onnx.defs.has(node.op_type, max_inclusive_version=opset, domain=""):
+            since = _first_version(node.op_type)
+            yield error(
+                "operator-of-opset",
+                node,
+                f"{node.op_type} came with opset {since}, the graph is of {opset}",
+            )
+
+
+def _first_version(op_type: str) -> int:
+    return min(
+        schema.since_version
+        for schema in onnx.defs.get_all_schemas_with_history()
+        if schema.name == op_type and schema.domain == ""
+    )
+
+
+def _name(node: ir.Node | None) -> str:
+    return "" if node is None else node.name or str(node.outputs[0].name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,3 +121,14 @@ class Target(abc.ABC):
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules that a graph for it is held against."""
         return ()
+
+    def lint(self, model: ir.Model) -> tuple[LintFinding, ...]:
+        """List everything that is wrong with a graph for this target, errors first.
+
+        Args:
+            model: the graph; it stays as it is.
+        """
+        copy = model.clone()
+        graph.infer_shapes(copy)
+        found = [finding for rule in self.lint_rules() for finding in rule(copy)]
+        return tuple(sorted(found, key=lambda each: each.severity))

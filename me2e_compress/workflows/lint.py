@@ -6,8 +6,7 @@ from pathlib import Path
 
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.targets.lint import LintFinding
-from me2e_compress.targets.lint import lint as find
+from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.paths import model_path
 from me2e_compress.workflows.result import Result, Table, table
@@ -135,7 +134,7 @@ def lint(model: str | Path, options: LintOptions | None = None) -> LintResult:
     """
     options, path = options or LintOptions(), model_path(model)
     loaded = graph.load(path)
-    found = tuple(find(loaded, options.target))
+    found = tuple(TARGETS.parse(options.target).lint(loaded))
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, found, build)
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import CONVOLUTIONS
-from me2e_compress.graph.layers import extent
+from me2e_compress.graph.nodes import extent
 from me2e_compress.quantization.rules.base import Rule, RuleFacts, RuleSet
 from me2e_compress.quantization.rules.scope import (
     ModuleScope,

@@ -14,7 +14,7 @@ from me2e_compress.graph import (
     producer_of,
 )
 from me2e_compress.runtime.native import operators as native_operators
-from me2e_compress.targets.finding import (
+from me2e_compress.targets.base import (
     LintFinding,
     LintRule,
     error,

@@ -7,8 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import QuantPlan
-from me2e_compress.targets.base import Target
-from me2e_compress.targets.finding import LintRule
+from me2e_compress.targets.base import LintRule, Target
 from me2e_compress.targets.tensorrt.lint import RULES
 from me2e_compress.targets.tensorrt.place import place, tensors
 

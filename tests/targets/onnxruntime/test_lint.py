@@ -6,7 +6,6 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
-from me2e_compress.targets.lint import lint
 from tests.nets import MODULES, conv_attention, net
 
 LAYER = """
@@ -39,7 +38,7 @@ def test_convolutions_that_run_slowly(
 ) -> None:
     text = LAYER % {"kind": kind, "zero": zero, "answer": answer}
 
-    found = lint(ir.from_onnx_text(text), "onnxruntime")
+    found = TARGETS.parse("onnxruntime").lint(ir.from_onnx_text(text))
 
     assert [each.rule for each in found] == rules
     assert {each.severity for each in found} <= {"warning"}
@@ -50,7 +49,7 @@ def test_operators_without_a_kernel() -> None:
         '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>'
         "m (float[1,2,3,3] x) => (float[1,2,3,3] y) { y = trt.InverseTRT(x) }"
     )
-    (found,) = lint(model, "onnxruntime")
+    (found,) = TARGETS.parse("onnxruntime").lint(model)
 
     assert found.message == "trt::InverseTRT has no kernel and no local function"
 
@@ -60,7 +59,7 @@ def test_contrib_operators_are_known() -> None:
         '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1]>'
         "m (float[2] x) => (float[2] y) { y = com.microsoft.Gelu(x) }"
     )
-    assert lint(model, "onnxruntime") == ()
+    assert TARGETS.parse("onnxruntime").lint(model) == ()
 
 
 def test_opsets_nobody_has_released() -> None:
@@ -68,7 +67,7 @@ def test_opsets_nobody_has_released() -> None:
         '<ir_version: 9, opset_import: ["" : 99]>'
         "m (float[2] x) => (float[2] y) { y = Relu(x) }"
     )
-    assert "opset" in [each.rule for each in lint(model, "onnxruntime")]
+    assert "opset" in [each.rule for each in TARGETS.parse("onnxruntime").lint(model)]
 
 
 def test_what_we_place_for_it_has_no_findings() -> None:
@@ -79,7 +78,7 @@ def test_what_we_place_for_it_has_no_findings() -> None:
 
     placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
 
-    assert lint(placed, "onnxruntime") == ()
+    assert TARGETS.parse("onnxruntime").lint(placed) == ()
 
 
 def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
@@ -98,4 +97,4 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
 
     placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
 
-    assert lint(placed, "onnxruntime") == ()
+    assert TARGETS.parse("onnxruntime").lint(placed) == ()

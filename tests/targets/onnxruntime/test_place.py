@@ -8,7 +8,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.targets.lint import lint
+from me2e_compress.targets import TARGETS
 from me2e_compress.targets.onnxruntime import (
     int8_layers,
     kept_float,
@@ -120,7 +120,7 @@ def test_the_result_is_a_valid_graph_and_the_source_untouched() -> None:
 
 def test_the_lint_of_the_target_finds_nothing() -> None:
     for model in (block(), linear(), conv_attention()):
-        assert lint(lowered(model), "onnxruntime") == ()
+        assert TARGETS.parse("onnxruntime").lint(lowered(model)) == ()
 
 
 def test_the_same_plan_gives_the_same_graph() -> None:

@@ -11,8 +11,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import tensorrt
-from me2e_compress.targets.lint import LintFinding, lint
+from me2e_compress.targets import TARGETS, LintFinding, tensorrt
 from tests.nets import MODULES, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)
@@ -20,7 +19,7 @@ FULL = QuantScheme.named("full", MODULES)
 
 def found(text: str, opset: int = 17) -> list[tuple[str, str, str]]:
     model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : {opset}]>' + text)
-    return [shown(each) for each in lint(model, "tensorrt")]
+    return [shown(each) for each in TARGETS.parse("tensorrt").lint(model)]
 
 
 def shown(finding: LintFinding) -> tuple[str, str, str]:
@@ -36,7 +35,7 @@ def placed(rules: str) -> ir.Model:
 
 @pytest.mark.parametrize("rules", ["paper", "tensorrt"])
 def test_what_we_place_has_no_findings(rules: str) -> None:
-    assert lint(placed(rules), "tensorrt") == ()
+    assert TARGETS.parse("tensorrt").lint(placed(rules)) == ()
 
 
 def _scale(value: float) -> Callable[[ir.Model], None]:
@@ -128,7 +127,7 @@ def test_what_is_broken_is_found(
     model = placed("paper")
     change(model)
 
-    ours = [each for each in lint(model, "tensorrt") if each.rule == rule]
+    ours = [each for each in TARGETS.parse("tensorrt").lint(model) if each.rule == rule]
 
     assert ours
     assert message in ours[0].message
@@ -252,4 +251,6 @@ def test_graphs_of_other_quantizers_are_judged_the_same() -> None:
     """
     model = net(text, {"w": np.ones((16, 16))})
 
-    assert [each.rule for each in lint(model, "tensorrt")] == ["float-weight"]
+    assert [each.rule for each in TARGETS.parse("tensorrt").lint(model)] == [
+        "float-weight"
+    ]

@@ -4,7 +4,7 @@ import onnx
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.targets.lint import LintFinding, lint
+from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.lint.tables import (
     LATER,
     SUPPORTED,
@@ -14,7 +14,7 @@ from me2e_compress.targets.tensorrt.lint.tables import (
 
 def found(text: str, opset: int = 17) -> list[LintFinding]:
     head = f'<ir_version: 9, opset_import: ["" : {opset}, "trt" : 1]>'
-    return list(lint(ir.from_onnx_text(head + text), "tensorrt"))
+    return list(TARGETS.parse("tensorrt").lint(ir.from_onnx_text(head + text)))
 
 
 def said(text: str, opset: int = 17) -> list[tuple[str, str]]:
@@ -185,4 +185,4 @@ def test_a_local_function_stands_in_for_an_operator() -> None:
     <domain: "own", opset_import: ["" : 17]>
     Twice (x) => (y) { y = Add(x, x) }
     """
-    assert lint(ir.from_onnx_text(text), "tensorrt") == ()
+    assert TARGETS.parse("tensorrt").lint(ir.from_onnx_text(text)) == ()

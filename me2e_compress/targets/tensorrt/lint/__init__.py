@@ -1,6 +1,6 @@
 """Rules of TensorRT: would its parser take a graph, and run its int8 as int8?"""
 
-from me2e_compress.targets.finding import LintRule, of_opset, valid
+from me2e_compress.targets.base import LintRule, of_opset, valid
 from me2e_compress.targets.tensorrt.lint import (
     placement,
     qdq,

@@ -6,7 +6,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, nodes_of
-from me2e_compress.targets.finding import LintFinding, error, warning
+from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
     PAIR,

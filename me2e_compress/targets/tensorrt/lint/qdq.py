@@ -12,7 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import is_standard, nodes_of
-from me2e_compress.targets.finding import LintFinding, error
+from me2e_compress.targets.base import LintFinding, error
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
     QUANTIZE,

@@ -6,7 +6,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import input_at, is_standard, nodes_of, rank_of
-from me2e_compress.targets.finding import LintFinding, error
+from me2e_compress.targets.base import LintFinding, error
 
 MAX_K = 3840
 """Largest K of a TopK."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import onnx_ir as ir
 
 from me2e_compress.graph import input_at, is_standard, nodes_of, opset_of, rank_of
-from me2e_compress.targets.finding import LintFinding, error, warning
+from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.quantized import PAIR
 from me2e_compress.targets.tensorrt.lint.tables import (
     LATER,

@@ -3,7 +3,6 @@ import pytest
 
 from me2e_compress.errors import RecipeError
 from me2e_compress.targets import TARGETS
-from me2e_compress.targets.lint import lint
 
 GRID = (
     '<ir_version: 9, opset_import: ["" : %d]>'
@@ -14,11 +13,11 @@ GRID = (
 
 @pytest.mark.parametrize("target", TARGETS.names())
 def test_operators_younger_than_the_graph(target: str) -> None:
-    found = lint(ir.from_onnx_text(GRID % 13), target)
+    found = TARGETS.parse(target).lint(ir.from_onnx_text(GRID % 13))
 
     young = [each.message for each in found if each.rule == "operator-of-opset"]
     assert young == ["GridSample came with opset 16, the graph is of 13"]
-    assert not lint(ir.from_onnx_text(GRID % 16), target)
+    assert not TARGETS.parse(target).lint(ir.from_onnx_text(GRID % 16))
 
 
 @pytest.mark.parametrize("target", TARGETS.names())
@@ -26,7 +25,7 @@ def test_what_is_no_valid_graph(target: str) -> None:
     model = ir.from_onnx_text(GRID % 16)
     model.graph[0].attributes.add(ir.AttrInt64("speed", 3))
 
-    (found,) = lint(model, target)
+    (found,) = TARGETS.parse(target).lint(model)
 
     assert (found.severity, found.rule) == ("error", "onnx")
     assert "speed" in found.message
@@ -34,4 +33,4 @@ def test_what_is_no_valid_graph(target: str) -> None:
 
 def test_no_such_target() -> None:
     with pytest.raises(RecipeError, match="no target 'qnn'; there are tensorrt"):
-        lint(ir.from_onnx_text(GRID % 16), "qnn")
+        TARGETS.parse("qnn").lint(ir.from_onnx_text(GRID % 16))
