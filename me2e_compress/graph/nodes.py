@@ -1,8 +1,8 @@
-"""Facts about nodes and values, about layers with weights, and the interface."""
+"""Facts about nodes and values, and about layers with weights."""
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -70,24 +70,6 @@ def array_of(value: ir.Value | None) -> npt.NDArray[np.generic] | None:
         return None
     tensor = ir.convenience.get_const_tensor(value)
     return None if tensor is None else tensor.numpy()
-
-
-@dataclasses.dataclass(frozen=True)
-class Port:
-    """One input or output: name, ONNX type and shape as text, e.g. ``[1, 6, 'W']``."""
-
-    name: str
-    type: str
-    shape: str
-
-
-def interface(model: ir.Model) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
-    """List the inputs and the outputs: no pass may change these unasked."""
-    return _ports(model.graph.inputs), _ports(model.graph.outputs)
-
-
-def _ports(values: Iterable[ir.Value]) -> tuple[Port, ...]:
-    return tuple(Port(v.name or "", str(v.type), str(v.shape)) for v in values)
 
 
 CONVOLUTIONS = ("Conv", "ConvTranspose")
