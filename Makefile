@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: demo test test-slow check fix clean
+.PHONY: coverage demo docs test test-slow check fix clean
 
 demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
 	$(BIN)/me2e-compress demo --out out
@@ -14,6 +14,12 @@ test: check  ## lint, types, layers, tests
 
 test-slow: $(VENV)/.test  ## what takes minutes: TensorRT-RTX builds of whole stacks, training killed and resumed, 2 GB
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup -m slow
+
+coverage: $(VENV)/.test  ## the same tests, with branch coverage and its floor
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup --cov --cov-report=term:skip-covered
+
+docs: $(VENV)/.docs  ## the API reference, from the docstrings
+	$(BIN)/pdoc -d google -o out/api me2e_compress '!me2e_compress.__main__' '!me2e_compress.cli'
 
 check: $(VENV)/.test
 	$(BIN)/ruff check .
@@ -33,6 +39,10 @@ $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)
 $(VENV)/.test: pyproject.toml constraints.txt | $(VENV)
 	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,bench,ray,trt-check,test]'
 	touch $@ $(VENV)/.demo
+
+$(VENV)/.docs: pyproject.toml constraints.txt | $(VENV)
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,ray,docs]'
+	touch $@
 
 $(VENV):
 	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,27 @@
+"""Ranges of so many times the root mean square."""
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+
+from me2e_compress.calibration.observers import Observer
+from me2e_compress.calibration.observers.base import Bounds, within
+from me2e_compress.calibration.statistics import Statistics
+
+
+@dataclasses.dataclass(frozen=True)
+class Rms(Observer):
+    """Clip every tensor at a multiple of its root mean square over all frames.
+
+    Attributes:
+        times: the multiple.
+    """
+
+    name: ClassVar[str] = "rms"
+    times: float = 4.0
+
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+        """Return bounds no wider than what was seen."""
+        mean_squares = seen.readings[:, :, 2].mean(axis=0)
+        return within(seen, np.float32(self.times) * np.sqrt(mean_squares))
