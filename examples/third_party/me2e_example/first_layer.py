@@ -5,8 +5,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.quantization.rules import Rule, RuleFacts, RuleSet
-from me2e_compress.quantization.rules.stages import PaperRules
+from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,4 +30,4 @@ class Cautious(RuleSet):
 
     def own_rules(self) -> tuple[Rule, ...]:
         """Ask the paper's rules first."""
-        return (*PaperRules().own_rules(), FirstLayer())
+        return (*RULE_SETS.parse("paper").rules(), FirstLayer())

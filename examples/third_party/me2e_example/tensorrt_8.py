@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.targets.finding import LintFinding, LintRule, error
+from me2e_compress.targets import LintFinding, LintRule, error
 from me2e_compress.targets.tensorrt import TensorRT
 
 NEWEST_OPSET = 17
