@@ -42,7 +42,7 @@ from me2e_compress.quantization.plan import (
     QuantPlan,
     make_plan,
 )
-from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
+from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
 from me2e_compress.runtime.interleaved import time_interleaved

@@ -15,5 +15,5 @@ EVALUATORS: Registry[Evaluator] = Registry(
     "evaluator",
     _HERE,
     EvaluationError,
-    {"highway": f"{_HERE}.highway.evaluation_options:Highway"},
+    {"highway": f"{_HERE}.highway.evaluation_options:HighwayEvaluation"},
 )

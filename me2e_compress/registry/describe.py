@@ -77,7 +77,7 @@ def options_of(cls: type) -> tuple[Option, ...]:
 
 
 def has_default(field: "dataclasses.Field[Any]") -> bool:
-    """Say whether an option may be left out."""
+    """Return whether an option may be left out."""
     missing = dataclasses.MISSING
     return field.default is not missing or field.default_factory is not missing
 

@@ -31,7 +31,7 @@ from me2e_compress.registry.text import (
 _OURS = "me2e-compress"
 
 
-class Item(Protocol):
+class NamedItem(Protocol):
     """What is registered: a frozen dataclass.
 
     Class attributes:
@@ -41,7 +41,7 @@ class Item(Protocol):
     name: ClassVar[str]
 
 
-T = TypeVar("T", bound=Item)
+T = TypeVar("T", bound=NamedItem)
 
 
 @dataclasses.dataclass(frozen=True)

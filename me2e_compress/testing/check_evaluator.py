@@ -1,4 +1,4 @@
-"""Hold an evaluator to what scores are computed from."""
+"""Check that an evaluator yields what scores are computed from."""
 
 from collections import Counter
 

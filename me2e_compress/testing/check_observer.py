@@ -1,4 +1,4 @@
-"""Hold an observer to what calibration needs of it."""
+"""Check that an observer does what calibration needs of it."""
 
 import numpy as np
 import numpy.typing as npt

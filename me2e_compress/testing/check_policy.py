@@ -1,4 +1,4 @@
-"""Hold a policy to its contract, in a world of its own."""
+"""Check that a policy keeps its contract, in a world of its own."""
 
 from dataclasses import dataclass, field
 

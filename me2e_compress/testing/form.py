@@ -1,14 +1,14 @@
-"""Hold anything that a registry names to what all of it has in common."""
+"""Check what all items of registries have in common."""
 
 import re
 from typing import TypeVar
 
 from me2e_compress.errors import VerificationError
-from me2e_compress.registry import Item, Registry, options_of
+from me2e_compress.registry import NamedItem, Registry, options_of
 
 _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
-T = TypeVar("T", bound=Item)
+T = TypeVar("T", bound=NamedItem)
 
 
 def check_form(item: T, registry: Registry[T]) -> None:

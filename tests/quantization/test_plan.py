@@ -6,8 +6,8 @@ import pytest
 
 from me2e_compress.errors import ModuleMapError, RecipeError
 from me2e_compress.quantization.plan import Decision, make_plan, tensors_of
-from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
-from me2e_compress.quantization.rules.stages import PaperRules
+from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, conv_attention, net
 

@@ -14,7 +14,7 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
-from me2e_compress.quantization.rules.stages import PaperRules
+from me2e_compress.quantization.rules.paper_rules import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.installed import install
 from tests.nets import MODULES, net

@@ -7,7 +7,7 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.errors import VerificationError
-from me2e_compress.evaluators.highway.evaluation_options import Highway
+from me2e_compress.evaluators.highway.evaluation_options import HighwayEvaluation
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.testing import check_evaluator
@@ -62,7 +62,7 @@ def test_a_wrong_evaluator_is_caught(way: str, message: str) -> None:
 def test_ours_holds(tmp_path: Path) -> None:
     save_routes([EXIT], tmp_path / "routes.json")
     first, again = (
-        Highway("blind", tmp_path / folder, str(tmp_path / "routes.json"))
+        HighwayEvaluation("blind", tmp_path / folder, str(tmp_path / "routes.json"))
         for folder in ("first", "again")
     )
 

@@ -22,7 +22,7 @@ from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 
 
 @dataclass(frozen=True)
-class Highway:
+class HighwayEvaluation:
     """Drive a policy over routes of highway-env, and go on where a run was ended.
 
     Attributes:

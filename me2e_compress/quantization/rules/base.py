@@ -74,14 +74,14 @@ RULES: Registry[Rule] = Registry(
     "me2e_compress.rules",
     RecipeError,
     {
-        "operator": f"{_HERE}.scope:WeightedOperator",
-        "module": f"{_HERE}.scope:ModuleScope",
-        "weight": f"{_HERE}.scope:WeightOperand",
-        "attention-length": f"{_HERE}.stages:AttentionLength",
-        "gemv": f"{_HERE}.stages:MatrixVector",
-        "small-product": f"{_HERE}.kernel_limits:SmallProduct",
-        "narrow-convolution": f"{_HERE}.kernel_limits:NarrowConvolution",
-        "coordinates": f"{_HERE}.positions:Coordinates",
+        "operator": f"{_HERE}.paper_rules:WeightedOperator",
+        "module": f"{_HERE}.paper_rules:ModuleScope",
+        "weight": f"{_HERE}.paper_rules:WeightOperand",
+        "attention-length": f"{_HERE}.paper_rules:AttentionLength",
+        "gemv": f"{_HERE}.paper_rules:MatrixVector",
+        "small-product": f"{_HERE}.tensorrt_rules:SmallProduct",
+        "narrow-convolution": f"{_HERE}.tensorrt_rules:NarrowConvolution",
+        "coordinates": f"{_HERE}.tensorrt_rules:Coordinates",
     },
 )
 
@@ -131,7 +131,7 @@ RULE_SETS: Registry[RuleSet] = Registry(
     "me2e_compress.rule_sets",
     RecipeError,
     {
-        "paper": f"{_HERE}.stages:PaperRules",
-        "tensorrt": f"{_HERE}.kernel_limits:TensorRTRules",
+        "paper": f"{_HERE}.paper_rules:PaperRules",
+        "tensorrt": f"{_HERE}.tensorrt_rules:TensorRTRules",
     },
 )

@@ -7,7 +7,7 @@ import pytest
 from me2e_compress.driving.latency import FrameRate
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import EVALUATORS
-from me2e_compress.evaluators.highway.evaluation_options import Highway
+from me2e_compress.evaluators.highway.evaluation_options import HighwayEvaluation
 from me2e_compress.simulator.routes import save_routes
 from tests.evaluators.highway.drivers import EXIT
 
@@ -26,7 +26,9 @@ def test_an_evaluation_is_its_text(tmp_path: Path) -> None:
 
 def test_options_reach_the_drive(tmp_path: Path) -> None:
     conditions = (
-        Highway("blind", tmp_path, latency="fps:5", dt_ms=25, weather="night=0.5")
+        HighwayEvaluation(
+            "blind", tmp_path, latency="fps:5", dt_ms=25, weather="night=0.5"
+        )
         .evaluator()
         .job.conditions
     )

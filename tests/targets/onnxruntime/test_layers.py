@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from me2e_compress import graph
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.rules.stages import PaperRules
+from me2e_compress.quantization.rules.paper_rules import PaperRules
 from me2e_compress.targets.onnxruntime import place, tensors
 from tests.nets import net
 from tests.targets.onnxruntime.lowered import (

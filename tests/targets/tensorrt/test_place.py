@@ -11,7 +11,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.rules.kernel_limits import TensorRTRules
+from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.tensorrt.place import place

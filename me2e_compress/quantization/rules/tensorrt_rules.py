@@ -1,4 +1,4 @@
-"""What TensorRT's int8 kernels are too coarse for, and the set of rules for it.
+"""The rule set for TensorRT: what its int8 kernels are too coarse for, coordinates.
 
 Bounds are those of NVIDIA's own quantizer (ModelOpt 0.47,
 ``modelopt/onnx/quantization/graph_utils.py``): int8 tensor cores work on tiles of 16
@@ -14,8 +14,7 @@ import onnx_ir as ir
 from me2e_compress.graph import CONVOLUTIONS, static_shape
 from me2e_compress.graph.nodes import extent
 from me2e_compress.quantization.rules.base import Rule, RuleFacts
-from me2e_compress.quantization.rules.positions import Coordinates
-from me2e_compress.quantization.rules.stages import PaperRules
+from me2e_compress.quantization.rules.paper_rules import PaperRules
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +82,22 @@ class NarrowConvolution(Rule):
             f"{inputs} to {outputs} channels in {group} groups, kernel {list(kernel)}:"
             " too narrow for int8 kernels"
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinates(Rule):
+    """Layers that positions come from stay float: offsets, reference points.
+
+    A position is right to a fraction of a cell or wrong; 8 bits over a map of 100
+    cells leave half a cell. Sampling weights that read the same tensor as the offsets
+    go with them: neither then needs it in int8.
+    """
+
+    name: ClassVar[str] = "coordinates"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to what :func:`~me2e_compress.quantization.coordinates` found."""
+        return facts.coordinates.get(node)
 
 
 @dataclasses.dataclass(frozen=True)
