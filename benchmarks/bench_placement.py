@@ -47,7 +47,7 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
 from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets import tensorrt
+from me2e_compress.targets.tensorrt import TensorRT
 
 NODES = 8000
 """As an exporter counts; more than 5,000 once constants are no nodes."""
@@ -141,7 +141,7 @@ def gains(
     nodes = {each.output for each in differing}
     variants["all of ModelOpt's"] = flipped(plan, nodes, theirs)
     names = dict.fromkeys(
-        name for each in variants.values() for name in tensorrt.tensors(each, model)
+        name for each in variants.values() for name in TensorRT().tensors(each, model)
     )
     fixed = constants_of(model, list(names))
     known = [name for name in names if name not in fixed]
@@ -198,7 +198,7 @@ def write(subject: Subject, model: ir.Model, plan: QuantPlan, ranges: Ranges) ->
     path = subject.folder / "variant.onnx"
     count = len(list(subject.folder.glob("variant*.onnx")))
     path = path.with_name(f"variant-{count}.onnx")
-    graph.save(tensorrt.place(model, plan, ranges), path)
+    graph.save(TensorRT().place(model, plan, ranges), path)
     return path
 
 

@@ -9,17 +9,53 @@ import hashlib
 import itertools
 import json
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.calibration.arrays import load_arrays
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.recurrence import recurrent_inputs
+
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,  # pickled objects, headers that lie
+    MemoryError,  # so do they
+    RuntimeError,  # encrypted, or compressed as zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
+    """Read every array of an ``.npz``, by name.
+
+    Args:
+        path: the file.
+        what: it should be, for the message.
+
+    Raises:
+        FramesError: the file cannot be read, or holds something else.
+    """
+    try:
+        with path.open("rb") as source:
+            content = np.load(source, allow_pickle=False)
+            if not isinstance(content, np.lib.npyio.NpzFile):
+                raise FramesError(f"{path}: not {what} (it is a single array)")
+            found = {name: content[name] for name in content}
+    except _UNREADABLE as error:
+        line = " ".join(str(error).split())
+        raise FramesError(f"{path}: not {what} ({line})") from error
+    for name, value in found.items():
+        if not isinstance(value, np.ndarray):
+            raise FramesError(f"{path}: not {what} ({name} is not an array)")
+    return found
+
 
 __all__ = ["CalibrationSet", "Frame", "synthetic"]
 

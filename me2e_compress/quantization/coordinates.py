@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 import onnx_ir as ir
 
 from me2e_compress.graph import input_at
-from me2e_compress.quantization.nearest import behind
+from me2e_compress.quantization.find_attention import behind
 
 _POSITIONS: dict[str, tuple[int, ...]] = {
     "DeformConv": (2,),

@@ -1,10 +1,11 @@
-"""Open a graph as an onnxruntime session, its weights lent, not written out.
+"""Open a graph in onnxruntime, if it can run it, its weights lent, not written out.
 
 What onnxruntime is given is the graph without its large weights, as if they lay in a
 file, and the arrays themselves in the place of that file. So no weight is serialized,
 however large they are together (a protobuf message ends at 2 GiB).
 """
 
+import functools
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,11 +15,63 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 import onnxruntime as ort
+from onnxruntime.capi import (
+    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
+)
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
+from me2e_compress.graph import is_standard
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
-from me2e_compress.runtime.native import REFUSALS, unsupported
+
+# The compiled module has no stubs.
+
+
+InvalidArgument: type[Exception] = _native.InvalidArgument
+"""Raised where inputs do not fit."""
+
+REFUSALS: tuple[type[Exception], ...] = (
+    _native.Fail,
+    _native.InvalidArgument,
+    _native.InvalidGraph,
+    _native.InvalidProtobuf,
+    _native.NoModel,
+    _native.NoSuchFile,
+    _native.NotImplemented,
+    _native.RuntimeException,
+    RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
+)
+"""Everything raised where a graph cannot be read, built or run."""
+
+
+@functools.cache
+def operators() -> frozenset[tuple[str, str]]:
+    """List the (domain, operator) pairs that are known; ai.onnx is written ``""``."""
+    return frozenset(
+        ("" if schema.domain == "ai.onnx" else schema.domain, schema.name)
+        for schema in _native.get_all_operator_schema()
+    )
+
+
+def unsupported(model: ir.Model) -> str | None:
+    """Return why the CPU cannot run a graph; None if it knows every operator.
+
+    A known operator may still lack a kernel for its element type; only building a
+    :class:`~me2e_compress.runtime.session.Session` finds that.
+    """
+    known = operators()
+    unknown = {
+        f"{node.domain or 'ai.onnx'}::{node.op_type}": node
+        for graph in (*model.graphs(), *model.functions.values())
+        for node in graph
+        if node.op_identifier() not in model.functions
+        and ("" if is_standard(node) else node.domain, node.op_type) not in known
+    }
+    if not unknown:
+        return None
+    node = next(iter(unknown.values()))
+    return f"onnxruntime has no operator {', '.join(unknown)} (node {node.name!r})"
+
 
 _INT8_STAYS = "session.qdqisint8allowed"
 LENT_BYTES = 1024

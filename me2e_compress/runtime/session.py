@@ -10,8 +10,13 @@ import onnxruntime as ort
 
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.native import REFUSALS, InvalidArgument
-from me2e_compress.runtime.opening import Weights, open_file, open_graph
+from me2e_compress.runtime.opening import (
+    REFUSALS,
+    InvalidArgument,
+    Weights,
+    open_file,
+    open_graph,
+)
 from me2e_compress.runtime.recurrence import SessionPort, recurrence
 
 __all__ = ["Session", "SessionPort", "replay", "run_once"]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer, scale_of
-from me2e_compress.calibration.observers.extremes import MaxMin, MovingAverage
+from me2e_compress.calibration.observers.base import MaxMin, MovingAverage
 from me2e_compress.calibration.observers.histogram import (
     Entropy,
     MeanSquaredError,

@@ -13,7 +13,7 @@ from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.runtime.native import REFUSALS
+from me2e_compress.runtime.opening import REFUSALS
 from tests.passes import onnx_cases
 from tests.passes.onnx_cases import Case
 

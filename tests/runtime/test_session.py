@@ -8,7 +8,7 @@ from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.native import unsupported
+from me2e_compress.runtime.opening import unsupported
 from me2e_compress.runtime.session import Session, replay, run_once
 
 COUNTER = """

@@ -3,8 +3,12 @@
 To add an observer: write its class, then add it to this table.
 """
 
-from me2e_compress.calibration.observers.base import Bounds, Observer
-from me2e_compress.calibration.observers.scale import QUANT_MAX, scale_of
+from me2e_compress.calibration.observers.base import (
+    QUANT_MAX,
+    Bounds,
+    Observer,
+    scale_of,
+)
 from me2e_compress.errors import RecipeError
 from me2e_compress.registry import Registry
 
@@ -17,8 +21,8 @@ OBSERVERS: Registry[Observer] = Registry(
     "me2e_compress.observers",
     RecipeError,
     {
-        "max-min": f"{_HERE}.extremes:MaxMin",
-        "moving-average": f"{_HERE}.extremes:MovingAverage",
+        "max-min": f"{_HERE}.base:MaxMin",
+        "moving-average": f"{_HERE}.base:MovingAverage",
         "percentile": f"{_HERE}.histogram:Percentile",
         "mse": f"{_HERE}.histogram:MeanSquaredError",
         "entropy": f"{_HERE}.histogram:Entropy",

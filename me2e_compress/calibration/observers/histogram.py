@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.calibration.observers.base import (
+    QUANT_MAX,
     Bounds,
     Observer,
     check_option,
     within,
 )
-from me2e_compress.calibration.observers.scale import QUANT_MAX
 from me2e_compress.calibration.statistics import BINS, Statistics
 
 Counts: TypeAlias = npt.NDArray[np.int64]

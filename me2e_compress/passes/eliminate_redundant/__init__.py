@@ -1,6 +1,7 @@
 """Remove what does nothing, or is there twice."""
 
 import dataclasses
+import hashlib
 from collections import Counter
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,7 +11,6 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.graph import array_of, provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.eliminate_redundant import sharing
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
 from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
 from me2e_compress.passes.fold_constants.inference import branch_fits
@@ -19,11 +19,108 @@ from me2e_compress.rewrite import (
     can_replace,
     fresh_name,
     graphs_of,
+    has_subgraph,
     is_read,
+    is_standard,
     remove_dead,
     replace_value,
     value_names,
 )
+
+COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
+
+RANDOM = frozenset(
+    {
+        "Bernoulli",
+        "Dropout",
+        "Multinomial",
+        "RandomNormal",
+        "RandomNormalLike",
+        "RandomUniform",
+        "RandomUniformLike",
+    }
+)
+
+EDGE_BYTES = 64
+"""How much of each end of a weight is compared before all of it is hashed."""
+
+
+def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
+    """Merge equal nodes into the first of them; count those that went.
+
+    Nodes are equal if operator, attributes and inputs are; those of different
+    modules are told apart unless ``across_modules``, so that a module can still be
+    taken out later.
+    """
+    first: dict[object, ir.Node] = {}
+    merged: dict[ir.Node, list[ir.Node]] = {}
+    for node in graph:
+        if not is_standard(node) or node.op_type in RANDOM or has_subgraph(node):
+            continue
+        module = "" if across_modules else provenance.module_of(node)
+        known = first.setdefault(_key(node, module), node)
+        if known is node:
+            continue
+        pairs = list(zip(node.outputs, known.outputs, strict=True))
+        if all(can_replace(old, new) for old, new in pairs):
+            for old, new in pairs:
+                bypass(old, new)
+            merged.setdefault(known, [known]).append(node)
+    for known, nodes in merged.items():
+        provenance.inherit(known, nodes, by=by)
+        graph.remove(nodes[1:], safe=True)
+    return sum(len(nodes) - 1 for nodes in merged.values())
+
+
+def _key(node: ir.Node, module: str) -> object:
+    inputs = [id(value) for value in node.inputs]
+    if node.op_type in COMMUTATIVE:
+        inputs.sort()
+    attributes = tuple(
+        ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
+            deterministic=True
+        )
+        for name in sorted(node.attributes)
+    )
+    named = tuple(bool(value.name) for value in node.outputs)
+    return (node.op_type, tuple(inputs), named, attributes, module)
+
+
+def share_initializers(graph: ir.Graph) -> int:
+    """Merge equal initializers into the first; count those that went."""
+    groups: dict[object, list[ir.Value]] = {}
+    for value in graph.initializers.values():
+        if value.const_value is not None and not value.is_graph_input():
+            groups.setdefault(_edges(value.const_value), []).append(value)
+    count = 0
+    for group in groups.values():
+        first: dict[bytes, ir.Value] = {}
+        for value in group if len(group) > 1 else ():
+            known = first.setdefault(_content(value), value)
+            if known is not value and not value.is_graph_output():
+                value.replace_all_uses_with(known)
+                del graph.initializers[value.name or ""]
+                count += 1
+    return count
+
+
+def _edges(tensor: ir.TensorProtocol) -> object:
+    head = (tensor.dtype, tuple(tensor.shape.numpy()))
+    if tensor.dtype == ir.DataType.STRING:
+        return (*head, tuple(tensor.numpy().reshape(-1).tolist()))
+    if tensor.dtype.bitwidth < 8 or tensor.nbytes <= 2 * EDGE_BYTES:
+        return (*head, tensor.tobytes())
+    flat = tensor.numpy().reshape(-1)
+    size = EDGE_BYTES // flat.itemsize
+    return (*head, flat[:size].tobytes(), flat[-size:].tobytes())
+
+
+def _content(value: ir.Value) -> bytes:
+    tensor = value.const_value
+    if tensor is None or tensor.dtype == ir.DataType.STRING:
+        return b""
+    return hashlib.blake2b(tensor.tobytes(), digest_size=16).digest()
+
 
 __all__ = ["EliminateRedundant"]
 
@@ -68,13 +165,13 @@ class EliminateRedundant(Pass):
         self, body: ir.Graph, opsets: dict[str, int], tally: Counter[str]
     ) -> None:
         site = MergeSite(body, opsets, self.name)
-        tally["initializers"] += sharing.share_initializers(body)
+        tally["initializers"] += share_initializers(body)
         work = dict.fromkeys(reversed(list(body)))
         while work:
             node, _ = work.popitem()
             if node.graph is body:
                 work.update(dict.fromkeys(self._visit(node, site, tally)))
-        tally["equal nodes"] += sharing.share_nodes(
+        tally["equal nodes"] += share_nodes(
             body, self.name, across_modules=self.across_modules
         )
 

@@ -11,7 +11,7 @@ import onnxruntime
 from me2e_compress.graph import array_of
 from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
 from me2e_compress.rewrite import Array
-from me2e_compress.runtime.native import REFUSALS
+from me2e_compress.runtime.opening import REFUSALS
 
 SILENT = 4
 """onnxruntime's log level "fatal": what cannot be evaluated is said in the notes."""

@@ -13,7 +13,7 @@ from me2e_compress.graph import (
     opset_of,
     producer_of,
 )
-from me2e_compress.runtime.native import operators as native_operators
+from me2e_compress.runtime.opening import operators as native_operators
 from me2e_compress.targets.base import (
     LintFinding,
     LintRule,

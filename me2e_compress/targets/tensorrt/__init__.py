@@ -1,17 +1,37 @@
-"""TensorRT: int8 as explicit, symmetric QDQ, and what its parser would say of it."""
+"""TensorRT: int8 as explicit, symmetric QDQ, and what its parser would say of it.
+
+The rules (TensorRT 10 developer guide, "Explicit quantization", and what its ONNX
+parser accepts): zero points are 0; activations have one scale a tensor, weights one a
+channel, batches of matrices one; weights are stored as int8 behind a
+DequantizeLinear; biases and outputs have no QDQ, and of an Add only the residual branch
+has; every int8 reader of a tensor shares one pair, every float reader reads the tensor
+itself.
+"""
 
 import dataclasses
 from typing import ClassVar
 
+import numpy as np
+import numpy.typing as npt
 import onnx_ir as ir
 
+from me2e_compress import rewrite
+from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.quantization.plan import QuantPlan
+from me2e_compress.graph import provenance
+from me2e_compress.quantization.plan import (
+    Decision,
+    QuantPlan,
+    share_scales,
+    tensors_of,
+)
 from me2e_compress.targets.base import LintRule, Target
 from me2e_compress.targets.tensorrt.lint import RULES
-from me2e_compress.targets.tensorrt.place import place, tensors
+from me2e_compress.targets.weights import QuantizedWeight, weights_of
 
-__all__ = ["TensorRT", "place", "tensors"]
+__all__ = ["TensorRT"]
+
+BY = "quantize-int8"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,12 +42,117 @@ class TensorRT(Target):
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
         """Name what weighted layers and residual branches read."""
-        return tensors(plan, model)
+        return tensors_of(plan, model)
 
     def place(self, model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
-        """Put a pair of QuantizeLinear and DequantizeLinear before what reads int8."""
-        return place(model, plan, ranges)
+        """Return a copy of a graph in which the plan's nodes read int8.
+
+        Args:
+            model: the float graph that was planned and calibrated; it stays as it is.
+            plan: what becomes int8.
+            ranges: of every activation that the plan reads.
+
+        Returns:
+            The copy: a QuantizeLinear and a DequantizeLinear for each of those
+            activations (int8, zero point 0, scale = max(|low|, |high|) / 127), and int8
+            initializers behind a DequantizeLinear for the weights.
+
+        Raises:
+            PreconditionError: the graph is older than opset 13, or something that the
+                plan calls a weight is not one.
+        """
+        weights = weights_of(model, plan.chosen)
+        copy = model.clone()
+        nodes = {str(node.outputs[0].name): node for node in copy.graph}
+        writer = _Writer(copy.graph, share_scales(plan, ranges))
+        for decision in plan.chosen:
+            writer.apply(nodes[decision.output], decision, weights.get(decision.output))
+        rewrite.sweep(copy)
+        return copy
 
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its parser and of explicit quantization."""
         return RULES
+
+
+class _Writer:
+    """Writes pairs into one graph, each tensor and each weight once."""
+
+    def __init__(self, where: ir.Graph, ranges: Ranges) -> None:
+        self._graph = where
+        self._ranges = ranges
+        self._activations: dict[str, ir.Value] = {}
+        self._weights: dict[tuple[str, int | None], ir.Value] = {}
+        self._zero: ir.Value | None = None
+        self._names = rewrite.value_names(where)
+
+    def apply(
+        self, node: ir.Node, decision: Decision, weight: QuantizedWeight | None
+    ) -> None:
+        """Rewrite one node to read int8."""
+        for index in decision.activations:
+            value = node.inputs[index]
+            if value is not None:
+                node.replace_input_with(index, self._activation(value, node))
+        at = decision.weight
+        like = None if at is None else node.inputs[at]
+        if weight is not None and at is not None and like is not None:
+            node.replace_input_with(at, self._weight(weight, like, node))
+
+    def _activation(self, value: ir.Value, reader: ir.Node) -> ir.Value:
+        name = str(value.name)
+        if name not in self._activations:
+            step = np.array(scale_of(*self._ranges.tensors[name]))
+            scale = self._constant(step, f"{name}_scale")
+            if self._zero is None:
+                self._zero = self._constant(np.array(0, np.int8), "int8_zero")
+            pair = [scale, self._zero]
+            quantize = self._node("QuantizeLinear", [value, *pair], name, value, reader)
+            quantize.outputs[0].type = ir.TensorType(ir.DataType.INT8)
+            dequantize = self._node(
+                "DequantizeLinear", [quantize.outputs[0], *pair], name, value, reader
+            )
+            producer = value.producer()
+            if producer is None:
+                self._graph.insert_before(self._graph[0], [quantize, dequantize])
+            else:
+                self._graph.insert_after(producer, [quantize, dequantize])
+            self._activations[name] = dequantize.outputs[0]
+        return self._activations[name]
+
+    def _weight(
+        self, weight: QuantizedWeight, like: ir.Value, reader: ir.Node
+    ) -> ir.Value:
+        key = weight.name, weight.axis
+        if key not in self._weights:
+            name, scales = weight.name, weight.scales
+            inputs = [
+                self._constant(weight.integers, f"{name}_int8"),
+                self._constant(scales, f"{name}_scale"),
+                self._constant(np.zeros(scales.shape, np.int8), f"{name}_zero"),
+            ]
+            dequantize = self._node("DequantizeLinear", inputs, name, like, reader)
+            dequantize.outputs[0].shape = ir.Shape(weight.integers.shape)
+            if weight.axis is not None:
+                dequantize.attributes.add(ir.AttrInt64("axis", weight.axis))
+            self._graph.insert_before(reader, dequantize)
+            self._weights[key] = dequantize.outputs[0]
+        return self._weights[key]
+
+    def _constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
+        return rewrite.add_constant(self._graph, array, name, self._names)
+
+    def _node(
+        self,
+        op: str,
+        inputs: list[ir.Value],
+        name: str,
+        like: ir.Value,
+        reader: ir.Node,
+    ) -> ir.Node:
+        unique = rewrite.fresh_name(f"{name}_{op}", self._names)
+        node = ir.node(op, inputs, name=unique)
+        output = node.outputs[0]
+        output.name, output.shape, output.type = unique, like.shape, like.type
+        provenance.inherit(node, [reader], by=BY)
+        return node

@@ -6,8 +6,8 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.targets import tensorrt
 from me2e_compress.targets.onnxruntime import convert, unranged
+from me2e_compress.targets.tensorrt import TensorRT
 from tests.nets import conv_attention
 from tests.targets.onnxruntime.lowered import (
     FULL,
@@ -46,8 +46,8 @@ foreign (float[4,6] x) => (float[4,3] y)
 
 def placed(model: ir.Model, fed: Feeds) -> ir.Model:
     plan = make_plan(model, FULL)
-    ranges = measured(model, tensorrt.tensors(plan, model), fed)
-    return tensorrt.place(model, plan, ranges)
+    ranges = measured(model, TensorRT().tensors(plan, model), fed)
+    return TensorRT().place(model, plan, ranges)
 
 
 def converted(source: ir.Model, fed: Feeds) -> ir.Model:

@@ -11,7 +11,8 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS, LintFinding, tensorrt
+from me2e_compress.targets import TARGETS, LintFinding
+from me2e_compress.targets.tensorrt import TensorRT
 from tests.nets import MODULES, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)
@@ -30,7 +31,7 @@ def placed(rules: str) -> ir.Model:
     model = conv_attention()
     plan = make_plan(model, FULL, RULE_SETS.parse(rules))
     tensors = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
-    return tensorrt.place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+    return TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 
 
 @pytest.mark.parametrize("rules", ["paper", "tensorrt"])

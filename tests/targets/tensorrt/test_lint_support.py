@@ -5,7 +5,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.targets import TARGETS, LintFinding
-from me2e_compress.targets.tensorrt.lint.tables import (
+from me2e_compress.targets.tensorrt.lint.support_matrix import (
     LATER,
     SUPPORTED,
     UNSUPPORTED,

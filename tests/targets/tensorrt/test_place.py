@@ -14,7 +14,7 @@ from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import run_once
-from me2e_compress.targets.tensorrt.place import place
+from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.weights import quantize_weight
 from tests.nets import MODULES, conv_attention, net
 
@@ -49,7 +49,7 @@ def layers(seed: int = 0, opset: int = 17) -> ir.Model:
 def placed(model: ir.Model, reach: float = 3.0) -> ir.Model:
     plan = make_plan(model, FULL)
     tensors = dict.fromkeys(tensors_of(plan, model), (-reach, reach / 2))
-    return place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+    return TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 
 
 def test_weights_are_stored_as_int8_along_their_channels() -> None:
@@ -251,7 +251,7 @@ def test_what_a_concat_joins_is_on_one_scale() -> None:
     plan = make_plan(model, FULL, TensorRTRules())
     tensors = {"a": (-1.0, 1.0), "ab": (-1.0, 4.0)}
 
-    result = place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+    result = TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 
     scales = [
         graph.array_of(node.inputs[1])

@@ -2,11 +2,9 @@
 
 from me2e_compress.targets.base import LintRule, of_opset, valid
 from me2e_compress.targets.tensorrt.lint import (
-    placement,
     qdq,
     support,
 )
-from me2e_compress.targets.tensorrt.lint.restrictions import restrictions
 
 RULES: tuple[LintRule, ...] = (
     valid,
@@ -16,17 +14,17 @@ RULES: tuple[LintRule, ...] = (
     support.element_types,
     support.one_type,
     support.plugins,
-    restrictions,
+    support.restrictions,
     qdq.scales,
     qdq.zero_points,
     qdq.biases,
     qdq.scalars,
     qdq.completeness,
     qdq.integers,
-    placement.channel_scales,
-    placement.repeated_pairs,
-    placement.outputs,
-    placement.branches,
-    placement.half_quantized,
-    placement.float_weights,
+    qdq.channel_scales,
+    qdq.repeated_pairs,
+    qdq.outputs,
+    qdq.branches,
+    qdq.half_quantized,
+    qdq.float_weights,
 )

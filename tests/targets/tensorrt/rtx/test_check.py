@@ -10,7 +10,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import MissingExtraError, RecipeError
 from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import tensorrt
+from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import check
 from tests.nets import MODULES, conv_attention, net
 from tests.targets.tensorrt.test_place import layers
@@ -23,7 +23,7 @@ RTX = pytest.mark.skipif(
 def quantized(model: ir.Model) -> ir.Model:
     plan = make_plan(model, QuantScheme.named("full", MODULES))
     ranges = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
-    placed = tensorrt.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+    placed = TensorRT().place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
     stamp_plan(placed, plan)
     return placed
 

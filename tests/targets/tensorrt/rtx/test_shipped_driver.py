@@ -13,7 +13,8 @@ from me2e_compress.passes import Context
 from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS, tensorrt
+from me2e_compress.targets import TARGETS
+from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import check
 from me2e_compress.zoo.shipped import shipped
 
@@ -35,7 +36,7 @@ def quantized(model: ir.Model, scheme: str, rules: str) -> ir.Model:
     chosen = QuantScheme.named(scheme, map_of(model, None))
     plan = make_plan(model, chosen, RULE_SETS.parse(rules))
     ranges = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
-    placed = tensorrt.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+    placed = TensorRT().place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
     stamp_plan(placed, plan)
     return placed
 
