@@ -46,8 +46,8 @@ from me2e_compress.study import (
 from me2e_compress.study.tables import all_tables
 from me2e_compress.study.workspace import MARKDOWN, Workspace
 from me2e_compress.study.write import write_study
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.workflows.paths import model_path
 
 DRIVER = "highway"
 MODULES = ("track", "map", "motion", "occ")

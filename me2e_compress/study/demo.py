@@ -12,13 +12,13 @@ from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
 from me2e_compress.study.tables import differences, scoreboards
 from me2e_compress.study.write import StudyFiles, write_study
+from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.paths import check_folder
 from me2e_compress.workflows.result import Result, Table
 from me2e_compress.zoo import shipped
 

@@ -13,7 +13,7 @@ from me2e_compress.passes import Pass
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study.check_frames import check_recordings
 from me2e_compress.study.definition import Condition, Scheme, Study, Timing
-from me2e_compress.workflows.paths import model_path
+from me2e_compress.workflows.checks import model_path
 
 
 def load_study(path: str | Path, routes: str | None = None) -> Study:

@@ -14,8 +14,8 @@ from me2e_compress.study.prepared import PreparedScheme, prepare_scheme
 from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
+from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_folder
 
 
 def run_study(

@@ -19,9 +19,13 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import Part, draw, shard
 from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
-from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.checks import (
+    check_count,
+    check_folder,
+    check_output,
+    model_path,
+)
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_folder, check_output, model_path
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table
 

@@ -9,8 +9,8 @@ from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import model_path
 from me2e_compress.workflows.result import Result, Table, table
 
 

@@ -15,10 +15,14 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.runtime.atomic import write_json
+from me2e_compress.workflows.checks import (
+    check_count,
+    check_output,
+    load_map,
+    model_path,
+)
 from me2e_compress.workflows.compress_result import CompressResult, beside
-from me2e_compress.workflows.limits import check_count
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_output, load_map, model_path
 from me2e_compress.zoo.shipped import sample_frames
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]

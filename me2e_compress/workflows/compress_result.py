@@ -5,10 +5,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from me2e_compress.manager import Report, Step, Verification
-from me2e_compress.workflows.result import Result, Table, megabytes, table
-
-AT_LEAST = "≥: nodes of unknown MACs, such as plugins, are not counted"
-"""What a table says of MACs that are a lower bound."""
+from me2e_compress.workflows.result import (
+    AT_LEAST,
+    Result,
+    Table,
+    giga,
+    megabytes,
+    table,
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -98,19 +102,6 @@ def steps_table(steps: Sequence[Step]) -> Table:
         ],
         "\n".join(notes),
     )
-
-
-def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
-    """Write MACs in billions, as a lower bound where those of some nodes are unknown.
-
-    Args:
-        macs: those that are known; None if none are.
-        unknown: of how many nodes they are not known.
-        form: of the number.
-    """
-    if macs is None:
-        return "-"
-    return ("≥ " if unknown else "") + format(macs / 1e9, form)
 
 
 def verification_table(verifications: Iterable[Verification]) -> Table:

@@ -9,6 +9,7 @@ from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.interleaved import RunTimes, time_interleaved
 from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
@@ -16,7 +17,6 @@ from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.paths import check_folder
 from me2e_compress.workflows.result import Result, Table, megabytes, table
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 8, 4

@@ -20,9 +20,8 @@ from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.simulator.routes import pick_routes
-from me2e_compress.workflows.limits import check_number
+from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_folder, model_path
 from me2e_compress.workflows.result import Result, Table, number
 from me2e_compress.workflows.score import driving_score, score_records, scores_table
 

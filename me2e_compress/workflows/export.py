@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from me2e_compress.errors import GraphError
-from me2e_compress.workflows.limits import check_count
-from me2e_compress.workflows.paths import check_output
+from me2e_compress.workflows.checks import check_count, check_output
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.extras import need_closed_loop
-from me2e_compress.workflows.limits import check_count
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_folder, model_path
 from me2e_compress.zoo.stacks import STACKS, find
 from me2e_compress.zoo.synthetic_frames import frames as synthetic
 

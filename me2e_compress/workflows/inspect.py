@@ -10,9 +10,16 @@ from me2e_compress.graph import Port, provenance
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
-from me2e_compress.workflows.compress_result import AT_LEAST, giga
-from me2e_compress.workflows.paths import load_map, model_path
-from me2e_compress.workflows.result import Result, Table, megabytes, number, table
+from me2e_compress.workflows.checks import load_map, model_path
+from me2e_compress.workflows.result import (
+    AT_LEAST,
+    Result,
+    Table,
+    giga,
+    megabytes,
+    number,
+    table,
+)
 
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 

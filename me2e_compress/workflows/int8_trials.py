@@ -12,9 +12,8 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.checks import Given, check_count, check_output, load_map
 from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.paths import Given, check_output, load_map
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 
 

@@ -8,7 +8,7 @@ from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
-from me2e_compress.workflows.paths import model_path
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.result import Result, Table, table
 
 

@@ -21,7 +21,7 @@ from me2e_compress.quantization.plan import (
     save_plan,
 )
 from me2e_compress.quantization.plan.decision import record
-from me2e_compress.workflows.paths import check_output, model_path
+from me2e_compress.workflows.checks import check_output, model_path
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table, table
 

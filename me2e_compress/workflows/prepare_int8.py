@@ -16,7 +16,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.workflows.paths import load_map
+from me2e_compress.workflows.checks import load_map
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,9 +7,8 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.latency_trace import PERCENTILES, LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
-from me2e_compress.workflows.limits import check_count
+from me2e_compress.workflows.checks import check_count, check_output, model_path
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_output, model_path
 from me2e_compress.workflows.result import Result, Table, table
 
 

@@ -8,6 +8,9 @@ from typing import Any
 
 from me2e_compress.errors import MissingPackageError
 
+AT_LEAST = "≥: nodes of unknown MACs, such as plugins, are not counted"
+"""What a table says of MACs that are a lower bound."""
+
 MOST_ROWS = 30
 """Rows of a table in a notebook; the last line says how many more there are."""
 
@@ -97,6 +100,19 @@ def number(value: float | None, form: str = ",.0f") -> str:
 def megabytes(count: float) -> str:
     """Write bytes as MB (1e6)."""
     return f"{count / 1e6:.2f}"
+
+
+def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
+    """Write MACs in billions, as a lower bound where those of some nodes are unknown.
+
+    Args:
+        macs: those that are known; None if none are.
+        unknown: of how many nodes they are not known.
+        form: of the number.
+    """
+    if macs is None:
+        return "-"
+    return ("≥ " if unknown else "") + format(macs / 1e9, form)
 
 
 class Result(abc.ABC):

@@ -12,10 +12,9 @@ from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity import Budget, Candidate, Int8Choice, Trials
 from me2e_compress.sensitivity import search as find
+from me2e_compress.workflows.checks import check_number, model_path
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
-from me2e_compress.workflows.limits import check_number
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import model_path
 from me2e_compress.workflows.result import Result, Table, number, table
 
 

@@ -17,11 +17,15 @@ from me2e_compress.sensitivity import (
     advise,
     analyse,
 )
+from me2e_compress.workflows.checks import (
+    check_count,
+    check_folder,
+    check_number,
+    model_path,
+)
 from me2e_compress.workflows.extras import need_closed_loop
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
-from me2e_compress.workflows.limits import check_count, check_number
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_folder, model_path
 from me2e_compress.workflows.result import Result, Table, megabytes, number, table
 
 

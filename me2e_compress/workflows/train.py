@@ -6,8 +6,8 @@ from pathlib import Path
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.training.course import NO_LATENCY, CourseProgress, RoundResult, run
 from me2e_compress.training.curriculum import FULL, SMALL, SMALL_LATENCY
+from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.paths import check_folder
 from me2e_compress.workflows.result import Result, Table, number, table
 from me2e_compress.workflows.score import score_records
 

@@ -8,7 +8,7 @@ import pytest
 
 from me2e_compress.errors import GraphError
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.workflows.paths import model_path
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.zoo import shipped
 from tests.cli.conftest import Command
 from tests.evaluators.highway.drivers import EXIT, straight_on

@@ -11,7 +11,7 @@ from me2e_compress.evaluators.highway.evaluation_options import engine_of
 from me2e_compress.study import load_study, run_study
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import write_study
-from me2e_compress.workflows.paths import check_folder
+from me2e_compress.workflows.checks import check_folder
 
 Routes = Annotated[
     str | None, typer.Option(help="instead of the study's: all, N, ID,ID")

@@ -1,5 +1,6 @@
-"""Files as users name them: which model a word means, which outputs would do harm."""
+"""What users give, checked before any work: files, folders, models, numbers."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -7,7 +8,7 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
@@ -118,3 +119,30 @@ def _weights(given: Path) -> Iterator[Path]:
         for value in each.initializers.values():
             if isinstance(value.const_value, ir.ExternalTensor):
                 yield Path(value.const_value.path)
+
+
+def check_number(option: str, value: float | None, *, zero: bool = False) -> None:
+    """Refuse anything but a finite number above 0.
+
+    Args:
+        option: its name, for the message.
+        value: what was given; None if nothing was.
+        zero: whether 0 will do too.
+
+    Raises:
+        RecipeError: it is NaN, infinite or too small.
+    """
+    if value is None or (math.isfinite(value) and (value > 0 or (zero and value == 0))):
+        return
+    least = "0 or above" if zero else "above 0"
+    raise RecipeError(f"{option} is {value:g}: it must be a finite number {least}")
+
+
+def check_count(option: str, value: int, least: int = 0) -> None:
+    """Refuse a count that is too small.
+
+    Raises:
+        RecipeError: it is below the least.
+    """
+    if value < least:
+        raise RecipeError(f"{option} is {value}: it must be {least} or more")
