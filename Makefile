@@ -19,7 +19,7 @@ coverage: $(VENV)/.test  ## the same tests, with branch coverage and its floor
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup --cov --cov-report=term:skip-covered
 
 docs: $(VENV)/.docs  ## the API reference, from the docstrings
-	$(BIN)/pdoc -d google -o out/api me2e_compress '!me2e_compress.__main__' '!me2e_compress.cli'
+	$(BIN)/python docs/make_api.py out/api
 
 check: $(VENV)/.test
 	$(BIN)/ruff check .
