@@ -106,7 +106,7 @@ def write_item(name: str, options: Mapping[str, object], *, short: bool = False)
 
 
 def write_value(value: object) -> str:
-    """Write the value of an option; what is no number or list becomes a string."""
+    """Write the value of an option: a number, a list, or else a string."""
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
     if value is None or isinstance(value, bool | int | float | str):

@@ -1,4 +1,4 @@
-"""The admission gate: a route must tell a driver from a sleepwalker.
+"""The admission gate: a route must tell a driver from a blind one.
 
 A route is admitted if the privileged expert solves it and the blind driver, who keeps
 one speed on the route's centre, commits an infraction on it at every one of
