@@ -5,7 +5,7 @@
                                           [--target tensorrt|onnxruntime]
 
 Studies, one after the other: baselines (expert, blind, the driver), ablation (each
-module away), pairs (two away), schemes (float to int8, at no latency and at each
+module away), pairs (two away), variants (float to int8, at no latency and at each
 model's own under one device scale), latency (fewer decisions a second), determinism
 (the driver twice, compared byte by byte). They share OUT, so what one has driven the
 next does not drive again, and a run that was stopped goes on: every route is written
@@ -23,7 +23,7 @@ from pathlib import Path
 
 from benchmarks.driver_records import (
     among_conditions,
-    among_schemes,
+    among_variants,
     losers,
     routes_csv,
     scores_csv,
@@ -31,27 +31,26 @@ from benchmarks.driver_records import (
 from me2e_compress import recipe
 from me2e_compress.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.passes import PASSES, Pass
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study import (
     Condition,
     Listener,
-    Scheme,
     Study,
     Timing,
+    Variant,
     run_study,
 )
 from me2e_compress.study.tables import all_tables
 from me2e_compress.study.workspace import MARKDOWN, Workspace
 from me2e_compress.study.write import write_study
 from me2e_compress.workflows.checks import model_path
+from me2e_compress.workflows.compress import CompressOptions
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 
 DRIVER = "highway"
 MODULES = ("track", "map", "motion", "occ")
-SCHEMES = ("exact", "feature-ext", "prediction", "full")
+VARIANTS = ("exact", "feature-ext", "prediction", "full")
 FPS = (20, 10, 5, 2, 1)
 FLOAT_MEDIAN_S = 0.43
 """Median latency of the float driver on the device imagined."""
@@ -78,40 +77,34 @@ class Bench:
     target: str | None = None
 
     @property
-    def float(self) -> Scheme:
-        return Scheme("float", self.model)
+    def float(self) -> Variant:
+        return Variant("float", self.model)
 
-    def without(self, *modules: str) -> Scheme:
+    def without(self, *modules: str) -> Variant:
         """Drop modules; what read them reads the means over the calibration frames."""
         text = (
             "import-normalize,fold-constants,"
             f"ablate-modules{{drop=[{', '.join(modules)}], fill=means, "
             "drop_outputs=true},eliminate-redundant,fuse-basic"
         )
-        return Scheme(f"minus-{'-'.join(modules)}", self.model, recipe.parse(text))
+        return Variant(f"minus-{'-'.join(modules)}", self.model, recipe.parse(text))
 
-    def compressed(self, name: str) -> Scheme:
+    def compressed(self, name: str) -> Variant:
         """Apply a recipe; its int8 is for the target, where one is chosen."""
         passes = recipe.load(name)
-        if self.target is not None:
-            passes = tuple(self._aimed(each) for each in passes)
-        return Scheme(name, self.model, passes)
-
-    def _aimed(self, current: Pass) -> Pass:
-        if not isinstance(current, QuantizeInt8):
-            return current
-        options = {"scheme": current.scheme, "target": self.target}
-        return PASSES.build(current.name, options)
+        if self.target is not None and any(each.quantizes for each in passes):
+            passes = CompressOptions(target=self.target).passes(passes)
+        return Variant(name, self.model, passes)
 
     def study(
         self,
         title: str,
-        schemes: tuple[Scheme, ...],
+        variants: tuple[Variant, ...],
         conditions: tuple[Condition, ...] = (IDEAL,),
     ) -> Study:
         return Study(
             title,
-            schemes,
+            variants,
             conditions,
             self.float.name,
             self.routes,
@@ -127,7 +120,7 @@ class Bench:
 
 
 def baselines(bench: Bench) -> Study:
-    drivers = (Scheme("expert", "expert"), Scheme("blind", "blind"))
+    drivers = (Variant("expert", "expert"), Variant("blind", "blind"))
     return bench.study("Baselines", (*drivers, bench.float))
 
 
@@ -141,9 +134,9 @@ def pairs(bench: Bench) -> Study:
     return bench.study("Ablation of pairs", (bench.float, *double))
 
 
-def schemes(bench: Bench) -> Study:
-    made = [bench.compressed(name) for name in SCHEMES]
-    return bench.study("Schemes", (bench.float, *made), (IDEAL, DEVICE))
+def variants(bench: Bench) -> Study:
+    made = [bench.compressed(name) for name in VARIANTS]
+    return bench.study("Variants", (bench.float, *made), (IDEAL, DEVICE))
 
 
 def latency(bench: Bench) -> Study:
@@ -151,7 +144,7 @@ def latency(bench: Bench) -> Study:
 
 
 def determinism(bench: Bench) -> Study:
-    again = Scheme("float-again", bench.model)
+    again = Variant("float-again", bench.model)
     return bench.untimed(bench.study("Determinism", (bench.float, again)))
 
 
@@ -159,7 +152,7 @@ STUDIES: Mapping[str, Callable[[Bench], Study]] = {
     "baselines": baselines,
     "ablation": ablation,
     "pairs": pairs,
-    "schemes": schemes,
+    "schemes": variants,
     "latency": latency,
     "determinism": determinism,
 }
@@ -171,9 +164,9 @@ def same_bytes(bench: Bench) -> str:
     first, again = (
         {
             path.name: path.read_bytes()
-            for path in (workspace.results(scheme, IDEAL) / "routes").glob("*.json")
+            for path in (workspace.results(variant, IDEAL) / "routes").glob("*.json")
         }
-        for scheme in determinism(bench).schemes
+        for variant in determinism(bench).variants
     )
     equal = sum(first[name] == again.get(name) for name in first)
     size = sum(map(len, first.values()))
@@ -211,7 +204,7 @@ def one_more(bench: Bench) -> str:
         for pair in combinations(MODULES, 2)
         for name in pair
     ]
-    return among_schemes(Workspace(bench.out), couples, IDEAL).markdown()
+    return among_variants(Workspace(bench.out), couples, IDEAL).markdown()
 
 
 BESIDES: Mapping[str, Callable[[Bench], str]] = {
@@ -230,7 +223,7 @@ def run(bench: Bench, name: str, workers: int) -> None:
     parts = [table.markdown() for table in all_tables(outcome)]
     if name in BESIDES:
         parts.append(BESIDES[name](bench))
-    if len(outcome.schemes) > 1:
+    if len(outcome.variants) > 1:
         parts.append(losers(outcome))
     text = "\n".join(parts)
     write_bytes(folder / MARKDOWN, f"# {study.title}\n\n{text}".encode())

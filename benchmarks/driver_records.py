@@ -9,9 +9,9 @@ from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.study import Condition, Scheme, StudyResult
-from me2e_compress.study.cells import estimate_cell
+from me2e_compress.study import Condition, StudyResult, Variant
 from me2e_compress.study.drives import Drive
+from me2e_compress.study.tables import estimate_cell
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Cell, Table
 
@@ -23,16 +23,16 @@ DIGITS = 4
 
 
 def scores_csv(outcome: StudyResult) -> str:
-    """One row a scheme and condition; what was not measured is empty."""
+    """One row a variant and condition; what was not measured is empty."""
     return _csv([_scores(outcome, drive) for drive in outcome.drives])
 
 
 def routes_csv(outcome: StudyResult) -> str:
-    """One row a scheme, condition and route."""
+    """One row a variant, condition and route."""
     return _csv(
         [
             {
-                "scheme": drive.scheme,
+                "scheme": drive.variant,
                 "condition": drive.condition,
                 "route": each.route,
                 "driving_score_percent": each.driving_score,
@@ -47,32 +47,35 @@ def routes_csv(outcome: StudyResult) -> str:
 
 
 def among_conditions(
-    workspace: Workspace, scheme: Scheme, conditions: Iterable[Condition], to: Condition
+    workspace: Workspace,
+    variant: Variant,
+    conditions: Iterable[Condition],
+    to: Condition,
 ) -> Table:
     """One driver under several conditions minus itself under another one.
 
     Args:
         workspace: Where it was driven.
-        scheme: The driver.
+        variant: The driver.
         conditions: All of them were driven.
         to: The one that is subtracted.
     """
-    reference = _episodes(workspace, scheme, to)
+    reference = _episodes(workspace, variant, to)
     rows = [
         (Cell(each.name), *_cells(difference(episodes, reference)))
         for each in conditions
-        if each != to and (episodes := _episodes(workspace, scheme, each))
+        if each != to and (episodes := _episodes(workspace, variant, each))
     ]
     return Table(
-        f"{scheme.name}: difference to {to.name} on the same routes",
+        f"{variant.name}: difference to {to.name} on the same routes",
         ("condition", "DS, points", "SR, points", "routes better", "routes worse"),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap.",
     )
 
 
-def among_schemes(
-    workspace: Workspace, pairs: Iterable[tuple[Scheme, Scheme]], condition: Condition
+def among_variants(
+    workspace: Workspace, pairs: Iterable[tuple[Variant, Variant]], condition: Condition
 ) -> Table:
     """Each first driver minus the second, under one condition.
 
@@ -89,7 +92,7 @@ def among_schemes(
     ]
     return Table(
         "One more module away",
-        ("schemes", "DS, points", "SR, points", "routes better", "routes worse"),
+        ("variants", "DS, points", "SR, points", "routes better", "routes worse"),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap.",
     )
@@ -98,7 +101,7 @@ def among_schemes(
 def losers(outcome: StudyResult) -> str:
     """Name the drives that are worse than the baseline's beyond doubt."""
     sure = [
-        f"{drive.scheme} ({drive.condition})"
+        f"{drive.variant} ({drive.condition})"
         for drive in outcome.drives
         if drive.difference is not None
         and (high := drive.difference.driving_score.high) is not None
@@ -118,34 +121,34 @@ def _cells(found: PairedDifference) -> tuple[Cell, ...]:
 
 
 def _episodes(
-    workspace: Workspace, scheme: Scheme, condition: Condition
+    workspace: Workspace, variant: Variant, condition: Condition
 ) -> list[Episode]:
-    folder = ResultsFolder.open(workspace.results(scheme, condition))
+    folder = ResultsFolder.open(workspace.results(variant, condition))
     return list(folder.episodes().values())
 
 
 def _driven(
-    workspace: Workspace, scheme: Scheme, condition: Condition
+    workspace: Workspace, variant: Variant, condition: Condition
 ) -> list[Episode]:
     """Give the episodes; none where nobody drove."""
-    if not workspace.results(scheme, condition).is_dir():
+    if not workspace.results(variant, condition).is_dir():
         return []
-    return _episodes(workspace, scheme, condition)
+    return _episodes(workspace, variant, condition)
 
 
 def _scores(outcome: StudyResult, drive: Drive) -> Row:
-    scheme = outcome.scheme(drive.scheme)
+    variant = outcome.variant(drive.variant)
     return {
-        "scheme": drive.scheme,
+        "scheme": drive.variant,
         "condition": drive.condition,
         **_means(drive.scores),
         **_losses(drive.difference),
-        "size_mb": scheme.size_mb.value,
-        "latency_p50_ms": scheme.latency_ms[50].value,
-        "latency_p99_ms": scheme.latency_ms[99].value,
-        "plan_displacement_mean_m": scheme.fidelity.mean_m.value,
-        "plan_displacement_max_m": scheme.fidelity.max_m.value,
-        "plan_sqnr_db": scheme.fidelity.plan_sqnr_db.value,
+        "size_mb": variant.size_mb.value,
+        "latency_p50_ms": variant.latency_ms[50].value,
+        "latency_p99_ms": variant.latency_ms[99].value,
+        "plan_displacement_mean_m": variant.fidelity.mean_m.value,
+        "plan_displacement_max_m": variant.fidelity.max_m.value,
+        "plan_sqnr_db": variant.fidelity.plan_sqnr_db.value,
     }
 
 

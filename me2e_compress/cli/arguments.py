@@ -16,7 +16,7 @@ Scheme = Annotated[
 ]
 Rules = Annotated[str | None, typer.Option(help="of the int8 plan: paper or tensorrt")]
 Target = Annotated[
-    str | None, typer.Option(help="who runs the int8 graph: tensorrt or onnxruntime")
+    str | None, typer.Option(help="runtime of the int8 graph: tensorrt or onnxruntime")
 ]
 Overrides = Annotated[
     Path | None, typer.Option(help="TOML file of exceptions to the int8 plan")

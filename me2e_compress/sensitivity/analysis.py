@@ -60,7 +60,7 @@ def analyse(
 ) -> Sensitivity:
     """Score every module alone, then bisect it to the nodes that cost most.
 
-    Half of a module's nodes is int8 at a time, then half of the guilty half, and so on:
+    Half of a module's nodes is int8 at a time, then half of the costly half, and so on:
     a node among n is found in about 2 log2 n trials. Modules are driven, where the
     trials have a hook for that; halves of modules are not.
 
@@ -104,7 +104,7 @@ def names_of(trials: Trials, module: str) -> tuple[str, ...]:
 
 
 class _Bisection:
-    """The search for the guilty nodes of one module."""
+    """The search for the costly nodes of one module."""
 
     def __init__(
         self, trials: Trials, module: str, names: tuple[str, ...], budget: int
@@ -128,8 +128,8 @@ class _Bisection:
             halves = [
                 (half, self._loss(half)) for half in (group[:middle], group[middle:])
             ]
-            guilty = [each for each in halves if each[1] >= BLAME * loss]
-            open_groups += guilty
+            costly = [each for each in halves if each[1] >= BLAME * loss]
+            open_groups += costly
         found = [each for each in blamed if len(each[0]) < len(self._names)]
         return tuple(sorted(found, key=lambda each: -each[1]))
 

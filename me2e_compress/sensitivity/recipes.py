@@ -16,13 +16,13 @@ def advise(
     limit: float,
     driving_limit: float | None = None,
 ) -> Int8Choice:
-    """Give a choice that keeps the loss within a limit, and floats little for it.
+    """Choose what keeps the loss within a limit, with as little in float as possible.
 
     Starts with all modules in int8. Until the measured losses are within the limits,
     the costliest module first gives up the nodes that are to blame, the worst first,
     then all of them. Then each that was given up, the last first, is int8 again if
-    the losses stay within the limits: errors may cancel, or one culprit hide behind
-    another.
+    the losses stay within the limits: errors may cancel, or one costly node hide
+    behind another.
 
     Args:
         trials: judges variants.
@@ -78,7 +78,7 @@ def _sacrifices(found: Sensitivity) -> list[_Sacrifice]:
 def _without(
     trials: Trials, found: Sensitivity, given: Sequence[_Sacrifice]
 ) -> Int8Choice:
-    """Give the choice of all modules but what was given up."""
+    """Return the choice of all modules but what was given up."""
     gone = {each.module for each in given if each.nodes is None}
     names = dict[str, list[str]]()
     for each in given:
@@ -113,7 +113,7 @@ def write_recipe(
         choice: what is int8.
         passes: names of the passes before int8.
         rules: rule set of the plan.
-        target: who will run the graph.
+        target: runtime of the int8 graph.
 
     Returns:
         The file of overrides; None where none is needed.

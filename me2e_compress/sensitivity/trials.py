@@ -35,7 +35,7 @@ class Int8Choice:
     floats: tuple[str, ...] = ()
 
     def overrides(self) -> Overrides:
-        """Give the exceptions that keep the nodes float."""
+        """Build the overrides that keep the nodes in float."""
         return Overrides(
             override=tuple(
                 Override(dtype=FLOAT, nodes=name.translate(_GLOB), reason="sensitive")
@@ -129,7 +129,7 @@ class Trials:
         return make_plan(self.model, scheme, self._rules, choice.overrides())
 
     def variant(self, choice: Int8Choice) -> ir.Model:
-        """Give the graph of a choice."""
+        """Build the graph of a choice."""
         if not choice.modules:
             return self.model
         return self._target.place(self.model, self.plan(choice), self.ranges)
@@ -139,7 +139,7 @@ class Trials:
 
         Raises:
             GraphError: onnxruntime cannot run the variant.
-            EvaluationError: an output is no number.
+            EvaluationError: an output is not finite.
         """
         if choice not in self._known:
             graph_of_choice = self.variant(choice)

@@ -1,6 +1,6 @@
-"""Schemes held against each other: size, latency, fidelity and the road."""
+"""Variants held against each other: size, latency, fidelity and the road."""
 
-from me2e_compress.study.definition import Condition, Scheme, Study, Timing
+from me2e_compress.study.definition import Condition, Study, Timing, Variant
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
@@ -9,10 +9,10 @@ from me2e_compress.workflows.listener import Listener
 __all__ = [
     "Condition",
     "Listener",
-    "Scheme",
     "Study",
     "StudyResult",
     "Timing",
+    "Variant",
     "load_study",
     "run_study",
 ]

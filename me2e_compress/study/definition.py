@@ -1,4 +1,4 @@
-"""What a study is: schemes, the conditions they drive under, the one they face."""
+"""What a study is: variants, the conditions they drive under, the one they face."""
 
 import re
 from collections import Counter
@@ -6,9 +6,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import driver_named
-from me2e_compress.errors import StudyError
+from me2e_compress.errors import FramesError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.simulator.routes import Route
@@ -20,7 +21,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
 
 @dataclass(frozen=True)
-class Scheme:
+class Variant:
     """One way to have a driver: a file as it is, or what passes make of it.
 
     Args:
@@ -44,11 +45,11 @@ class Scheme:
 
     def __post_init__(self) -> None:
         """Refuse what could not be run."""
-        _check_name("scheme", self.name)
+        _check_name("variant", self.name)
         options = (self.passes, self.module_map, self.adapter, self.trace)
         if not self.is_model and any(options):
             raise StudyError(
-                f"scheme {self.name}: {self.policy} is no model: there is nothing "
+                f"variant {self.name}: {self.policy} is not a model: there is nothing "
                 "to compress, adapt or time"
             )
 
@@ -63,7 +64,7 @@ class Condition:
     """What decisions cost.
 
     Args:
-        name: As a scheme's.
+        name: As a variant's.
         latency: ``none``, ``fps:F``, or ``trace``: each model's own latencies.
 
     Raises:
@@ -124,13 +125,13 @@ class Timing:
 
 @dataclass(frozen=True)
 class Study:
-    """Schemes x conditions on the same routes.
+    """Variants x conditions on the same routes.
 
     Args:
         title: Heads the report.
-        schemes: In the order of the tables.
+        variants: In the order of the tables.
         conditions: In the order of the tables.
-        baseline: Name of the scheme that the others are held against.
+        baseline: Name of the variant that the others are held against.
         routes: What each of them drives.
         set_size: How many routes the whole set has.
         frames: Folder of recorded frames that passes calibrate on.
@@ -139,12 +140,12 @@ class Study:
         seed: Of bootstraps, of passes and of draws from traces.
 
     Raises:
-        StudyError: Nothing to drive, a name twice, a baseline that is no scheme, a
+        StudyError: Nothing to drive, a name twice, a baseline that is not a variant, a
             negative seed, or passes or a trace that need frames where there are none.
     """
 
     title: str
-    schemes: tuple[Scheme, ...]
+    variants: tuple[Variant, ...]
     conditions: tuple[Condition, ...]
     baseline: str
     routes: tuple[Route, ...]
@@ -156,12 +157,13 @@ class Study:
 
     def __post_init__(self) -> None:
         """Refuse what could not be finished."""
-        _unique("scheme", (scheme.name for scheme in self.schemes))
+        _unique("variant", (variant.name for variant in self.variants))
         _unique("condition", (condition.name for condition in self.conditions))
-        names = [scheme.name for scheme in self.schemes]
+        names = [variant.name for variant in self.variants]
         if self.baseline not in names:
             raise StudyError(
-                f"baseline {self.baseline!r} is no scheme; there are {', '.join(names)}"
+                f"baseline {self.baseline!r} is not a variant; there are"
+                f" {', '.join(names)}"
             )
         if not self.routes:
             raise StudyError(f"{self.title}: there is no route to drive")
@@ -171,17 +173,17 @@ class Study:
 
     def _check_frames(self) -> None:
         needy = [
-            (scheme.name, each.name)
-            for scheme in self.schemes
-            for each in scheme.passes
+            (variant.name, each.name)
+            for variant in self.variants
+            for each in variant.passes
             if each.needs_frames
         ]
         if needy and self.frames is None:
             raise StudyError(
-                f"scheme {needy[0][0]}: {needy[0][1]} measures on recorded frames, and "
-                "there are none (frames = FRAMES)"
+                f"variant {needy[0][0]}: {needy[0][1]} measures on recorded frames,"
+                " and there are none (frames = FRAMES)"
             )
-        untimed = [each for each in self.schemes if each.is_model and not each.trace]
+        untimed = [each for each in self.variants if each.is_model and not each.trace]
         traced = [each.name for each in self.conditions if each.traced]
         if traced and untimed and self.held_out is None:
             raise StudyError(
@@ -192,15 +194,29 @@ class Study:
     def inputs(self) -> Iterator[str | Path]:
         """List the files and folders that it reads."""
         yield from filter(None, (self.frames, self.held_out))
-        for each in self.schemes:
+        for each in self.variants:
             named = (each.policy, each.module_map, each.adapter, each.trace)
             yield from filter(None, named)
             yield from (file for step in each.passes for file in step.files())
 
+    def check_recordings(self) -> None:
+        """Open the recordings that it names.
+
+        Raises:
+            StudyError: One of them is not a recording.
+        """
+        for name, folder in (("frames", self.frames), ("held_out", self.held_out)):
+            if folder is None:
+                continue
+            try:
+                CalibrationSet(folder)
+            except FramesError as error:
+                raise StudyError(f"{name}: {error}") from error
+
     @property
-    def reference(self) -> Scheme:
+    def reference(self) -> Variant:
         """The baseline."""
-        return next(each for each in self.schemes if each.name == self.baseline)
+        return next(each for each in self.variants if each.name == self.baseline)
 
 
 def _check_name(kind: str, name: str) -> None:

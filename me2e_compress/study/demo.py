@@ -7,7 +7,7 @@ from pathlib import Path
 from me2e_compress import recipe
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.simulator.routes import load_routes, pick_routes
-from me2e_compress.study.definition import Condition, Scheme, Study, Timing
+from me2e_compress.study.definition import Condition, Study, Timing, Variant
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
 from me2e_compress.study.tables import differences, scoreboards
@@ -121,17 +121,17 @@ class DriverDemo:
         return compare_modules(self._source, self._small)
 
     def compare(self, listener: Listener) -> Result:
-        """Hold the small graph against the driver on other frames."""
+        """Compare the small graph with the driver on other frames."""
         return compare(self._source, self._small, self._held_out, listener)
 
     def drive(self, listener: Listener) -> DriveResult:
-        """Let both drive the routes, and write the report."""
+        """Drive the routes with both, and write the report."""
         everything = load_routes()
         study = Study(
             f"{self.name} before and after {self.scheme}",
             (
-                Scheme(FLOAT, str(self._source)),
-                Scheme(self.scheme, str(self._small)),
+                Variant(FLOAT, str(self._source)),
+                Variant(self.scheme, str(self._small)),
             ),
             (Condition("ideal", "none"),),
             FLOAT,

@@ -1,4 +1,4 @@
-"""Every scheme under every condition, driven and scored."""
+"""Every variant under every condition, driven and scored."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.study.definition import Condition, Study
-from me2e_compress.study.prepared import PreparedScheme
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
 from me2e_compress.study.workspace import Workspace
@@ -22,10 +22,10 @@ from me2e_compress.workflows.listener import Listener
 
 @dataclass(frozen=True)
 class Drive:
-    """One scheme under one condition.
+    """One variant under one condition.
 
     Attributes:
-        scheme: Its name.
+        variant: Its name.
         condition: Its name.
         scores: Over all routes; None where it was not driven.
         difference: To the baseline under the same condition, paired by route; None
@@ -34,7 +34,7 @@ class Drive:
         reason: Why it was not driven; empty if it was.
     """
 
-    scheme: str
+    variant: str
     condition: str
     scores: Scores | None
     difference: PairedDifference | None = None
@@ -44,7 +44,7 @@ class Drive:
     def to_json(self) -> dict[str, Any]:
         """Return scores, difference and routes."""
         return {
-            "scheme": self.scheme,
+            "scheme": self.variant,
             "condition": self.condition,
             "reason": self.reason or None,
             "scores": self.scores.to_json() if self.scores else None,
@@ -54,15 +54,15 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class Road:
+class DriveSetup:
     """What all drives of a study share.
 
     Args:
-        study: Schemes, conditions, routes.
+        study: Variants, conditions, routes.
         clock: Latencies of the models.
         workspace: Where results go.
         engine: Where routes are driven.
-        listener: Who is told.
+        listener: Is called with progress and warnings.
     """
 
     study: Study
@@ -72,15 +72,15 @@ class Road:
     listener: Listener
 
     def under(
-        self, condition: Condition, contenders: Sequence[PreparedScheme]
+        self, condition: Condition, prepared: Sequence[PreparedVariant]
     ) -> tuple[Drive, ...]:
-        """Drive all schemes under one condition, the baseline first.
+        """Drive all variants under one condition, the baseline first.
 
         Raises:
             EvaluationError: A folder is of another evaluation or cannot be written.
         """
-        names = [each.scheme.name for each in contenders]
-        baseline = contenders[names.index(self.study.baseline)]
+        names = [each.variant.name for each in prepared]
+        baseline = prepared[names.index(self.study.baseline)]
         reference = self._episodes(baseline, condition)
         return tuple(
             self._drive(
@@ -89,45 +89,45 @@ class Road:
                 reference if each is baseline else self._episodes(each, condition),
                 None if each is baseline else reference,
             )
-            for each in contenders
+            for each in prepared
         )
 
-    def job(self, contender: PreparedScheme, condition: Condition) -> Job | None:
+    def job(self, prepared: PreparedVariant, condition: Condition) -> Job | None:
         """Return who drives under what; None if its latency is not known."""
-        latency = self.clock.source(contender.scheme, condition, self.study.seed)
+        latency = self.clock.source(prepared.variant, condition, self.study.seed)
         if latency is None:
             return None
-        size = image_size_of(contender.driver.open())
-        return Job(contender.driver, Conditions(latency, image_size=size))
+        size = image_size_of(prepared.driver.open())
+        return Job(prepared.driver, Conditions(latency, image_size=size))
 
     def _episodes(
-        self, contender: PreparedScheme, condition: Condition
+        self, prepared: PreparedVariant, condition: Condition
     ) -> tuple[Episode, ...] | None:
-        job = self.job(contender, condition)
+        job = self.job(prepared, condition)
         if job is None:
             return None
         evaluator = HighwayEvaluator(
             job,
             self.study.routes,
-            self.workspace.results(contender.scheme, condition),
+            self.workspace.results(prepared.variant, condition),
             self.study.set_size,
             self.engine,
-            self._teller(f"{contender.scheme.name}, {condition.name}"),
+            self._teller(f"{prepared.variant.name}, {condition.name}"),
             self.listener.on_warning,
         )
         return tuple(evaluator.episodes())
 
     def _drive(
         self,
-        contender: PreparedScheme,
+        prepared: PreparedVariant,
         condition: Condition,
         episodes: tuple[Episode, ...] | None,
         reference: tuple[Episode, ...] | None,
     ) -> Drive:
-        name, seed = contender.scheme.name, self.study.seed
+        name, seed = prepared.variant.name, self.study.seed
         if episodes is None:
             why = "no model: it has no latency of its own"
-            if contender.model is not None:
+            if prepared.model is not None:
                 why = f"its latency was not measured: {self.clock.reason}"
             return Drive(name, condition.name, None, reason=why)
         return Drive(

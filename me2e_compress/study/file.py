@@ -3,7 +3,7 @@
 import tomllib
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress import recipe
 from me2e_compress.driving.policies import driver_named
@@ -11,8 +11,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
-from me2e_compress.study.check_frames import check_recordings
-from me2e_compress.study.definition import Condition, Scheme, Study, Timing
+from me2e_compress.study.definition import Condition, Study, Timing, Variant
 from me2e_compress.workflows.checks import model_path
 
 
@@ -45,7 +44,7 @@ def load_study(path: str | Path, routes: str | None = None) -> Study:
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
     study = _Reader(path).study(table, routes)
-    check_recordings(study)
+    study.check_recordings()
     return study
 
 
@@ -53,7 +52,7 @@ class _Table(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-class _Scheme(_Table):
+class _Variant(_Table):
     name: str
     policy: str
     recipe: str | None = None
@@ -82,19 +81,21 @@ class _Study(_Table):
     frames: str | None = None
     held_out: str | None = None
     latency: _Latency = Field(default_factory=_Latency)
-    scheme: list[_Scheme]
+    variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
+    """Files written before variants had their name say ``[[scheme]]``."""
     condition: list[_Condition]
 
 
 _KINDS: dict[object, type[_Table]] = {
-    "scheme": _Scheme,
+    "variant": _Variant,
+    "scheme": _Variant,
     "condition": _Condition,
     "latency": _Latency,
 }
 
 
 def _complaint(error: ValidationError) -> str:
-    """Say what is wrong first: a key nobody knows explains one that is missing."""
+    """Describe the first error; an unknown key goes first, it may explain others."""
     found = error.errors(include_url=False)
     unknown = [each for each in found if each["type"] == "extra_forbidden"]
     first = (unknown or found)[0]
@@ -116,7 +117,7 @@ class _Reader:
         driven, set_size = self._routes(routes or str(table.routes))
         return Study(
             title=table.title,
-            schemes=tuple(self._scheme(each) for each in table.scheme),
+            variants=tuple(self._variant(each) for each in table.variant),
             conditions=tuple(
                 Condition(each.name, each.latency) for each in table.condition
             ),
@@ -129,14 +130,14 @@ class _Reader:
             seed=table.seed,
         )
 
-    def _scheme(self, table: _Scheme) -> Scheme:
+    def _variant(self, table: _Variant) -> Variant:
         policy, adapter = table.policy, table.adapter
         driver = driver_named(policy)
         if isinstance(driver, OnnxDriver):
             policy = str(model_path(driver.path, self.path.parent))
             if adapter is None and driver.adapter is not None:
                 adapter = str(driver.adapter)
-        return Scheme(
+        return Variant(
             table.name,
             policy,
             self._passes(table),
@@ -145,10 +146,10 @@ class _Reader:
             self._file(table.trace),
         )
 
-    def _passes(self, table: _Scheme) -> tuple[Pass, ...]:
+    def _passes(self, table: _Variant) -> tuple[Pass, ...]:
         if table.recipe is not None and table.passes is not None:
             raise StudyError(
-                f"{self.path}: scheme {table.name}: give a recipe or passes, not both"
+                f"{self.path}: variant {table.name}: give a recipe or passes, not both"
             )
         if table.passes is not None:
             return recipe.parse(table.passes)

@@ -9,8 +9,8 @@ from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.profile import processor
 from me2e_compress.study.definition import Condition, Study
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.plan_fidelity import Faithfulness, measure_json
-from me2e_compress.study.prepared import PreparedScheme
+from me2e_compress.study.plan_fidelity import PlanFidelity, measure_json
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.tables import all_tables
 from me2e_compress.study.timing import Clock
@@ -20,36 +20,36 @@ LATENCY_PERCENTILES = (50, 99)
 
 
 @dataclass(frozen=True)
-class SchemeOutcome:
-    """What a scheme is, apart from how it drives.
+class VariantOutcome:
+    """What a variant is, apart from how it drives.
 
     Attributes:
-        contender: Its driver and its file.
+        prepared: Its driver and its file.
         size_mb: Of the file with its weights, 1e6 bytes.
         latency_ms: Percentile to milliseconds on the device.
         fidelity: Its plan against the baseline's.
     """
 
-    contender: PreparedScheme
+    prepared: PreparedVariant
     size_mb: Measure
     latency_ms: Mapping[int, Measure]
-    fidelity: Faithfulness
+    fidelity: PlanFidelity
 
     @property
     def name(self) -> str:
-        """The scheme's name."""
-        return self.contender.scheme.name
+        """The variant's name."""
+        return self.prepared.variant.name
 
     @classmethod
     def of(
-        cls, contender: PreparedScheme, clock: Clock, fidelity: Faithfulness
-    ) -> "SchemeOutcome":
-        """Put together what was found."""
-        size = contender.size_bytes
-        name = contender.scheme.name
-        why = "no model" if contender.model is None else clock.reason
+        cls, prepared: PreparedVariant, clock: Clock, fidelity: PlanFidelity
+    ) -> "VariantOutcome":
+        """Collect what was found."""
+        size = prepared.size_bytes
+        name = prepared.variant.name
+        why = "no model" if prepared.model is None else clock.reason
         return cls(
-            contender,
+            prepared,
             Measure(None, "MB", "no model") if size is None else _mb(size),
             {
                 percent: _ms(clock.milliseconds(name, percent), why)
@@ -59,13 +59,13 @@ class SchemeOutcome:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return what the scheme is; all that was measured by a clock is `latency`."""
-        contender = self.contender
+        """Return what the variant is; all that was measured by a clock is `latency`."""
+        prepared = self.prepared
         return {
             "name": self.name,
-            "policy": contender.scheme.policy,
-            "pipeline": contender.pipeline or None,
-            "model_sha256": contender.sha256,
+            "policy": prepared.variant.policy,
+            "pipeline": prepared.pipeline or None,
+            "model_sha256": prepared.sha256,
             "size": measure_json(self.size_mb),
             "fidelity": self.fidelity.to_json(),
             "latency": {
@@ -81,8 +81,8 @@ class StudyResult(Result):
 
     Attributes:
         study: What was asked.
-        schemes: One a scheme, in the study's order.
-        drives: Condition by condition, the schemes in the study's order.
+        variants: One a variant, in the study's order.
+        drives: Condition by condition, the variants in the study's order.
         contrasts: The same moments as two drivers lived them.
         device_scale: How many times slower the device is than the machine timed on.
         machine: What it was made on, in words.
@@ -90,7 +90,7 @@ class StudyResult(Result):
     """
 
     study: Study
-    schemes: tuple[SchemeOutcome, ...]
+    variants: tuple[VariantOutcome, ...]
     drives: tuple[Drive, ...]
     contrasts: tuple[Contrast, ...]
     device_scale: float
@@ -99,15 +99,15 @@ class StudyResult(Result):
 
     @property
     def timed(self) -> bool:
-        """Whether the latency of any scheme is known."""
-        return any(each.latency_ms[50].value is not None for each in self.schemes)
+        """Whether the latency of any variant is known."""
+        return any(each.latency_ms[50].value is not None for each in self.variants)
 
     @property
     def headline(self) -> str:
-        """Title, schemes, conditions, routes."""
+        """Title, variants, conditions, routes."""
         study = self.study
         return (
-            f"{study.title}: {len(study.schemes)} schemes under"
+            f"{study.title}: {len(study.variants)} variants under"
             f" {len(study.conditions)} conditions on {len(study.routes)} of"
             f" {study.set_size} routes"
         )
@@ -125,7 +125,7 @@ class StudyResult(Result):
         return [self._record(each) for each in self.drives]
 
     def _record(self, drive: Drive) -> dict[str, object]:
-        scores, of = drive.scores, self.scheme(drive.scheme)
+        scores, of = drive.scores, self.variant(drive.variant)
         found = (
             {}
             if scores is None
@@ -137,7 +137,7 @@ class StudyResult(Result):
             }
         )
         return {
-            "scheme": drive.scheme,
+            "scheme": drive.variant,
             "condition": drive.condition,
             **found,
             "size_mb": of.size_mb.value,
@@ -149,9 +149,9 @@ class StudyResult(Result):
         """Return the drives under one condition."""
         return tuple(each for each in self.drives if each.condition == condition.name)
 
-    def scheme(self, name: str) -> SchemeOutcome:
-        """Return a scheme by its name."""
-        return next(each for each in self.schemes if each.name == name)
+    def variant(self, name: str) -> VariantOutcome:
+        """Return a variant by its name."""
+        return next(each for each in self.variants if each.name == name)
 
     def to_json(self) -> dict[str, Any]:
         """Return a document; the same study and seed give the same bytes but latency.
@@ -173,7 +173,7 @@ class StudyResult(Result):
                 "samples": study.timing.samples,
                 "threads": study.timing.threads,
             },
-            "schemes": [each.to_json() for each in self.schemes],
+            "schemes": [each.to_json() for each in self.variants],
             "drives": [each.to_json() for each in self.drives],
             "machine": self.machine,
             "versions": dict(self.versions),

@@ -1,4 +1,4 @@
-"""How far a scheme's plan moves from the baseline's, before anything drives."""
+"""How far a variant's plan moves from the baseline's, before anything drives."""
 
 import math
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.study.definition import Study
-from me2e_compress.study.prepared import PreparedScheme
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.workflows.listener import Listener
 
 EXACT = "no noise: equal to the bit"
@@ -21,8 +21,8 @@ EXACT = "no noise: equal to the bit"
 
 
 @dataclass(frozen=True)
-class Faithfulness:
-    """The plan of a scheme held against the baseline's on held-out frames.
+class PlanFidelity:
+    """The plan of a variant held against the baseline's on held-out frames.
 
     Attributes:
         mean_m: Mean displacement of the waypoints.
@@ -37,7 +37,7 @@ class Faithfulness:
     frames: int = 0
 
     @classmethod
-    def unknown(cls, reason: str) -> "Faithfulness":
+    def unknown(cls, reason: str) -> "PlanFidelity":
         """Nothing was compared."""
         return cls(
             Measure(None, "m", reason),
@@ -57,35 +57,35 @@ class Faithfulness:
 
 def judge(
     study: Study,
-    baseline: PreparedScheme,
-    contender: PreparedScheme,
+    baseline: PreparedVariant,
+    prepared: PreparedVariant,
     listener: Listener,
-) -> Faithfulness:
+) -> PlanFidelity:
     """Run both models over the held-out frames.
 
-    A model whose inputs or outputs are others is no error: it was not measured, and
-    the reason says why.
+    A model with other inputs or outputs is not an error: it was not measured, and the
+    reason says why.
     """
     if study.held_out is None:
-        return Faithfulness.unknown("no held-out frames were given")
-    if contender.model is None or baseline.model is None:
-        lacks = contender if contender.model is None else baseline
-        return Faithfulness.unknown(f"{lacks.scheme.name} is no model")
-    if contender is baseline:
-        return Faithfulness.unknown("the baseline itself")
+        return PlanFidelity.unknown("no held-out frames were given")
+    if prepared.model is None or baseline.model is None:
+        lacks = prepared if prepared.model is None else baseline
+        return PlanFidelity.unknown(f"{lacks.variant.name} is not a model")
+    if prepared is baseline:
+        return PlanFidelity.unknown("the baseline itself")
     recording = CalibrationSet(study.held_out)
-    stage = f"fidelity of {contender.scheme.name}"
-    left, right = Session(baseline.model), Session(contender.model)
+    stage = f"fidelity of {prepared.variant.name}"
+    left, right = Session(baseline.model), Session(prepared.model)
 
-    def told() -> Iterator[Frame]:
+    def reported() -> Iterator[Frame]:
         for frame in recording:
             listener.on_progress(stage, frame.index, len(recording), "frames")
             yield frame
 
     try:
-        found = compare(left, right, told())
+        found = compare(left, right, reported())
     except (EvaluationError, FramesError) as error:
-        return Faithfulness.unknown(str(error))
+        return PlanFidelity.unknown(str(error))
     return _of(found, right)
 
 
@@ -98,9 +98,9 @@ def measure_json(measure: Measure) -> dict[str, float | str | None]:
     }
 
 
-def _of(found: Fidelity, session: Session) -> Faithfulness:
+def _of(found: Fidelity, session: Session) -> PlanFidelity:
     if found.plan is None:
-        return Faithfulness.unknown(found.plan_reason)
+        return PlanFidelity.unknown(found.plan_reason)
     adapter = PlanAdapter.of(session.metadata, list(session.outputs))
     sqnr_db = next(
         (
@@ -111,7 +111,7 @@ def _of(found: Fidelity, session: Session) -> Faithfulness:
         math.nan,
     )
     exact = sqnr_db == math.inf
-    return Faithfulness(
+    return PlanFidelity(
         Measure(found.plan.mean_m, "m"),
         Measure(found.plan.max_m, "m"),
         Measure(sqnr_db, "dB")

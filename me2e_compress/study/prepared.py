@@ -14,7 +14,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.modules import ModuleMap
 from me2e_compress.recipe import to_text
-from me2e_compress.study.definition import Scheme, Study
+from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
@@ -23,11 +23,11 @@ from me2e_compress.workflows.listener import Listener
 
 
 @dataclass(frozen=True)
-class PreparedScheme:
-    """A scheme whose driver is ready.
+class PreparedVariant:
+    """A variant whose driver is ready.
 
     Attributes:
-        scheme: Which.
+        variant: Which.
         driver: What drives.
         model: The ONNX file; None for a driver without one.
         source: Name of the file that passes were applied to.
@@ -36,7 +36,7 @@ class PreparedScheme:
         size_bytes: Of the model with its weights.
     """
 
-    scheme: Scheme
+    variant: Variant
     driver: Driver
     model: Path | None = None
     source: str = ""
@@ -45,37 +45,37 @@ class PreparedScheme:
     size_bytes: int | None = None
 
 
-def prepare_scheme(
-    study: Study, scheme: Scheme, workspace: Workspace, listener: Listener
-) -> PreparedScheme:
-    """Find or make a scheme's driver, and open it once.
+def prepare_variant(
+    study: Study, variant: Variant, workspace: Workspace, listener: Listener
+) -> PreparedVariant:
+    """Find or make a variant's driver, and open it once.
 
     Raises:
         StudyError: No such model, or a file that a pass reads is missing.
         EvaluationError: It cannot drive.
         Me2eError: A pass refused the graph or broke.
     """
-    driver = driver_named(scheme.policy, scheme.adapter)
+    driver = driver_named(variant.policy, variant.adapter)
     if not isinstance(driver, OnnxDriver):
         driver.open()
-        return PreparedScheme(scheme, driver)
+        return PreparedVariant(variant, driver)
     model = source = driver.path
     if not source.is_file():
-        raise StudyError(f"scheme {scheme.name}: {source}: no such model")
-    if scheme.passes:
-        model = _compressed(study, scheme, workspace, listener)
+        raise StudyError(f"variant {variant.name}: {source}: no such model")
+    if variant.passes:
+        model = _compressed(study, variant, workspace, listener)
     driver = replace(driver, path=model)
     driver.open()
     sha256 = graph.sha256_of(model)
-    origin = source.name, to_text(scheme.passes)
-    if not scheme.passes:
-        origin = _told_beside(model, sha256) or origin
-    return PreparedScheme(
-        scheme, driver, model, *origin, sha256, graph.file_bytes(model)
+    origin = source.name, to_text(variant.passes)
+    if not variant.passes:
+        origin = _reported_beside(model, sha256) or origin
+    return PreparedVariant(
+        variant, driver, model, *origin, sha256, graph.file_bytes(model)
     )
 
 
-def _told_beside(model: Path, sha256: str) -> tuple[str, str] | None:
+def _reported_beside(model: Path, sha256: str) -> tuple[str, str] | None:
     """Read source and passes from the report beside a file, if it is of this file."""
     report = _report_of(model)
     if report is None or report.output.sha256 != sha256:
@@ -86,7 +86,7 @@ def _told_beside(model: Path, sha256: str) -> tuple[str, str] | None:
 def _unaltered(model: Path) -> bool:
     """Whether a file is the one that its report was written of."""
     try:
-        return _told_beside(model, graph.sha256_of(model)) is not None
+        return _reported_beside(model, graph.sha256_of(model)) is not None
     except (OSError, DecodeError):
         return False
 
@@ -110,48 +110,50 @@ class _Report(BaseModel):
 
 
 def _compressed(
-    study: Study, scheme: Scheme, workspace: Workspace, listener: Listener
+    study: Study, variant: Variant, workspace: Workspace, listener: Listener
 ) -> Path:
     """Apply the passes, unless the same was done before; the report is written last.
 
     What is there is taken if it is still the file that its report was written of.
     """
-    source = Path(scheme.policy)
+    source = Path(variant.policy)
     frames = None if study.frames is None else CalibrationSet(study.frames)
-    path = workspace.model(scheme, _key(scheme, source, frames, study.seed))
+    path = workspace.model(variant, _key(variant, source, frames, study.seed))
     if path.is_file() and beside(path, "report").is_file():
         if _unaltered(path):
             return path
         listener.on_warning(f"{path}: not what its report is of: made again")
-    stage = f"compress {scheme.name}"
+    stage = f"compress {variant.name}"
 
-    def told(_: str, done: int, total: int, words: str) -> None:
+    def report(_: str, done: int, total: int, words: str) -> None:
         listener.on_progress(stage, done, total, words)
 
-    options = CompressOptions(module_map=scheme.module_map, seed=study.seed)
-    compress(source, path, scheme.passes, study.frames, options, Listener(told))
+    options = CompressOptions(module_map=variant.module_map, seed=study.seed)
+    compress(source, path, variant.passes, study.frames, options, Listener(report))
     return path
 
 
-def _key(scheme: Scheme, source: Path, frames: CalibrationSet | None, seed: int) -> str:
+def _key(
+    variant: Variant, source: Path, frames: CalibrationSet | None, seed: int
+) -> str:
     """Hash everything that decides what the passes make."""
-    modules = scheme.module_map
+    modules = variant.module_map
     decisive = (
         __version__,
         graph.sha256_of(source),
-        to_text(scheme.passes),
+        to_text(variant.passes),
         "" if frames is None else frames.fingerprint,
         "" if modules is None else repr(ModuleMap.load(modules)),
         str(seed),
-        *(_content(scheme, file) for each in scheme.passes for file in each.files()),
+        *(_content(variant, file) for each in variant.passes for file in each.files()),
     )
     return hashlib.sha256("\n".join(decisive).encode()).hexdigest()
 
 
-def _content(scheme: Scheme, file: Path) -> str:
+def _content(variant: Variant, file: Path) -> str:
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
         raise StudyError(
-            f"scheme {scheme.name}: {file}: cannot be read: {error.strerror}"
+            f"variant {variant.name}: {file}: cannot be read: {error.strerror}"
         ) from error

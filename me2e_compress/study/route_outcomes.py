@@ -91,7 +91,7 @@ def _outcome(
 
 
 def _apart(one: Episode, other: Episode) -> tuple[float | None, int | None]:
-    """Give the greatest distance at the same time, metres, and that time."""
+    """Return the greatest distance at the same time, metres, and that time."""
     count = min(len(one.frames), len(other.frames))
     if not count:
         return None, None

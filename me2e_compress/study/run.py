@@ -4,13 +4,12 @@ from pathlib import Path
 
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.manager.report import versions
-from me2e_compress.study.check_frames import check_recordings
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drives import Road
+from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.file import load_study
-from me2e_compress.study.outcome import SchemeOutcome, StudyResult, this_machine
+from me2e_compress.study.outcome import StudyResult, VariantOutcome, this_machine
 from me2e_compress.study.plan_fidelity import judge
-from me2e_compress.study.prepared import PreparedScheme, prepare_scheme
+from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
@@ -28,13 +27,13 @@ def run_study(
     """Make the models, time them, hold them against the baseline, drive them.
 
     Run again with the same folder it goes on: models, traces and routes that are there
-    are not made again. Studies may share a folder where they share schemes.
+    are not made again. Studies may share a folder where they share variants.
 
     Args:
         study: What is asked, or its TOML file.
         folder: Where models, traces and results go.
         engine: Where routes are driven; None for one process of this machine.
-        listener: Who is told how it goes.
+        listener: Is called with progress and warnings.
         pictures: On how many routes two drives are shown side by side.
 
     Raises:
@@ -45,21 +44,22 @@ def run_study(
     study, folder = _read(study), Path(folder)
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     workspace = Workspace(folder)
-    contenders = [
-        prepare_scheme(study, scheme, workspace, listener) for scheme in study.schemes
+    prepared = [
+        prepare_variant(study, variant, workspace, listener)
+        for variant in study.variants
     ]
-    clock = time_all(study, contenders, workspace, listener)
-    schemes = _schemes(study, contenders, clock, listener)
-    road = Road(study, clock, workspace, engine or LocalEngine(), listener)
+    clock = time_all(study, prepared, workspace, listener)
+    variants = _variants(study, prepared, clock, listener)
+    setup = DriveSetup(study, clock, workspace, engine or LocalEngine(), listener)
     drives = [
         drive
         for condition in study.conditions
-        for drive in road.under(condition, contenders)
+        for drive in setup.under(condition, prepared)
     ]
-    contrasts = take_pictures(road, contenders, drives, pictures)
+    contrasts = take_pictures(setup, prepared, drives, pictures)
     return StudyResult(
         study,
-        schemes,
+        variants,
         tuple(drives),
         contrasts,
         clock.scale,
@@ -71,16 +71,16 @@ def run_study(
 def _read(study: Study | str | Path) -> Study:
     if isinstance(study, str | Path):
         return load_study(study)
-    check_recordings(study)
+    study.check_recordings()
     return study
 
 
-def _schemes(
-    study: Study, contenders: list[PreparedScheme], clock: Clock, listener: Listener
-) -> tuple[SchemeOutcome, ...]:
-    names = [each.scheme.name for each in contenders]
-    baseline = contenders[names.index(study.baseline)]
+def _variants(
+    study: Study, prepared: list[PreparedVariant], clock: Clock, listener: Listener
+) -> tuple[VariantOutcome, ...]:
+    names = [each.variant.name for each in prepared]
+    baseline = prepared[names.index(study.baseline)]
     return tuple(
-        SchemeOutcome.of(each, clock, judge(study, baseline, each, listener))
-        for each in contenders
+        VariantOutcome.of(each, clock, judge(study, baseline, each, listener))
+        for each in prepared
     )

@@ -11,8 +11,8 @@ from me2e_compress.simulator.pictures import Moment, RoutePicture, write_png
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.world import World
 from me2e_compress.study.definition import Condition
-from me2e_compress.study.drives import Drive, Road
-from me2e_compress.study.prepared import PreparedScheme
+from me2e_compress.study.drives import Drive, DriveSetup
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.route_outcomes import RouteOutcome
 
 SCORED, MOVED_M = 1.0, 0.5
@@ -25,17 +25,17 @@ class Contrast:
 
     Attributes:
         route: What the baseline made of the route.
-        other: What the scheme made of it.
-        scheme: Its name.
+        other: What the variant made of it.
+        variant: Its name.
         condition: Under what both drove.
         time_us: The moment; a drive that was over by then shows its end.
         before: PNG of the baseline.
-        after: PNG of the scheme.
+        after: PNG of the variant.
     """
 
     route: RouteOutcome
     other: RouteOutcome
-    scheme: str
+    variant: str
     condition: str
     time_us: int
     before: Path
@@ -82,41 +82,41 @@ class _Pair:
 
 
 def take_pictures(
-    road: Road,
-    contenders: Sequence[PreparedScheme],
+    setup: DriveSetup,
+    prepared: Sequence[PreparedVariant],
     drives: Sequence[Drive],
     limit: int,
 ) -> tuple[Contrast, ...]:
-    """Drive again, up to the moment, the routes on which schemes part the most.
+    """Drive again, up to the moment, the routes on which variants part the most.
 
     Pictures that are there are not taken again.
 
     Args:
-        road: What the drives share.
-        contenders: The schemes.
+        setup: What the drives share.
+        prepared: The variants.
         drives: What they did.
-        limit: How many routes; each is another, and schemes take turns.
+        limit: How many routes; each is another, and variants take turns.
 
     Raises:
         EvaluationError: A picture cannot be written.
     """
     found = list[Contrast]()
-    by_name = {each.scheme.name: each for each in contenders}
-    conditions = {each.name: each for each in road.study.conditions}
-    routes = {each.id: each for each in road.study.routes}
-    pairs = _chosen(road.study.baseline, drives, limit)
+    by_name = {each.variant.name: each for each in prepared}
+    conditions = {each.name: each for each in setup.study.conditions}
+    routes = {each.id: each for each in setup.study.routes}
+    pairs = _chosen(setup.study.baseline, drives, limit)
     for done, pair in enumerate(pairs):
-        road.listener.on_progress("pictures", done, len(pairs), pair.route.route)
+        setup.listener.on_progress("pictures", done, len(pairs), pair.route.route)
         condition = conditions[pair.drive.condition]
         where = routes[pair.route.route]
-        names = (road.study.baseline, pair.drive.scheme)
+        names = (setup.study.baseline, pair.drive.variant)
         before, after = (
-            _picture(road, by_name[name], condition, where, pair.moment_us)
+            _picture(setup, by_name[name], condition, where, pair.moment_us)
             for name in names
         )
         found.append(
             Contrast(
-                *(pair.route, pair.other, pair.drive.scheme, condition.name),
+                *(pair.route, pair.other, pair.drive.variant, condition.name),
                 *(pair.moment_us, before, after),
             )
         )
@@ -124,12 +124,12 @@ def take_pictures(
 
 
 def _chosen(baseline: str, drives: Sequence[Drive], limit: int) -> list[_Pair]:
-    """Take the widest gaps: one of each scheme first, and no route twice."""
-    references = {each.condition: each for each in drives if each.scheme == baseline}
+    """Choose the widest gaps: one of each variant first, and no route twice."""
+    references = {each.condition: each for each in drives if each.variant == baseline}
     pairs = [
         _Pair(drive, route, other)
         for drive in drives
-        if drive.scheme != baseline and drive.routes
+        if drive.variant != baseline and drive.routes
         for route, other in zip(
             references[drive.condition].routes, drive.routes, strict=True
         )
@@ -140,8 +140,8 @@ def _chosen(baseline: str, drives: Sequence[Drive], limit: int) -> list[_Pair]:
     chosen = list[_Pair]()
     for others_only in (True, False):
         for pair in ranked:
-            shown = [each.drive.scheme for each in chosen]
-            if len(chosen) == limit or (others_only and pair.drive.scheme in shown):
+            shown = [each.drive.variant for each in chosen]
+            if len(chosen) == limit or (others_only and pair.drive.variant in shown):
                 continue
             if pair.route.route not in [each.route.route for each in chosen]:
                 chosen.append(pair)
@@ -168,15 +168,15 @@ class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
 
 
 def _picture(
-    road: Road,
-    contender: PreparedScheme,
+    setup: DriveSetup,
+    prepared: PreparedVariant,
     condition: Condition,
     route: Route,
     time_us: int,
 ) -> Path:
-    name = contender.scheme.name
-    path = road.workspace.picture(contender.scheme, condition, route.id, time_us)
-    job = road.job(contender, condition)
+    name = prepared.variant.name
+    path = setup.workspace.picture(prepared.variant, condition, route.id, time_us)
+    job = setup.job(prepared, condition)
     if path.is_file() or job is None:
         return path
     moments = _watched(job, route, time_us)

@@ -5,25 +5,30 @@ from typing import TYPE_CHECKING
 
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.differences import PairedDifference
+from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.study.cells import MISSING, estimate_cell, measure_cell
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.drives import Drive
+from me2e_compress.study.plan_fidelity import EXACT
 from me2e_compress.workflows.result import Cell, Table
 
 if TYPE_CHECKING:
-    from me2e_compress.study.outcome import SchemeOutcome, StudyResult
+    from me2e_compress.study.outcome import StudyResult, VariantOutcome
 
+MISSING = "\N{EN DASH}"
+"""Stands where nothing was measured."""
+INFINITE = "\N{INFINITY}"
+MINUS = "\N{MINUS SIGN}"
 SCORES = ("DS", "SR %", "DE %", "DC")
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
 def scoreboards(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Show how every scheme drives, and what it weighs and takes.
+    """Show how every variant drives, and what it weighs and takes.
 
-    One table a condition; one scheme alone has one table of all its conditions.
+    One table a condition; one variant alone has one table of all its conditions.
     """
-    if len(outcome.schemes) > 1:
+    if len(outcome.variants) > 1:
         return tuple(_scoreboard(outcome, each) for each in outcome.study.conditions)
     return (
         Table(
@@ -38,9 +43,9 @@ def scoreboards(outcome: "StudyResult") -> tuple[Table, ...]:
 def _scoreboard(outcome: "StudyResult", condition: Condition) -> Table:
     return Table(
         f"Scoreboard, {_condition(outcome, condition)}",
-        ("scheme", *SCORES, *COSTS),
+        ("variant", *SCORES, *COSTS),
         tuple(
-            (Cell(each.scheme), *_scores(each), *_costs(outcome.scheme(each.scheme)))
+            (Cell(each.variant), *_scores(each), *_costs(outcome.variant(each.variant)))
             for each in outcome.under(condition)
         ),
         f"{_routes_note(outcome)} {_costs_note(outcome)}",
@@ -49,17 +54,17 @@ def _scoreboard(outcome: "StudyResult", condition: Condition) -> Table:
 
 
 def differences(outcome: "StudyResult") -> Table:
-    """Show every scheme minus the baseline, paired by route."""
+    """Show every variant minus the baseline, paired by route."""
     baseline, rows = outcome.study.baseline, []
     several = len(outcome.study.conditions) > 1
     for drive in outcome.drives:
         if drive.difference is None:
             continue
-        name = f"{drive.scheme}, {drive.condition}" if several else drive.scheme
+        name = f"{drive.variant}, {drive.condition}" if several else drive.variant
         rows.append((Cell(name), *_difference(drive.difference)))
     return Table(
         f"Difference to {baseline} on the same routes",
-        ("scheme", "DS, points", "SR, points", "routes better", "routes worse"),
+        ("variant", "DS, points", "SR, points", "routes better", "routes worse"),
         tuple(rows),
         "Mean over routes with its 95 % interval, paired bootstrap: an interval that "
         "holds zero shows no difference.",
@@ -68,11 +73,11 @@ def differences(outcome: "StudyResult") -> Table:
 
 def abilities(outcome: "StudyResult") -> tuple[Table, ...]:
     """Show the success rate by ability: tables as those of the scoreboard."""
-    if len(outcome.schemes) > 1:
+    if len(outcome.variants) > 1:
         return tuple(
             _abilities(
                 f"Success by ability in %, {_condition(outcome, each)}",
-                {drive.scheme: drive.scores for drive in outcome.under(each)},
+                {drive.variant: drive.scores for drive in outcome.under(each)},
                 outcome.study.baseline,
             )
             for each in outcome.study.conditions
@@ -86,7 +91,7 @@ def _abilities(
     title: str,
     found: Mapping[str, Scores | None],
     strong: str,
-    heading: str = "scheme",
+    heading: str = "variant",
 ) -> Table:
     rows = [
         (
@@ -107,7 +112,7 @@ def _abilities(
 
 def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
     """Every table of a study, in the order of reading."""
-    compared = [differences(outcome)] if len(outcome.schemes) > 1 else []
+    compared = [differences(outcome)] if len(outcome.variants) > 1 else []
     return (*scoreboards(outcome), *compared, *abilities(outcome))
 
 
@@ -119,13 +124,13 @@ def _scores(drive: Drive) -> tuple[Cell, ...]:
     return (*map(estimate_cell, shown), estimate_cell(scores.comfort))
 
 
-def _costs(scheme: "SchemeOutcome") -> tuple[Cell, ...]:
+def _costs(variant: "VariantOutcome") -> tuple[Cell, ...]:
     return (
-        measure_cell(scheme.size_mb, ".2f"),
-        measure_cell(scheme.latency_ms[50], ".1f"),
-        measure_cell(scheme.latency_ms[99], ".1f"),
-        measure_cell(scheme.fidelity.mean_m, ".3f"),
-        measure_cell(scheme.fidelity.plan_sqnr_db, ".1f"),
+        measure_cell(variant.size_mb, ".2f"),
+        measure_cell(variant.latency_ms[50], ".1f"),
+        measure_cell(variant.latency_ms[99], ".1f"),
+        measure_cell(variant.fidelity.mean_m, ".3f"),
+        measure_cell(variant.fidelity.plan_sqnr_db, ".1f"),
     )
 
 
@@ -170,3 +175,34 @@ def _costs_note(outcome: "StudyResult") -> str:
         "held-out frames, and the noise on them."
     )
     return " ".join(notes)
+
+
+def estimate_cell(
+    estimate: Estimate, form: str = ".1f", *, signed: bool = False
+) -> Cell:
+    """Show a mean with its interval."""
+    measure, sign = estimate.measure, "+" if signed else ""
+    if measure.value is None:
+        return Cell(MISSING, reason=measure.reason)
+    form = f"{sign}{'.3f' if measure.unit == 'ratio' else form}"
+    text = number(measure.value, form)
+    if estimate.low is None or estimate.high is None:
+        return Cell(text)
+    low, high = (number(each, form) for each in (estimate.low, estimate.high))
+    return Cell(text, f"{low} to {high}")
+
+
+def measure_cell(measure: Measure, form: str) -> Cell:
+    """Show a number, or a dash that knows why."""
+    if measure.value is None:
+        infinite = measure.reason == EXACT
+        return Cell(INFINITE if infinite else MISSING, reason=measure.reason)
+    return Cell(number(measure.value, form))
+
+
+def number(value: float, form: str) -> str:
+    """Write a number with a minus as wide as a plus, and no negative zero."""
+    text = format(value, form)
+    if not any(digit in text for digit in "123456789"):
+        text = text.replace("-", "+" if form.startswith("+") else "")
+    return text.replace("-", MINUS)

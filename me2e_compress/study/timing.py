@@ -12,52 +12,52 @@ from me2e_compress.driving.latency import (
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.interleaved import describe_machine, record_traces
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.study.definition import Condition, Scheme, Study
-from me2e_compress.study.prepared import PreparedScheme
+from me2e_compress.study.definition import Condition, Study, Variant
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.listener import Listener
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Latencies of the schemes on one device.
+    """Latencies of the variants on one device.
 
     Attributes:
-        traces: As measured, by the scheme's name.
+        traces: As measured, by the variant's name.
         scale: How many times slower the device is than the machine of the traces;
-            one number for all schemes.
-        reason: Why a scheme has no trace, in words; empty if all have one.
+            one number for all variants.
+        reason: Why a variant has no trace, in words; empty if all have one.
     """
 
     traces: Mapping[str, LatencyTrace]
     scale: float
     reason: str = ""
 
-    def milliseconds(self, scheme: str, percent: float) -> float | None:
+    def milliseconds(self, variant: str, percent: float) -> float | None:
         """Return a percentile on the device; None without a trace."""
-        if scheme not in self.traces:
+        if variant not in self.traces:
             return None
-        return self.scale * self.traces[scheme].percentile_us(percent) / 1e3
+        return self.scale * self.traces[variant].percentile_us(percent) / 1e3
 
     def source(
-        self, scheme: Scheme, condition: Condition, seed: int
+        self, variant: Variant, condition: Condition, seed: int
     ) -> LatencySource | None:
-        """Return what a scheme's decisions cost; None without the trace for it."""
+        """Return what a variant's decisions cost; None without the trace for it."""
         if not condition.traced:
             return parse_latency(condition.latency)
-        if scheme.name not in self.traces:
+        if variant.name not in self.traces:
             return None
-        samples = self.traces[scheme.name].samples_us
+        samples = self.traces[variant.name].samples_us
         return TraceLatency(samples, scale=self.scale, seed=seed)
 
 
 def time_all(
     study: Study,
-    contenders: Sequence[PreparedScheme],
+    prepared: Sequence[PreparedVariant],
     workspace: Workspace,
     listener: Listener,
 ) -> Clock:
-    """Take the traces that are given or kept, and measure the others in turn.
+    """Load the traces that are given or kept, and measure the others, interleaved.
 
     What is measured together shares its noise. A trace that is kept is of the same
     model, machine, threads and frames, and has as many samples; one that is not is
@@ -72,39 +72,39 @@ def time_all(
     frames = None if study.held_out is None else CalibrationSet(study.held_out)
     seen = None if frames is None else frames.fingerprint
     traces = dict[str, LatencyTrace]()
-    for each in contenders:
+    for each in prepared:
         kept = _kept(study, each, seen, workspace, listener)
         if kept is not None:
-            traces[each.scheme.name] = kept
+            traces[each.variant.name] = kept
     if frames is None:
         return Clock(traces, _scale(study, traces), "no held-out frames were given")
-    baseline = next(each for each in contenders if each.scheme is study.reference)
-    yardstick = None if baseline.scheme.trace else traces.get(study.baseline)
-    missing = _missing(contenders, traces, yardstick, workspace, listener)
-    measured = _measured(study, frames, missing, baseline, yardstick, listener)
+    baseline = next(each for each in prepared if each.variant is study.reference)
+    kept_baseline = None if baseline.variant.trace else traces.get(study.baseline)
+    missing = _missing(prepared, traces, kept_baseline, workspace, listener)
+    measured = _measured(study, frames, missing, baseline, kept_baseline, listener)
     # the baseline last: a kill before leaves none that old ones could stand beside
     for each in sorted(missing, key=lambda one: one is baseline):
-        trace = replace(measured[each.scheme.name], frames=seen)
-        trace.save(workspace.trace(each.scheme))
-        traces[each.scheme.name] = trace
+        trace = replace(measured[each.variant.name], frames=seen)
+        trace.save(workspace.trace(each.variant))
+        traces[each.variant.name] = trace
     return Clock(traces, _scale(study, traces), "not a model")
 
 
 def _missing(
-    contenders: Sequence[PreparedScheme],
+    prepared: Sequence[PreparedVariant],
     traces: Mapping[str, LatencyTrace],
-    yardstick: LatencyTrace | None,
+    kept_baseline: LatencyTrace | None,
     workspace: Workspace,
     listener: Listener,
-) -> list[PreparedScheme]:
+) -> list[PreparedVariant]:
     """List what is to be measured: all, where new traces cannot stand beside old."""
-    ours = [each for each in contenders if each.model and not each.scheme.trace]
-    missing = [each for each in ours if each.scheme.name not in traces]
-    if yardstick is not None or not missing:
+    ours = [each for each in prepared if each.model and not each.variant.trace]
+    missing = [each for each in ours if each.variant.name not in traces]
+    if kept_baseline is not None or not missing:
         return missing
     for each in ours:
         if each not in missing:
-            path = workspace.trace(each.scheme)
+            path = workspace.trace(each.variant)
             listener.on_warning(
                 f"{path}: no trace of the baseline is kept beside it: measured again"
             )
@@ -114,22 +114,22 @@ def _missing(
 def _measured(
     study: Study,
     frames: CalibrationSet,
-    missing: Sequence[PreparedScheme],
-    baseline: PreparedScheme,
+    missing: Sequence[PreparedVariant],
+    baseline: PreparedVariant,
     kept: LatencyTrace | None,
     listener: Listener,
 ) -> dict[str, LatencyTrace]:
-    """Measure in turn, beside the baseline: it is the yardstick of another day.
+    """Measure in turn, with the baseline among them to tie days together.
 
     Where the baseline's trace is kept, the others are put on its scale: machines are
     slower on some days than on others.
     """
     if not missing:
         return {}
-    name = baseline.scheme.name
+    name = baseline.variant.name
     timed = missing if kept is None else (baseline, *missing)
     found = record_traces(
-        {each.scheme.name: each.model for each in timed if each.model is not None},
+        {each.variant.name: each.model for each in timed if each.model is not None},
         frames,
         samples=study.timing.samples,
         threads=study.timing.threads,
@@ -150,14 +150,14 @@ def _paced(trace: LatencyTrace, pace: float) -> LatencyTrace:
 
 def _kept(
     study: Study,
-    each: PreparedScheme,
+    each: PreparedVariant,
     frames: str | None,
     workspace: Workspace,
     listener: Listener,
 ) -> LatencyTrace | None:
-    if each.scheme.trace is not None:
-        return LatencyTrace.load(each.scheme.trace)
-    path = workspace.trace(each.scheme)
+    if each.variant.trace is not None:
+        return LatencyTrace.load(each.variant.trace)
+    path = workspace.trace(each.variant)
     if each.model is None or not path.is_file():
         return None
     trace = LatencyTrace.load(path)
@@ -170,9 +170,9 @@ def _kept(
 
 
 def _other(
-    trace: LatencyTrace, each: PreparedScheme, frames: str | None, study: Study
+    trace: LatencyTrace, each: PreparedVariant, frames: str | None, study: Study
 ) -> str | None:
-    """Say what a trace is of that this study does not measure; None: the same."""
+    """Return what a trace is of, if this study measures something else; else None."""
     wanted, machine = study.timing.samples, describe_machine(study.timing.threads)
     if trace.model_sha256 != each.sha256:
         return "another model"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from me2e_compress.errors import StudyError
-from me2e_compress.study.definition import Condition, Scheme
+from me2e_compress.study.definition import Condition, Variant
 
 JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
 """What is found, for programs, in a repository and in a browser."""
@@ -20,23 +20,23 @@ class Workspace:
 
     folder: Path
 
-    def results(self, scheme: Scheme, condition: Condition) -> Path:
-        """Return the folder of results of one scheme under one condition."""
-        return self._made("results") / f"{scheme.name}.{condition.name}"
+    def results(self, variant: Variant, condition: Condition) -> Path:
+        """Return the folder of results of one variant under one condition."""
+        return self._made("results") / f"{variant.name}.{condition.name}"
 
-    def model(self, scheme: Scheme, key: str) -> Path:
+    def model(self, variant: Variant, key: str) -> Path:
         """Return where the model goes that passes make: a key is a recipe's hash."""
-        return self._made("models") / f"{scheme.name}.{key[:16]}.onnx"
+        return self._made("models") / f"{variant.name}.{key[:16]}.onnx"
 
-    def trace(self, scheme: Scheme) -> Path:
-        """Return where the latencies of a scheme's model go."""
-        return self._made("traces") / f"{scheme.name}.json"
+    def trace(self, variant: Variant) -> Path:
+        """Return where the latencies of a variant's model go."""
+        return self._made("traces") / f"{variant.name}.json"
 
     def picture(
-        self, scheme: Scheme, condition: Condition, route: str, time_us: int
+        self, variant: Variant, condition: Condition, route: str, time_us: int
     ) -> Path:
         """Return where the picture of one moment goes."""
-        name = f"{route}.{time_us // 1000}ms.{scheme.name}.{condition.name}.png"
+        name = f"{route}.{time_us // 1000}ms.{variant.name}.{condition.name}.png"
         return self._made("pictures") / name
 
     def _made(self, name: str) -> Path:

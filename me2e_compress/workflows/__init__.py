@@ -1,5 +1,5 @@
 """What a command does, as silent typed functions: a file each.
 
-Files first, then options (a frozen dataclass, checked once), then who is told how it
-goes; what was found comes back as a :class:`~me2e_compress.workflows.result.Result`.
+Each takes files first, then options (a frozen dataclass, checked once), then a listener
+for progress, and returns a :class:`~me2e_compress.workflows.result.Result`.
 """

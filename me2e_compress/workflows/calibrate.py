@@ -158,7 +158,7 @@ def calibrate(
             tool's cache is read.
         output: ``RANGES.json``, or ``SHARD.npz`` of a shard.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         FramesError: no frames or more than one source, or frames that do not fit.

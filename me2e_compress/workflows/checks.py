@@ -13,7 +13,7 @@ from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 Given: TypeAlias = str | Path | None
-"""An input as the user names it; a word that is no file or folder harms nothing."""
+"""An input as the user names it; a word that does not name a file is harmless."""
 
 
 def model_path(text: str | Path, beside: Path = Path()) -> Path:

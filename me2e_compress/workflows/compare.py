@@ -70,7 +70,7 @@ def compare(
         reference: the graph to be true to: a file, or the name of one that ships.
         candidate: the graph that is judged.
         frames: folder of recorded frames.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         GraphError: no such model, or onnxruntime cannot run it.
@@ -83,9 +83,9 @@ def compare(
         recording.check(graph.load(path))
     total = len(recording)
 
-    def told(frame: Frame) -> Frame:
+    def reported(frame: Frame) -> Frame:
         listener.on_progress("frames", frame.index, total, "")
         return frame
 
     left, right = (Session(path, release=True) for path in paths)
-    return CompareResult(*paths, measure(left, right, map(told, recording)))
+    return CompareResult(*paths, measure(left, right, map(reported, recording)))

@@ -37,7 +37,7 @@ class CompressOptions:
         scheme: int8 after the recipe's passes: ``feature-ext``, ``prediction``,
             ``full``.
         rules: of the int8 plan: ``paper`` or ``tensorrt``.
-        target: who will run the int8 graph: ``tensorrt`` or ``onnxruntime``.
+        target: runtime of the int8 graph: ``tensorrt`` or ``onnxruntime``.
         overrides: TOML file of exceptions to the int8 plan.
         ranges: file of saved ranges, instead of frames.
         method: how ranges are read from frames, or were for ``ranges``.
@@ -90,10 +90,10 @@ class CompressOptions:
             )
         if self.scheme is not None:
             passes = (*passes, QuantizeInt8(scheme=self.scheme))
-        return self._told(passes)
+        return self._with_int8(passes)
 
-    def _told(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
-        """Put the options into what quantizes; else into what reads ranges."""
+    def _with_int8(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
+        """Set options of the passes that quantize, else of those that read ranges."""
         named = ("rules", "target", "method")
         given: dict[str, object] = {n: v for n in named if (v := getattr(self, n))}
         files = {"overrides": self.overrides, "ranges": self.ranges}
@@ -136,7 +136,7 @@ def compress(
         frames: folder of recorded frames; without them exact passes are checked on
             seeded inputs, a model that ships on the frames that ship with it.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         GraphError: no such model, or the output would harm an input.

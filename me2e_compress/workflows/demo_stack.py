@@ -138,7 +138,7 @@ class StackDemo:
         return compare_modules(self._source, self._small)
 
     def compare(self, listener: Listener) -> Result:
-        """Hold the small graph against the stack on other frames."""
+        """Compare the small graph with the stack on other frames."""
         return compare(self._source, self._small, self._held_out, listener)
 
     def time(self, listener: Listener) -> FilesResult:
@@ -152,8 +152,8 @@ class StackDemo:
             for name, path in paths.items()
         }
         frame = CalibrationSet(self._held_out)[0]
-        told = partial(listener.on_progress, "latency")
-        times = time_interleaved(sessions, [frame], self.rounds, told)
+        progress = partial(listener.on_progress, "latency")
+        times = time_interleaved(sessions, [frame], self.rounds, progress)
         report = self._small.with_name(self._small.stem + ".report.json")
         return FilesResult(
             {paths[name]: each for name, each in times.items()},

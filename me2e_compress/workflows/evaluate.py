@@ -121,7 +121,7 @@ def evaluate(
             ``blind:MPS``.
         output: the folder of results.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         EvaluationError: no such policy, route, latency, weather or engine; the policy

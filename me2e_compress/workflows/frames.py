@@ -56,7 +56,7 @@ def record_frames(
         source: a stack of the zoo, or an ONNX file that keeps the policy contract.
         folder: is written.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Returns:
         The folder.
@@ -76,13 +76,13 @@ def record_frames(
         made = _synthetic(str(source), options)
     about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
 
-    def told() -> Iterator[Frame]:
+    def reported() -> Iterator[Frame]:
         for frame in made:
             yield frame
             done = frame.index + 1
             listener.on_progress("frames", done, options.count, folder.name)
 
-    return write_recording(folder, told(), about)
+    return write_recording(folder, reported(), about)
 
 
 def _driven(model: Path, options: FramesOptions) -> Iterator[Frame]:

@@ -24,7 +24,7 @@ class TrialOptions:
     Attributes:
         scheme: modules that may be int8: ``feature-ext``, ``prediction``, ``full``.
         rules: of the int8 plans.
-        target: who will run the graph; None leaves it to the workflow.
+        target: runtime of the int8 graph; None is chosen by the workflow.
         ranges: file of saved ranges, instead of calibrating.
         module_map: preset or TOML file; None finds the preset.
         count: frames to judge on.

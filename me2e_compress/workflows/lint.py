@@ -140,7 +140,7 @@ def lint(model: str | Path, options: LintOptions | None = None) -> LintResult:
 
 
 def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:
-    """Say what TensorRT-RTX made of a graph."""
+    """Describe what TensorRT-RTX made of a graph."""
     int8 = Counter(each.kind for each in verdict.kernels if each.is_int8)
     every = Counter(each.kind for each in verdict.kernels)
     kernels = ", ".join(f"{int8[kind]} of {every[kind]} {kind}s" for kind in every)

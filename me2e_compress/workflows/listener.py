@@ -1,4 +1,4 @@
-"""Who is told how a workflow goes; nobody is, unless asked for."""
+"""How a workflow reports progress: to nobody, unless a listener is given."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

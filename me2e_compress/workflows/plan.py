@@ -204,7 +204,7 @@ def _made(
     quantizer: QuantizeInt8,
     options: PlanOptions,
 ) -> QuantPlan:
-    """Take a plan, or plan a float graph once the exact passes are done."""
+    """Return a plan as it is, or plan a float graph after the exact passes."""
     if isinstance(read, QuantPlan):
         return read
     ready = PreparedGraph.of(file, read, options.module_map)

@@ -93,7 +93,7 @@ def profile(
         frames: folder of recorded frames; repeated as often as it takes.
         output: write the latencies as a trace, which ``evaluate`` can charge.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         GraphError: no such model, it cannot be run, or the output would harm an input.

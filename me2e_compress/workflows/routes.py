@@ -122,7 +122,7 @@ def make_routes(
     Args:
         output: the manifest to write.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         GraphError: the output cannot be written.
@@ -141,7 +141,7 @@ def make_routes(
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ExaminationResult(Result):
-    """What the gate says of a set of routes.
+    """Which routes of a set are admitted.
 
     Attributes:
         manifest: the set.
@@ -197,12 +197,12 @@ class ExaminationResult(Result):
 def examine_routes(
     manifest: str | Path, pick: str = "all", listener: Listener = SILENT
 ) -> ExaminationResult:
-    """Put a set of routes through the gate again.
+    """Examine a set of routes again, as if it were to be admitted.
 
     Args:
         manifest: the set.
         pick: ``all``, a number or ``ID,ID``.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         EvaluationError: no such route, or no file of routes.

@@ -59,7 +59,7 @@ def score(
 
     Args:
         results: folders that ``evaluate`` wrote.
-        listener: who is told of files that are damaged and left out.
+        listener: is called with the files that are damaged and left out.
 
     Raises:
         EvaluationError: not a folder of results.

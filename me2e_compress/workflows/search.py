@@ -49,7 +49,7 @@ class SearchOptions(TrialOptions):
 
     @property
     def runs_on(self) -> str:
-        """Who will run the graph."""
+        """The runtime of the int8 graph."""
         return self.target or ("tensorrt" if self.max_ms is None else "onnxruntime")
 
 
@@ -121,7 +121,7 @@ def search(
         frames: folder of recorded frames.
         output: the recipe.
         options: with a budget.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         GraphError: no such model, or the output would harm an input.
@@ -142,8 +142,8 @@ def search(
     else:
         seconds = partial(_seconds, trials, options.threads)
         budget = Budget((options.max_ms or 0) / 1e3, "s", seconds)
-    told = partial(listener.on_progress, "modules")
-    tried = find(trials, modules, budget, progress=told)
+    report = partial(listener.on_progress, "modules")
+    tried = find(trials, modules, budget, progress=report)
     choice = Int8Choice(tried[-1].modules)
     written = files.write(choice, options.rules, options.runs_on)
     return SearchResult(files.output, tried, budget.unit, written)

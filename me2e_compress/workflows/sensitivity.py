@@ -170,7 +170,7 @@ def measure_sensitivity(
         frames: folder of recorded frames.
         output: the recipe; overrides lie beside it where nodes stay float.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         GraphError: no such model, or an output would harm an input.

@@ -84,7 +84,7 @@ def train(
     Args:
         output: a folder; the same again resumes.
         options: None takes the defaults.
-        listener: who is told how it goes.
+        listener: is called with progress and warnings.
 
     Raises:
         TrainingError: the folder is of another course, or a part failed.

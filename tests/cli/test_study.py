@@ -90,7 +90,7 @@ def test_json_is_the_file(
             '"uniad"\n\n',
             "uniad: no such file; models that ship: highway",
         ),
-        ('"exact"\npolicy', '"float"\npolicy', "2 schemes are named float"),
+        ('"exact"\npolicy', '"float"\npolicy', "2 variants are named float"),
         ('recipe = "exact"', 'recipe = "exakt"', "no recipe exakt"),
         ('"frames"', '"nowhere"', "nowhere: no such folder"),
         ("[[condition]]", "[[conditions]]", "no key conditions; there are title"),
@@ -133,7 +133,7 @@ def test_a_model_that_ships_is_not_one_where_you_are(
     with pytest.raises(StudyError, match="seen"):
         study.study(toml, tmp_path / "out")
 
-    assert asked[0].schemes[0].policy == str(shipped("highway"))
+    assert asked[0].variants[0].policy == str(shipped("highway"))
 
 
 def test_an_engine_nobody_knows(

@@ -6,7 +6,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.extras import training
+from me2e_compress.cli.app import add_training
 from me2e_compress.errors import MissingExtraError
 from me2e_compress.training.course import claim
 from me2e_compress.training.curriculum import FULL
@@ -62,7 +62,7 @@ def test_without_an_extra_it_says_what_to_install(
     )
     app = typer.Typer()
     app.command("other")(lambda: None)  # with one command Typer asks for no name
-    training(app)
+    add_training(app)
 
     found = CliRunner().invoke(app, ["train", "highway", "--small", "-o", "out"])
 

@@ -11,13 +11,20 @@ import pytest
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.simulator.routes import Route
-from me2e_compress.study import Condition, Scheme, Study, StudyResult, Timing, run_study
+from me2e_compress.study import (
+    Condition,
+    Study,
+    StudyResult,
+    Timing,
+    Variant,
+    run_study,
+)
 from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 
 ROUTES = (CROSSING, PARKED)
 IDEAL, SLOW = Condition("ideal", "none"), Condition("slow", "fps:2")
-BLIND = Scheme("blind", "blind:6")
+BLIND = Variant("blind", "blind:6")
 FASTER = "factor = Constant <value_float = 2.0> () plan = Mul (ahead, factor)"
 
 Make = Callable[..., Study]
@@ -68,9 +75,9 @@ def asked(models: Path) -> Study:
         "Slow & <fast>",
         (
             BLIND,
-            Scheme("slow", str(models / "slow.onnx")),
-            Scheme("again", str(models / "slow.onnx")),
-            Scheme("fast", str(models / "fast.onnx")),
+            Variant("slow", str(models / "slow.onnx")),
+            Variant("again", str(models / "slow.onnx")),
+            Variant("fast", str(models / "fast.onnx")),
         ),
         (IDEAL, SLOW),
         "slow",

@@ -5,17 +5,17 @@ import pytest
 from me2e_compress import recipe
 from me2e_compress.errors import EvaluationError, Me2eError, StudyError
 from me2e_compress.passes import Pass
-from me2e_compress.study import Condition, Scheme, Timing
+from me2e_compress.study import Condition, Timing, Variant
 from tests.study.conftest import IDEAL, Make
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"schemes": ()}, "the study has no scheme"),
+        ({"variants": ()}, "the study has no variant"),
         ({"conditions": ()}, "the study has no condition"),
         ({"conditions": (IDEAL, IDEAL)}, "2 conditions are named ideal"),
-        ({"baseline": "quick"}, "'quick' is no scheme; there are blind, slow, again"),
+        ({"baseline": "quick"}, "'quick' is not a variant; there are blind, slow"),
         ({"routes": ()}, "no route to drive"),
         ({"seed": -1}, "seed -1: must be 0 or more"),
         (
@@ -41,9 +41,9 @@ def test_a_study_that_could_not_be_finished(
 def test_passes_that_need_frames_and_none_are_given(
     make: Make, passes: tuple[Pass, ...], name: str
 ) -> None:
-    words = rf"scheme small: {name} measures on recorded frames, and there are none"
+    words = rf"variant small: {name} measures on recorded frames, and there are none"
     with pytest.raises(StudyError, match=words):
-        make(schemes=(Scheme("small", "m.onnx", passes),), baseline="small")
+        make(variants=(Variant("small", "m.onnx", passes),), baseline="small")
 
 
 @pytest.mark.parametrize(
@@ -56,15 +56,15 @@ def test_passes_that_need_frames_and_none_are_given(
     ],
 )
 def test_passes_that_need_no_frames(make: Make, text: str) -> None:
-    schemes = (Scheme("small", "m.onnx", recipe.parse(text)),)
+    variants = (Variant("small", "m.onnx", recipe.parse(text)),)
 
-    assert make(schemes=schemes, baseline="small").frames is None
+    assert make(variants=variants, baseline="small").frames is None
 
 
 @pytest.mark.parametrize("name", ["", "a b", "../up", "a/b", ".hidden", "a.b"])
 def test_a_name_that_is_no_folder(name: str) -> None:
     with pytest.raises(StudyError, match="a name is made of letters"):
-        Scheme(name, "expert")
+        Variant(name, "expert")
 
 
 @pytest.mark.parametrize(
@@ -77,12 +77,12 @@ def test_a_name_that_is_no_folder(name: str) -> None:
     ],
 )
 def test_a_driver_that_is_no_model_takes_nothing(options: dict[str, object]) -> None:
-    with pytest.raises(StudyError, match="scheme e: expert is no model"):
-        Scheme("e", "expert", **options)  # type: ignore[arg-type]
+    with pytest.raises(StudyError, match="variant e: expert is not a model"):
+        Variant("e", "expert", **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("latency", ["measured", "trace:t.json", "traces"])
-def test_a_latency_that_differs_from_scheme_to_scheme(latency: str) -> None:
+def test_a_latency_that_differs_from_variant_to_variant(latency: str) -> None:
     with pytest.raises(StudyError, match="none, fps:F and trace"):
         Condition("c", latency)
 

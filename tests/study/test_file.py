@@ -21,16 +21,16 @@ held_out = "frames"
 samples = 50
 baseline_median_s = 0.43
 
-[[scheme]]
+[[variant]]
 name = "float"
 policy = "slow.onnx"
 
-[[scheme]]
+[[variant]]
 name = "small"
 policy = "slow.onnx"
 recipe = "exact"
 
-[[scheme]]
+[[variant]]
 name = "mine"
 policy = "slow.onnx"
 passes = "import-normalize,fold-constants"
@@ -54,10 +54,10 @@ def test_everything_that_a_file_says(models: Path) -> None:
     assert (len(study.routes), study.set_size) == (3, 220)
     assert study.timing.baseline_median_s == 0.43
     assert study.held_out == models / "frames"
-    assert [scheme.policy for scheme in study.schemes] == [
+    assert [variant.policy for variant in study.variants] == [
         str(models / "slow.onnx")
     ] * 3
-    assert [len(scheme.passes) for scheme in study.schemes] == [0, 4, 2]
+    assert [len(variant.passes) for variant in study.variants] == [0, 4, 2]
     assert study.conditions == (Condition("ideal", "none"),)
 
 
@@ -71,7 +71,7 @@ def test_files_lie_beside_the_study(models: Path, tmp_path: Path) -> None:
     study = load_study(write(tmp_path, text.replace('"exact"', '"my.toml"')))
 
     assert (study.routes, study.set_size) == ((CROSSING, PARKED), 2)
-    assert [each.name for each in study.schemes[1].passes] == ["fold-constants"]
+    assert [each.name for each in study.variants[1].passes] == ["fold-constants"]
 
 
 def test_a_name_that_is_no_file_is_one_that_ships(models: Path) -> None:
@@ -79,7 +79,13 @@ def test_a_name_that_is_no_file_is_one_that_ships(models: Path) -> None:
 
     study = load_study(write(models, text))
 
-    assert study.schemes[0].policy == str(shipped("highway"))
+    assert study.variants[0].policy == str(shipped("highway"))
+
+
+def test_variants_may_be_called_schemes(models: Path) -> None:
+    named = load_study(write(models, GOOD))
+
+    assert load_study(write(models, GOOD.replace("[[variant]]", "[[scheme]]"))) == named
 
 
 def test_a_file_where_you_are_is_not_beside_the_study(
@@ -109,13 +115,13 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
             'name = "small"',
             'name = "small"\nrecip = "exact"',
             StudyError,
-            r"no key scheme\.1\.recip; there are name, policy, recipe",
+            r"no key variant\.1\.recip; there are name, policy, recipe",
         ),
         ('baseline = "float"', "", StudyError, "baseline: Field required"),
         ("routes = 3", "routes = 1.5", StudyError, "routes"),
         ("routes = 3", "routes = 0", EvaluationError, "0 routes were asked for"),
         ("routes = 3", 'routes = "no"', EvaluationError, "no route 'no'"),
-        ('baseline = "float"', 'baseline = "flaot"', StudyError, "'flaot' is no schem"),
+        ('baseline = "float"', 'baseline = "flaot"', StudyError, "'flaot' is not a v"),
         ('recipe = "exact"', 'recipe = "exakt"', RecipeError, "no recipe exakt"),
         ("fold-constants", "fold-constant", RecipeError, "no pass 'fold-constant'"),
         ("passes", 'recipe = "full"\npasses', StudyError, "a recipe or passes, not"),
@@ -138,7 +144,7 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
             'recipe = "exact"',
             'recipe = "feature-ext"',
             StudyError,
-            "scheme small: quantize-int8 measures on recorded frames, and there are no",
+            "variant small: quantize-int8 measures on recorded frames, and there are",
         ),
     ],
 )
@@ -175,7 +181,7 @@ def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
 
     study = load_study(write(tmp_path, block))
 
-    assert [scheme.name for scheme in study.schemes] == ["expert", "float", "int8"]
+    assert [variant.name for variant in study.variants] == ["expert", "float", "int8"]
     assert study.conditions[1].traced
 
 

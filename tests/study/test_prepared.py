@@ -8,8 +8,8 @@ import pytest
 from me2e_compress import graph, recipe
 from me2e_compress.errors import StudyError
 from me2e_compress.manager import PassManager
-from me2e_compress.study import Listener, Scheme, Study
-from me2e_compress.study.prepared import PreparedScheme, prepare_scheme
+from me2e_compress.study import Listener, Study, Variant
+from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.listener import SILENT
 from tests.cli.conftest import write_frames
@@ -19,11 +19,11 @@ from tests.study.conftest import Make
 
 @pytest.fixture
 def study(make: Make, tmp_path: Path) -> Study:
-    """One scheme that takes a module of a small stack away."""
+    """One variant that takes a module of a small stack away."""
     write_model(tmp_path / "m.onnx")
     write_images(tmp_path / "frames", 0)
-    scheme = Scheme("minus-occ", str(tmp_path / "m.onnx"), recipe.load("minus-occ"))
-    return make(schemes=(scheme,), baseline="minus-occ", frames=tmp_path / "frames")
+    variant = Variant("minus-occ", str(tmp_path / "m.onnx"), recipe.load("minus-occ"))
+    return make(variants=(variant,), baseline="minus-occ", frames=tmp_path / "frames")
 
 
 def write_images(folder: Path, seed: int) -> None:
@@ -38,8 +38,8 @@ def write_images(folder: Path, seed: int) -> None:
     )
 
 
-def made(study: Study, folder: Path) -> PreparedScheme:
-    return prepare_scheme(study, study.schemes[0], Workspace(folder), SILENT)
+def made(study: Study, folder: Path) -> PreparedVariant:
+    return prepare_variant(study, study.variants[0], Workspace(folder), SILENT)
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def no_passes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_passes_make_a_model_of_their_own(study: Study, tmp_path: Path) -> None:
-    source = Path(study.schemes[0].policy)
+    source = Path(study.variants[0].policy)
     before = source.read_bytes()
 
     found = made(study, tmp_path)
@@ -90,7 +90,7 @@ def test_a_model_without_its_report_is_made_again(study: Study, tmp_path: Path) 
 def test_what_decides_the_model_decides_its_name(
     study: Study, tmp_path: Path, change: str
 ) -> None:
-    first, scheme = made(study, tmp_path), study.schemes[0]
+    first, variant = made(study, tmp_path), study.variants[0]
     if change == "frames":
         write_images(tmp_path / "others", 1)
         study = dataclasses.replace(study, frames=tmp_path / "others")
@@ -99,8 +99,8 @@ def test_what_decides_the_model_decides_its_name(
     elif change == "source":
         write_model(tmp_path / "m.onnx", seed=1)
     else:
-        other = dataclasses.replace(scheme, passes=recipe.load("minus-map"))
-        study = dataclasses.replace(study, schemes=(other,))
+        other = dataclasses.replace(variant, passes=recipe.load("minus-map"))
+        study = dataclasses.replace(study, variants=(other,))
 
     assert made(study, tmp_path).model != first.model
 
@@ -120,7 +120,7 @@ def test_an_altered_model_is_made_again(
         first.model.with_name(f"{first.model.stem}.report.json").write_text("{}")
 
     listener = Listener(on_warning=warnings.append)
-    again = prepare_scheme(study, study.schemes[0], Workspace(tmp_path), listener)
+    again = prepare_variant(study, study.variants[0], Workspace(tmp_path), listener)
 
     assert again == first
     assert graph.sha256_of(first.model) == first.sha256
@@ -131,13 +131,13 @@ def with_means(study: Study, file: Path) -> Study:
     passes = recipe.parse(
         f'ablate-modules{{drop=[map],drop_outputs=true,fill=means,means="{file}"}}'
     )
-    scheme = dataclasses.replace(study.schemes[0], passes=passes)
-    return dataclasses.replace(study, schemes=(scheme,), baseline=scheme.name)
+    variant = dataclasses.replace(study.variants[0], passes=passes)
+    return dataclasses.replace(study, variants=(variant,), baseline=variant.name)
 
 
 def write_means(study: Study, file: Path, value: float) -> None:
     """One number everywhere that the map module is read."""
-    loaded = graph.load(Path(study.schemes[0].policy))
+    loaded = graph.load(Path(study.variants[0].policy))
     graph.infer_shapes(loaded)
     means = {
         str(output.name): np.full(shape, value, np.float32)
@@ -180,7 +180,9 @@ def test_what_made_a_file_is_read_from_the_report_beside_it(
 ) -> None:
     first = made(study, tmp_path)
     assert first.model is not None
-    plain = dataclasses.replace(study, schemes=(Scheme("minus-occ", str(first.model)),))
+    plain = dataclasses.replace(
+        study, variants=(Variant("minus-occ", str(first.model)),)
+    )
 
     found = made(plain, tmp_path)
 

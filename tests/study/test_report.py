@@ -83,7 +83,7 @@ def test_the_same_study_gives_the_same_page(found: StudyResult, page: str) -> No
     assert html(found, ("me2e-compress", "study", "<s>.toml")) == page
 
 
-def test_figures_name_every_scheme(found: StudyResult) -> None:
+def test_figures_name_every_variant(found: StudyResult) -> None:
     costs, gaps = pareto(found, IDEAL), forest(found)
 
     assert costs is not None
@@ -111,7 +111,7 @@ def test_a_curve_needs_three_conditions(found: StudyResult) -> None:
 
 
 def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
-    told = {each.scheme: each.text for each in findings(found)}
+    told = {each.variant: each.text for each in findings(found)}
 
     assert list(told) == ["blind", "again", "fast"]
     assert told["again"].startswith(f"1.00 {TIMES} the size, ")

@@ -15,9 +15,9 @@ from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.metrics.scores import score
 from me2e_compress.study import (
     Listener,
-    Scheme,
     StudyResult,
     Timing,
+    Variant,
     load_study,
     run_study,
 )
@@ -36,11 +36,11 @@ title = "Killed"
 baseline = "blind"
 routes = 8
 
-[[scheme]]
+[[variant]]
 name = "blind"
 policy = "blind"
 
-[[scheme]]
+[[variant]]
 name = "faster"
 policy = "blind:12"
 
@@ -53,7 +53,7 @@ pytestmark = pytest.mark.xdist_group("study")
 
 
 ROOT = Path(__file__).parents[2]
-ONE = {"schemes": (BLIND,), "baseline": "blind", "conditions": (IDEAL,)}
+ONE = {"variants": (BLIND,), "baseline": "blind", "conditions": (IDEAL,)}
 
 
 def without_latency(record: dict[str, Any]) -> dict[str, Any]:
@@ -62,11 +62,11 @@ def without_latency(record: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def test_every_scheme_under_every_condition(found: StudyResult) -> None:
-    assert [(each.scheme, each.condition) for each in found.drives] == [
-        (scheme, condition)
+def test_every_variant_under_every_condition(found: StudyResult) -> None:
+    assert [(each.variant, each.condition) for each in found.drives] == [
+        (variant, condition)
         for condition in ("ideal", "slow")
-        for scheme in ("blind", "slow", "again", "fast")
+        for variant in ("blind", "slow", "again", "fast")
     ]
     assert all(len(each.routes) == 2 for each in found.drives)
 
@@ -96,21 +96,21 @@ def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
 
 
 def test_a_model_has_size_and_latency_and_a_driver_has_none(found: StudyResult) -> None:
-    blind, slow, again, fast = found.schemes
+    blind, slow, again, fast = found.variants
 
     assert blind.size_mb.value is None
     assert blind.size_mb.reason == "no model"
     assert blind.latency_ms[50].value is None
-    assert slow.size_mb.value == Path(slow.contender.scheme.policy).stat().st_size / 1e6
+    assert slow.size_mb.value == Path(slow.prepared.variant.policy).stat().st_size / 1e6
     assert slow.latency_ms[50].value == pytest.approx(200.0)
     assert again.latency_ms[50].value is not None
     assert fast.latency_ms[99].value is not None
 
 
 def test_fidelity_is_measured_against_the_baseline(found: StudyResult) -> None:
-    blind, slow, again, fast = (each.fidelity for each in found.schemes)
+    blind, slow, again, fast = (each.fidelity for each in found.variants)
 
-    assert blind.mean_m.reason == "blind is no model"
+    assert blind.mean_m.reason == "blind is not a model"
     assert slow.mean_m.reason == "the baseline itself"
     assert again.mean_m.value == 0.0
     assert again.plan_sqnr_db.reason == "no noise: equal to the bit"
@@ -164,9 +164,9 @@ def test_what_is_there_is_not_made_again(make: Make, tmp_path: Path) -> None:
 
 def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> None:
     engine = Here()
-    faster = Scheme("faster", "blind:9")
+    faster = Variant("faster", "blind:9")
     first = make(**ONE, timing=Timing())
-    second = replace(first, schemes=(faster, BLIND))
+    second = replace(first, variants=(faster, BLIND))
 
     run_study(first, tmp_path, Here(), pictures=0)
     run_study(second, tmp_path, engine, pictures=0)
@@ -177,7 +177,7 @@ def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> N
 def test_a_name_that_is_taken_by_another_driver(make: Make, tmp_path: Path) -> None:
     asked = make(**ONE, timing=Timing())
     run_study(asked, tmp_path, Here(), pictures=0)
-    other = replace(asked, schemes=(Scheme("blind", "blind:9"),))
+    other = replace(asked, variants=(Variant("blind", "blind:9"),))
 
     with pytest.raises(EvaluationError, match=r"blind\.ideal: .* of another evaluatio"):
         run_study(other, tmp_path, Here(), pictures=0)
@@ -186,9 +186,9 @@ def test_a_name_that_is_taken_by_another_driver(make: Make, tmp_path: Path) -> N
 def test_a_missing_model_is_named_before_anything_drives(
     make: Make, tmp_path: Path
 ) -> None:
-    asked = make(schemes=(BLIND, Scheme("slow", "gone.onnx")))
+    asked = make(variants=(BLIND, Variant("slow", "gone.onnx")))
 
-    with pytest.raises(StudyError, match=r"scheme slow: gone\.onnx: no such model"):
+    with pytest.raises(StudyError, match=r"variant slow: gone\.onnx: no such model"):
         run_study(asked, tmp_path)
     assert not (tmp_path / "results").exists()
 
@@ -234,7 +234,7 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
 
 def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:
     heard = list[str]()
-    asked = make(schemes=make().schemes[1:3], conditions=(IDEAL,))
+    asked = make(variants=make().variants[1:3], conditions=(IDEAL,))
 
     run_study(
         asked,

@@ -4,22 +4,25 @@ import pytest
 
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import StudyResult
-from me2e_compress.study.cells import (
+from me2e_compress.study.tables import (
     INFINITE,
     MINUS,
     MISSING,
+    abilities,
+    all_tables,
+    differences,
     estimate_cell,
     measure_cell,
     number,
+    scoreboards,
 )
-from me2e_compress.study.tables import abilities, all_tables, differences, scoreboards
 from me2e_compress.workflows.result import Cell, Table
 from tests.study.conftest import IDEAL
 
 pytestmark = pytest.mark.xdist_group("study")
 
 
-def test_a_scoreboard_a_condition_and_a_row_a_scheme(found: StudyResult) -> None:
+def test_a_scoreboard_a_condition_and_a_row_a_variant(found: StudyResult) -> None:
     ideal, slow = scoreboards(found)
 
     assert ideal.title == "Scoreboard, ideal: decisions cost no time"
@@ -37,7 +40,7 @@ def test_the_numbers_are_those_of_the_drives(found: StudyResult) -> None:
     row = scoreboards(found)[0].rows[3]
 
     assert row[1] == estimate_cell(scores.driving_score)
-    assert row[6] == measure_cell(found.schemes[3].latency_ms[50], ".1f")
+    assert row[6] == measure_cell(found.variants[3].latency_ms[50], ".1f")
     assert row[8].text == "7.000"
 
 
@@ -57,9 +60,9 @@ def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
 
     assert table.title == "Difference to slow on the same routes"
     assert [row[0].text for row in table.rows] == [
-        f"{scheme}, {condition}"
+        f"{variant}, {condition}"
         for condition in ("ideal", "slow")
-        for scheme in ("blind", "again", "fast")
+        for variant in ("blind", "again", "fast")
     ]
     assert table.rows[1][1] == Cell("+0.0", "+0.0 to +0.0")
 
@@ -74,13 +77,13 @@ def test_abilities_have_their_mean_last(found: StudyResult) -> None:
     assert table.rows[0][-1].reason.startswith("no route for Merging")
 
 
-def test_one_scheme_has_one_scoreboard_of_its_conditions(found: StudyResult) -> None:
+def test_one_variant_has_one_scoreboard_of_its_conditions(found: StudyResult) -> None:
     study = dataclasses.replace(
-        found.study, schemes=found.study.schemes[1:2], baseline="slow"
+        found.study, variants=found.study.variants[1:2], baseline="slow"
     )
-    drives = tuple(each for each in found.drives if each.scheme == "slow")
+    drives = tuple(each for each in found.drives if each.variant == "slow")
     alone = dataclasses.replace(
-        found, study=study, schemes=found.schemes[1:2], drives=drives
+        found, study=study, variants=found.variants[1:2], drives=drives
     )
 
     [table] = scoreboards(alone)
@@ -95,7 +98,7 @@ def test_one_scheme_has_one_scoreboard_of_its_conditions(found: StudyResult) -> 
 def test_markdown() -> None:
     table = Table(
         "Costs",
-        ("scheme", "DS"),
+        ("variant", "DS"),
         (
             (Cell("a|b"), Cell("1.0", "0.5 to 1.5")),
             (Cell("c"), Cell(MISSING, reason="no")),
@@ -104,7 +107,7 @@ def test_markdown() -> None:
     )
 
     assert table.markdown() == (
-        "**Costs**\n\n| scheme | DS |\n|---|---:|\n"
+        "**Costs**\n\n| variant | DS |\n|---|---:|\n"
         f"| a\\|b | 1.0 (0.5 to 1.5) |\n| c | {MISSING} |\n\nNote.\n"
     )
 

@@ -12,8 +12,8 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.interleaved import describe_machine
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.study import Condition, Listener, Scheme, Study, Timing, timing
-from me2e_compress.study.prepared import prepare_scheme
+from me2e_compress.study import Condition, Listener, Study, Timing, Variant, timing
+from me2e_compress.study.prepared import prepare_variant
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.listener import SILENT
@@ -26,10 +26,10 @@ HERE = describe_machine(1)
 
 def clock_of(study: Study, folder: Path, listener: Listener = SILENT) -> Clock:
     place = Workspace(folder)
-    contenders = [
-        prepare_scheme(study, each, place, listener) for each in study.schemes
+    prepared = [
+        prepare_variant(study, each, place, listener) for each in study.variants
     ]
-    return time_all(study, contenders, place, listener)
+    return time_all(study, prepared, place, listener)
 
 
 @pytest.fixture
@@ -55,9 +55,9 @@ def paced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 @pytest.fixture
 def ours(make: Make) -> Study:
     """Two models, the clock above: five samples, the baseline at 0.24 s."""
-    schemes = make().schemes
+    variants = make().variants
     return make(
-        schemes=(BLIND, schemes[1], schemes[3]),
+        variants=(BLIND, variants[1], variants[3]),
         conditions=(IDEAL, DEVICE),
         timing=Timing(len(SAMPLES), baseline_median_s=0.24),
     )
@@ -75,9 +75,9 @@ def test_one_scale_gives_the_baseline_the_median_asked_for(
 
 
 @pytest.mark.usefixtures("paced")
-def test_each_scheme_pays_its_own_latency(ours: Study, tmp_path: Path) -> None:
+def test_each_variant_pays_its_own_latency(ours: Study, tmp_path: Path) -> None:
     clock = clock_of(ours, tmp_path)
-    blind, _, fast = ours.schemes
+    blind, _, fast = ours.variants
 
     assert clock.source(fast, IDEAL, 7) == NoLatency()
     assert clock.source(fast, DEVICE, 7) == TraceLatency(
@@ -96,7 +96,7 @@ def test_what_was_measured_is_kept(
 def test_a_model_that_joins_later_is_put_on_the_scale_of_the_others(
     ours: Study, make: Make, paced: list[list[str]], tmp_path: Path
 ) -> None:
-    alone = make(schemes=ours.schemes[1:2], timing=ours.timing)
+    alone = make(variants=ours.variants[1:2], timing=ours.timing)
 
     clock_of(alone, tmp_path)
     clock = clock_of(ours, tmp_path)
@@ -208,8 +208,10 @@ def test_a_trace_that_is_given_is_taken(
     make: Make, models: Path, paced: list[list[str]], tmp_path: Path
 ) -> None:
     LatencyTrace("0" * 64, "an Orin", (70_000, 80_000)).save(tmp_path / "orin.json")
-    given = Scheme("slow", str(models / "slow.onnx"), trace=tmp_path / "orin.json")
-    asked = make(schemes=(given,), conditions=(DEVICE,), timing=Timing(), held_out=None)
+    given = Variant("slow", str(models / "slow.onnx"), trace=tmp_path / "orin.json")
+    asked = make(
+        variants=(given,), conditions=(DEVICE,), timing=Timing(), held_out=None
+    )
 
     clock = clock_of(asked, tmp_path)
 
@@ -218,7 +220,7 @@ def test_a_trace_that_is_given_is_taken(
 
 
 def test_a_baseline_without_latency_sets_no_scale(make: Make, tmp_path: Path) -> None:
-    asked = make(schemes=(BLIND,), baseline="blind")
+    asked = make(variants=(BLIND,), baseline="blind")
 
     with pytest.raises(
         EvaluationError, match=r"median of 0\.2 s of blind, and there is"

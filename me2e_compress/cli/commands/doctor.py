@@ -6,5 +6,5 @@ from me2e_compress.workflows import doctor as workflow
 
 
 def doctor(as_json: given.Json = False) -> None:
-    """Say what this machine can do, and what to install for the rest."""
+    """Show what this machine can do, and what to install for the rest."""
     show(workflow.doctor(), as_json)

@@ -28,7 +28,7 @@ def routes(
     pick: Annotated[str, typer.Option(help="with --check: all, N or ID,ID")] = "all",
     as_json: given.Json = False,
 ) -> None:
-    """Make a fresh set of routes and admit it, or put a set through the gate again."""
+    """Make a fresh set of admitted routes, or examine an existing set again."""
     if check is not None:
         with listening() as listener:
             examined = workflow.examine_routes(check, pick, listener)

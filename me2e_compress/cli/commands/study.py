@@ -27,7 +27,7 @@ def study(
     address: given.Address = None,
     as_json: given.Json = False,
 ) -> None:
-    """Drive schemes under conditions and compare them; run it again to go on."""
+    """Drive variants under conditions and compare them; run it again to go on."""
     asked = load_study(definition, routes)
     check_folder(output, (definition,), (JSON, MARKDOWN, HTML))
     with listening() as listener:

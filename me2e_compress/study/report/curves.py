@@ -1,4 +1,4 @@
-"""How schemes drive from condition to condition."""
+"""How variants drive from condition to condition."""
 
 from collections.abc import Callable, Sequence
 
@@ -33,8 +33,8 @@ def curves(outcome: StudyResult) -> str | None:
     with styled():
         figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
         for axes, (title, pick) in zip(figure.subplots(1, 2), panels, strict=True):
-            for scheme in outcome.schemes:
-                _curve(axes, scheme.name, _found(outcome, scheme.name, pick), outcome)
+            for variant in outcome.variants:
+                _curve(axes, variant.name, _found(outcome, variant.name, pick), outcome)
             axes.set_title(title, color=MUTED)
             axes.set_xticks(range(len(names)), names)
             axes.set_ylim(0.0, 102.0)
@@ -43,12 +43,14 @@ def curves(outcome: StudyResult) -> str | None:
         return svg(figure)
 
 
-def _found(outcome: StudyResult, scheme: str, pick: Score) -> Sequence[Estimate | None]:
-    """Give one estimate a condition; None where the scheme was not driven."""
+def _found(
+    outcome: StudyResult, variant: str, pick: Score
+) -> Sequence[Estimate | None]:
+    """Return one estimate a condition; None where the variant was not driven."""
     return [
         None if drive.scores is None else pick(drive.scores)
         for drive in outcome.drives
-        if drive.scheme == scheme
+        if drive.variant == variant
     ]
 
 
@@ -72,7 +74,7 @@ def _curve(
         linewidth=1.2,
         markersize=5,
     )
-    if driven and len(outcome.schemes) > 1:
+    if driven and len(outcome.variants) > 1:
         place, value, *_ = driven[-1]
         axes.annotate(
             name, (place, value), xytext=(7, 0), textcoords="offset points", va="center"

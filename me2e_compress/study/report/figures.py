@@ -10,29 +10,35 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.study.definition import Condition
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.findings import sure
-from me2e_compress.study.report.labels import place
 from me2e_compress.study.report.style import (
     ACCENT,
     BASELINE,
     INK,
     MUTED,
+    RULE,
     bare,
     styled,
     svg,
 )
 
 CROWD = 6
-"""With more schemes than this, only the front and the baseline bear names and bars."""
+"""With more variants than this, only the front and the baseline bear names and bars."""
 WIDTH_IN = 9.2
 """Of the page's column."""
+LINE_PT = 10.5
+"""Height of a line of labels, points."""
+CHARACTER_PT = 4.9
+"""Mean width of a character of this size, points: an estimate is enough here."""
+GAP_PT = 7.0
+POINTS_AN_INCH = 72.0
 
 
 @dataclass(frozen=True)
 class Point:
-    """A scheme where cost meets driving score.
+    """A variant where cost meets driving score.
 
     Attributes:
-        name: The scheme.
+        name: The variant.
         cost: Megabytes or milliseconds; less is better.
         score: Driving score with its interval; more is better.
         baseline: Whether the others are held against it.
@@ -50,7 +56,7 @@ class Point:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """Give the points that no other beats on both counts, cheapest first."""
+    """Return the points that no other beats on both counts, cheapest first."""
     best, kept = float("-inf"), list[Point]()
     for point in sorted(points, key=lambda p: (p.cost, -p.height)):
         if point.height > best:
@@ -82,7 +88,7 @@ def pareto(outcome: StudyResult, condition: Condition) -> str | None:
         figure.canvas.draw_idle()
         for each, (points, _) in zip(axes, panels, strict=True):
             named = [(p.name, p.cost, p.height) for p in _named(points)]
-            place(figure, each, named)
+            _place_names(figure, each, named)
         return svg(figure)
 
 
@@ -92,7 +98,7 @@ def forest(outcome: StudyResult) -> str | None:
     if not rows:
         return None
     several = len(outcome.study.conditions) > 1
-    names = [f"{r.scheme}, {r.condition}" if several else r.scheme for r in rows]
+    names = [f"{r.variant}, {r.condition}" if several else r.variant for r in rows]
     with styled():
         height = 0.9 + 0.26 * len(rows)
         figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
@@ -111,12 +117,12 @@ def forest(outcome: StudyResult) -> str | None:
 def _points(outcome: StudyResult, condition: Condition, kind: str) -> list[Point]:
     found = list[Point]()
     for drive in outcome.under(condition):
-        scheme = outcome.scheme(drive.scheme)
-        measure = scheme.size_mb if kind == "size" else scheme.latency_ms[50]
+        variant = outcome.variant(drive.variant)
+        measure = variant.size_mb if kind == "size" else variant.latency_ms[50]
         if drive.scores is not None and measure.value is not None:
-            baseline = drive.scheme == outcome.study.baseline
+            baseline = drive.variant == outcome.study.baseline
             score = drive.scores.driving_score
-            found.append(Point(drive.scheme, measure.value, score, baseline))
+            found.append(Point(drive.variant, measure.value, score, baseline))
     return found
 
 
@@ -178,3 +184,42 @@ def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
     axes.margins(y=0.08 if len(found) > 3 else 0.3)
     left, right = axes.get_xlim()
     axes.set_xlim(min(left, -1.0), max(right, 1.0))
+
+
+def _place_names(
+    figure: Figure, axes: Axes, names: Sequence[tuple[str, float, float]]
+) -> None:
+    """Write names to the right of their points, moved up or down where they would meet.
+
+    Args:
+        figure: Which the axes are of.
+        axes: Its limits must be final.
+        names: Name, x and y of each point, in the units of the axes.
+    """
+    scale = POINTS_AN_INCH / figure.dpi
+    ends = list[tuple[float, float, float]]()
+    spots = [
+        (name, x, y, axes.transData.transform((x, y)) * scale) for name, x, y in names
+    ]
+    for name, x, y, (left, up) in sorted(spots, key=lambda spot: -spot[3][1]):
+        start = left + GAP_PT
+        end = start + CHARACTER_PT * len(name)
+        height = up
+        for other_start, other_end, other_height in ends:
+            meets = start < other_end and other_start < end
+            if meets and other_height - height < LINE_PT:
+                height = other_height - LINE_PT
+        ends.append((start, end, height))
+        moved = abs(height - up) > 1.0
+        axes.annotate(
+            name,
+            (x, y),
+            xytext=(GAP_PT, height - up),
+            textcoords="offset points",
+            va="center",
+            fontsize=8.5,
+            color=INK,
+            arrowprops={"arrowstyle": "-", "color": RULE} if moved else None,
+            annotation_clip=False,
+            bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 0.5},
+        )

@@ -1,46 +1,46 @@
-"""A study in sentences: one a scheme, with what is sure and what is not."""
+"""A study in sentences: one a variant, with what is sure and what is not."""
 
 from dataclasses import dataclass
 
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study.cells import number
 from me2e_compress.study.drives import Drive
-from me2e_compress.study.outcome import SchemeOutcome, StudyResult
+from me2e_compress.study.outcome import StudyResult, VariantOutcome
+from me2e_compress.study.tables import number
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 
 
 @dataclass(frozen=True)
 class Takeaway:
-    """What a reader should take away about a scheme.
+    """What a reader should take away about a variant.
 
     Attributes:
-        scheme: Its name.
+        variant: Its name.
         text: One sentence.
     """
 
-    scheme: str
+    variant: str
     text: str
 
 
 def findings(outcome: StudyResult) -> tuple[Takeaway, ...]:
-    """Say of every scheme what it costs and how it drives, against the baseline."""
-    baseline = outcome.scheme(outcome.study.baseline)
+    """Write for every variant what it costs and how it drives, against the baseline."""
+    baseline = outcome.variant(outcome.study.baseline)
     return tuple(
-        Takeaway(scheme.name, _sentence(outcome, baseline, scheme))
-        for scheme in outcome.schemes
-        if scheme is not baseline
+        Takeaway(variant.name, _sentence(outcome, baseline, variant))
+        for variant in outcome.variants
+        if variant is not baseline
     )
 
 
 def _sentence(
-    outcome: StudyResult, baseline: SchemeOutcome, scheme: SchemeOutcome
+    outcome: StudyResult, baseline: VariantOutcome, variant: VariantOutcome
 ) -> str:
     costs = [
-        _times(scheme.size_mb, baseline.size_mb, "the size"),
-        _times(scheme.latency_ms[50], baseline.latency_ms[50], "the median latency"),
+        _times(variant.size_mb, baseline.size_mb, "the size"),
+        _times(variant.latency_ms[50], baseline.latency_ms[50], "the median latency"),
     ]
-    drives = [each for each in outcome.drives if each.scheme == scheme.name]
+    drives = [each for each in outcome.drives if each.variant == variant.name]
     several = len(outcome.study.conditions) > 1
     roads = [_road(each, several) for each in drives]
     parts = [", ".join(filter(None, costs)), *filter(None, roads)]
@@ -66,7 +66,7 @@ def _road(drive: Drive, several: bool) -> str:
 
 
 def sure(found: Estimate) -> int:
-    """Give the sign of a difference that is sure, 0 where none is.
+    """Return the sign of a difference that is sure, 0 where none is.
 
     Judged as it is shown, to a tenth of a point: what rounds to zero is no difference.
     """

@@ -42,7 +42,7 @@ class Shown:
     Attributes:
         title: The route and the moment.
         before: Words and data URI of the baseline.
-        after: The same of the scheme.
+        after: The same of the variant.
     """
 
     title: str
@@ -51,7 +51,7 @@ class Shown:
 
 
 def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
-    """Give the whole page; it refers to nothing outside itself.
+    """Build the whole page; it refers to nothing outside itself.
 
     Args:
         outcome: What was found.
@@ -72,7 +72,7 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
         findings=findings(outcome),
         scoreboards=scoreboards(outcome),
         curves=_markup(curves(outcome)),
-        differences=differences(outcome) if len(outcome.schemes) > 1 else None,
+        differences=differences(outcome) if len(outcome.variants) > 1 else None,
         forest=_markup(forest(outcome)),
         fronts=[
             (each.name, _markup(drawn))
@@ -82,7 +82,7 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
         abilities=abilities(outcome),
         contrasts=[_shown(each, study.baseline) for each in outcome.contrasts],
         made=_made(outcome, command),
-        schemes=[_recipe(each.name, outcome) for each in outcome.schemes],
+        variants=[_recipe(each.name, outcome) for each in outcome.variants],
     )
 
 
@@ -92,7 +92,7 @@ def _lede(outcome: StudyResult) -> str:
     share = f"{driven}" if driven == study.set_size else f"{driven} of {study.set_size}"
     names = ", ".join(each.name for each in study.conditions)
     return (
-        f"{_count(len(study.schemes), 'scheme')} on {share} routes of highway-env, "
+        f"{_count(len(study.variants), 'variant')} on {share} routes of highway-env, "
         f"closed loop; {_count(len(study.conditions), 'condition')}: {names}."
     )
 
@@ -108,24 +108,24 @@ def _shown(contrast: Contrast, baseline: str) -> Shown:
         f"{contrast.time_us / 1e6:.1f} s into the route {route.route}; "
         f"at most {contrast.other.apart_m or 0.0:.1f} m apart",
         (f"{baseline}: {_fate(route)}", _data_uri(contrast.before)),
-        (f"{contrast.scheme}: {_fate(contrast.other)}", _data_uri(contrast.after)),
+        (f"{contrast.variant}: {_fate(contrast.other)}", _data_uri(contrast.after)),
     )
 
 
 def _fate(route: RouteOutcome) -> str:
-    """Say how a route went, in words."""
+    """Describe in words how a route went."""
     kinds = [WORDS[InfractionKind(kind)] for kind, _ in route.infractions]
     words = ", ".join(dict.fromkeys(kinds)) or route.ending
     return f"driving score {route.driving_score:.1f}, {words}"
 
 
 def _recipe(name: str, outcome: StudyResult) -> tuple[str, str, str]:
-    """Give name, what it was made of, and the first digits of its digest."""
-    contender = outcome.scheme(name).contender
-    made_of = contender.source or contender.scheme.policy
-    if contender.pipeline:
-        made_of = f"{made_of} → {contender.pipeline}"
-    return name, made_of, (contender.sha256 or "")[:12]
+    """Return name, what it was made of, and the first digits of its digest."""
+    prepared = outcome.variant(name).prepared
+    made_of = prepared.source or prepared.variant.policy
+    if prepared.pipeline:
+        made_of = f"{made_of} → {prepared.pipeline}"
+    return name, made_of, (prepared.sha256 or "")[:12]
 
 
 def _made(outcome: StudyResult, command: Sequence[str]) -> list[tuple[str, str]]:

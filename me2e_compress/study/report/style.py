@@ -21,7 +21,7 @@ def styled() -> AbstractContextManager[None]:
 
 
 def svg(figure: Figure) -> str:
-    """Give a figure as an SVG element: the same figure, the same text."""
+    """Write a figure as an SVG element: the same figure gives the same text."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
