@@ -24,7 +24,9 @@ from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets import TARGETS, onnxruntime
+from me2e_compress.targets import onnxruntime
+from me2e_compress.targets.onnxruntime import OnnxRuntime
+from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import check
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import frames as drive
@@ -95,7 +97,10 @@ def ranges(
     plan = make_plan(model, QuantScheme.named("full", context.modules))
     assert context.frames is not None
     path = tmp_path_factory.mktemp("ranges") / "ranges.json"
-    tensors = (*tensors_of(plan, model), *onnxruntime.tensors(plan, model))
+    tensors = (
+        *tensors_of(plan, model),
+        *onnxruntime.OnnxRuntime().tensors(plan, model),
+    )
     unique = tuple(dict.fromkeys(tensors))
     Calibrator(threads=2).run(model, unique, context.frames).save(path)
     return path
@@ -142,7 +147,7 @@ def test_schemes_shrink_the_file_and_keep_the_plan(
     int8 = [n for n in result.model.graph if n.op_type == "DequantizeLinear"]
     assert len(int8) >= layers
     assert graph.size(result.model).weight_bytes / 1e6 < WEIGHT_MB - saved
-    assert TARGETS.parse("tensorrt").lint(result.model) == ()
+    assert TensorRT().lint(result.model) == ()
 
 
 def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
@@ -167,7 +172,7 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     assert kernels["QGemm"] + kernels["MatMulIntegerToFloat"] >= 140
     assert found.plan is not None
     assert found.plan.max_m < FEATURES_MOVE * plan_m
-    assert TARGETS.parse("onnxruntime").lint(result) == ()
+    assert OnnxRuntime().lint(result) == ()
 
 
 @pytest.mark.slow

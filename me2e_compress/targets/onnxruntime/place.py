@@ -1,48 +1,63 @@
 """Write a plan into a graph as onnxruntime's CPU kernels read it."""
 
+import dataclasses
+from typing import ClassVar
+
 import onnx_ir as ir
 
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
+from me2e_compress.targets.base import LintRule, Target
 from me2e_compress.targets.onnxruntime.kernels import objection
+from me2e_compress.targets.onnxruntime.lint import RULES
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
 from me2e_compress.targets.onnxruntime.region import Region, find_region
 from me2e_compress.targets.weights import weights_of
 
 
-def place(model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
-    """Return a copy of a graph in which the plan's layers run in int8 on the CPU.
+@dataclasses.dataclass(frozen=True)
+class OnnxRuntime(Target):
+    """onnxruntime's CPU kernels: uint8 activations, quantized answers, 2-D products."""
 
-    Args:
-        model: the float graph that was planned and calibrated; it stays as it is.
-        plan: what becomes int8; the products of attention stay float here.
-        ranges: of every tensor that :func:`tensors` names.
+    name: ClassVar[str] = "onnxruntime"
 
-    Raises:
-        PreconditionError: the graph is older than opset 13, or something that the plan
-            calls a weight is not one.
-        FramesError: the range of a tensor is missing.
-    """
-    weights = weights_of(model, _layers_of(plan))
-    reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
-    return lower(Draft(model.clone(), weights, reach))
+    def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
+        """Return the activations whose range is needed: read or made by layers."""
+        return _region(plan, model).ranged
 
+    def place(self, model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
+        """Return a copy of a graph in which the plan's layers run in int8 on the CPU.
 
-def tensors(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-    """Return the activations whose range lowering needs: read or made by layers."""
-    return _region(plan, model).ranged
+        Args:
+            model: the float graph that was planned and calibrated; it stays as it is.
+            plan: what becomes int8; the products of attention stay float here.
+            ranges: of every tensor that :meth:`tensors` names.
 
+        Raises:
+            PreconditionError: the graph is older than opset 13, or something that the
+                plan calls a weight is not one.
+            FramesError: the range of a tensor is missing.
+        """
+        weights = weights_of(model, _layers_of(plan))
+        reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
+        return lower(Draft(model.clone(), weights, reach))
 
-def kept_float(plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
-    """List the plan's nodes that :func:`place` leaves in float, and why."""
-    region = _region(plan, model)
-    nodes = {str(node.outputs[0].name): node for node in model.graph}
-    reasons = (
-        (each, _objection(nodes[each.output], each, region)) for each in plan.chosen
-    )
-    return tuple(
-        KeptFloat(each.node, each.output, reason) for each, reason in reasons if reason
-    )
+    def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
+        """List the plan's nodes that :meth:`place` leaves in float, and why."""
+        region = _region(plan, model)
+        nodes = {str(node.outputs[0].name): node for node in model.graph}
+        reasons = (
+            (each, _objection(nodes[each.output], each, region)) for each in plan.chosen
+        )
+        return tuple(
+            KeptFloat(each.node, each.output, reason)
+            for each, reason in reasons
+            if reason
+        )
+
+    def lint_rules(self) -> tuple[LintRule, ...]:
+        """Return the rules of its kernels."""
+        return RULES
 
 
 def _layers_of(plan: QuantPlan) -> tuple[Decision, ...]:

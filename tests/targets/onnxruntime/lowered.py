@@ -17,7 +17,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import place, tensors
+from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.frames import record
 from tests.nets import MODULES, net
 
@@ -94,8 +94,8 @@ TOKENS = feeds(1, x=(2, 12, 8), t=(6, 5))
 def lowered(model: ir.Model, reach: float = 3.0) -> ir.Model:
     """Lower with one range for all."""
     plan = make_plan(model, FULL)
-    ends = dict.fromkeys(tensors(plan, model), (-reach, reach))
-    return place(model, plan, Ranges(ends, "max-min", 1, "", ""))
+    ends = dict.fromkeys(OnnxRuntime().tensors(plan, model), (-reach, reach))
+    return OnnxRuntime().place(model, plan, Ranges(ends, "max-min", 1, "", ""))
 
 
 def measured(model: ir.Model, tensors: tuple[str, ...], feeds: Feeds) -> Ranges:
@@ -108,7 +108,9 @@ def measured(model: ir.Model, tensors: tuple[str, ...], feeds: Feeds) -> Ranges:
 def calibrated(model: ir.Model, feeds: Feeds) -> ir.Model:
     """Lower with the ranges of one frame."""
     plan = make_plan(model, FULL)
-    return place(model, plan, measured(model, tensors(plan, model), feeds))
+    return OnnxRuntime().place(
+        model, plan, measured(model, OnnxRuntime().tensors(plan, model), feeds)
+    )
 
 
 def kernels(model: ir.Model) -> Counter[str]:

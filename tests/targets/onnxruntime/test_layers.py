@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from me2e_compress import graph
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules.paper_rules import PaperRules
-from me2e_compress.targets.onnxruntime import place, tensors
+from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.nets import net
 from tests.targets.onnxruntime.lowered import (
     FULL,
@@ -160,7 +160,9 @@ def test_a_constant_that_lends_a_product_its_columns_is_no_bias() -> None:
     plan = make_plan(model, FULL, PaperRules(without=("gemv",)))
     fed = feeds(2, x=(4, 8))
 
-    result = place(model, plan, measured(model, tensors(plan, model), fed))
+    result = OnnxRuntime().place(
+        model, plan, measured(model, OnnxRuntime().tensors(plan, model), fed)
+    )
 
     got, want = ran(result, fed)["y"], ran(model, fed)["y"]
     assert kernels(result)["QGemm"] == 0

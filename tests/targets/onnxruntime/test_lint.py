@@ -6,6 +6,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
+from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.nets import MODULES, conv_attention, net
 
 LAYER = """
@@ -38,7 +39,7 @@ def test_convolutions_that_run_slowly(
 ) -> None:
     text = LAYER % {"kind": kind, "zero": zero, "answer": answer}
 
-    found = TARGETS.parse("onnxruntime").lint(ir.from_onnx_text(text))
+    found = OnnxRuntime().lint(ir.from_onnx_text(text))
 
     assert [each.rule for each in found] == rules
     assert {each.severity for each in found} <= {"warning"}
@@ -49,7 +50,7 @@ def test_operators_without_a_kernel() -> None:
         '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>'
         "m (float[1,2,3,3] x) => (float[1,2,3,3] y) { y = trt.InverseTRT(x) }"
     )
-    (found,) = TARGETS.parse("onnxruntime").lint(model)
+    (found,) = OnnxRuntime().lint(model)
 
     assert found.message == "trt::InverseTRT has no kernel and no local function"
 
@@ -59,7 +60,7 @@ def test_contrib_operators_are_known() -> None:
         '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1]>'
         "m (float[2] x) => (float[2] y) { y = com.microsoft.Gelu(x) }"
     )
-    assert TARGETS.parse("onnxruntime").lint(model) == ()
+    assert OnnxRuntime().lint(model) == ()
 
 
 def test_opsets_nobody_has_released() -> None:
@@ -67,7 +68,7 @@ def test_opsets_nobody_has_released() -> None:
         '<ir_version: 9, opset_import: ["" : 99]>'
         "m (float[2] x) => (float[2] y) { y = Relu(x) }"
     )
-    assert "opset" in [each.rule for each in TARGETS.parse("onnxruntime").lint(model)]
+    assert "opset" in [each.rule for each in OnnxRuntime().lint(model)]
 
 
 def test_what_we_place_for_it_has_no_findings() -> None:
@@ -78,7 +79,7 @@ def test_what_we_place_for_it_has_no_findings() -> None:
 
     placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
 
-    assert TARGETS.parse("onnxruntime").lint(placed) == ()
+    assert OnnxRuntime().lint(placed) == ()
 
 
 def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
@@ -97,4 +98,4 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
 
     placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
 
-    assert TARGETS.parse("onnxruntime").lint(placed) == ()
+    assert OnnxRuntime().lint(placed) == ()

@@ -8,13 +8,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.targets import TARGETS
-from me2e_compress.targets.onnxruntime import (
-    int8_layers,
-    kept_float,
-    place,
-    tensors,
-)
+from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers
 from tests.nets import conv_attention
 from tests.targets.onnxruntime.lowered import (
     FULL,
@@ -102,7 +96,7 @@ def test_tensors_without_sign_use_the_whole_grid() -> None:
 def test_what_only_moves_elements_shares_the_grid_of_what_it_moves() -> None:
     model = block()
 
-    assert tensors(make_plan(model, FULL), model) == (
+    assert OnnxRuntime().tensors(make_plan(model, FULL), model) == (
         "x", "a1", "a2", "a3", "z3", "y",
     )  # fmt: skip
 
@@ -120,7 +114,7 @@ def test_the_result_is_a_valid_graph_and_the_source_untouched() -> None:
 
 def test_the_lint_of_the_target_finds_nothing() -> None:
     for model in (block(), linear(), conv_attention()):
-        assert TARGETS.parse("onnxruntime").lint(lowered(model)) == ()
+        assert OnnxRuntime().lint(lowered(model)) == ()
 
 
 def test_the_same_plan_gives_the_same_graph() -> None:
@@ -150,7 +144,7 @@ def test_a_missing_range_is_named() -> None:
     some = Ranges({"x": (-1.0, 1.0), "a1": (0.0, 1.0)}, "max-min", 1, "", "")
 
     with pytest.raises(FramesError, match=r"4 tensors have no range.* a2.*calibrated"):
-        place(model, plan, some)
+        OnnxRuntime().place(model, plan, some)
 
 
 def test_a_matrix_with_leading_ones_is_one_matrix_with_a_bias() -> None:
@@ -204,7 +198,7 @@ def test_what_the_kernels_do_not_take_is_listed_with_the_reason() -> None:
     model = drawn(KEPT, {"w": (8, 8, 1, 1), "up": (8, 8, 2, 2), "many": (8, 4, 4)})
     plan = make_plan(model, FULL)
 
-    found = {each.output: each.reason for each in kept_float(plan, model)}
+    found = {each.output: each.reason for each in OnnxRuntime().kept_float(plan, model)}
 
     assert found == {
         "s": "a sum that no int8 kernel reads, or of which none gives a side",
@@ -217,6 +211,6 @@ def test_what_the_kernels_do_not_take_is_listed_with_the_reason() -> None:
 def test_attention_products_are_listed_as_float() -> None:
     model = conv_attention()
 
-    found = kept_float(make_plan(model, FULL), model)
+    found = OnnxRuntime().kept_float(make_plan(model, FULL), model)
 
     assert [each.node for each in found] == ["/head/QK", "/head/AV"]

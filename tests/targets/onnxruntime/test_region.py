@@ -3,7 +3,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.targets.onnxruntime import tensors
+from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.nets import net
 from tests.targets.onnxruntime.lowered import (
     FULL,
@@ -97,7 +97,12 @@ def test_a_relu_in_a_body_is_no_part_of_the_convolution_before_it() -> None:
     weights = {name: generator.standard_normal(size) for name, size in shapes.items()}
     model, fed = net(BODY, weights), feeds(3, fine=(1, 4, 8, 8))
 
-    assert tensors(make_plan(model, FULL), model) == ("fine", "chosen", "c", "y")
+    assert OnnxRuntime().tensors(make_plan(model, FULL), model) == (
+        "fine",
+        "chosen",
+        "c",
+        "y",
+    )
     want, got = ran(model, fed)["y"], ran(calibrated(model, fed), fed)["y"]
     assert sqnr_db(want, got) > 25
 
