@@ -5,7 +5,7 @@
                                           [--target tensorrt|onnxruntime]
 
 Studies, one after the other: baselines (expert, blind, the driver), ablation (each
-module away), pairs (two away), variants (float to int8, at no latency and at each
+module away), pairs (two away), schemes (float to int8, at no latency and at each
 model's own under one device scale), latency (fewer decisions a second), determinism
 (the driver twice, compared byte by byte). They share OUT, so what one has driven the
 next does not drive again, and a run that was stopped goes on: every route is written
@@ -50,7 +50,7 @@ from me2e_compress.workflows.frames import FramesOptions, record_frames
 
 DRIVER = "highway"
 MODULES = ("track", "map", "motion", "occ")
-VARIANTS = ("exact", "feature-ext", "prediction", "full")
+SCHEMES = ("exact", "feature-ext", "prediction", "full")
 FPS = (20, 10, 5, 2, 1)
 FLOAT_MEDIAN_S = 0.43
 """Median latency of the float driver on the device imagined."""
@@ -134,9 +134,9 @@ def pairs(bench: Bench) -> Study:
     return bench.study("Ablation of pairs", (bench.float, *double))
 
 
-def variants(bench: Bench) -> Study:
-    made = [bench.compressed(name) for name in VARIANTS]
-    return bench.study("Variants", (bench.float, *made), (IDEAL, DEVICE))
+def schemes(bench: Bench) -> Study:
+    made = [bench.compressed(name) for name in SCHEMES]
+    return bench.study("Schemes", (bench.float, *made), (IDEAL, DEVICE))
 
 
 def latency(bench: Bench) -> Study:
@@ -152,7 +152,7 @@ STUDIES: Mapping[str, Callable[[Bench], Study]] = {
     "baselines": baselines,
     "ablation": ablation,
     "pairs": pairs,
-    "schemes": variants,
+    "schemes": schemes,
     "latency": latency,
     "determinism": determinism,
 }

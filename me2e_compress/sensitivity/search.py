@@ -76,6 +76,7 @@ def search(
         raise EvaluationError(
             f"{len(active)} modules are more than {MOST_MODULES}: use a coarser map"
         )
+    # 1. every module alone: what it loses, what it saves
     float_cost = budget.cost(trials.model)
     losses, savings = {}, {}
     for done, name in enumerate(active):
@@ -83,29 +84,30 @@ def search(
             progress(done, len(active), name)
         losses[name] = trials.score(Int8Choice((name,))).loss
         savings[name] = float_cost - budget.cost(trials.variant(Int8Choice((name,))))
+    # 2. every assignment, predicted from that
     ranked = _predict(active, losses, savings, float_cost)
-    fitting = [each for each in ranked if each.cost <= budget.limit]
+    # 3. the best that should fit, measured until one does
     tried: list[Candidate] = []
-    cheapest = min(ranked, key=lambda each: each.cost)
-    chosen = fitting[: most_tried - 1]
-    if fitting and cheapest not in chosen:
-        chosen.append(cheapest)
-    for candidate in chosen:
+    least = min(each.cost for each in ranked)
+    for candidate in _promising(ranked, budget.limit, most_tried):
         choice = Int8Choice(candidate.modules)
         cost = budget.cost(trials.variant(choice))
-        tried.append(
-            dataclasses.replace(
-                candidate, score=trials.score(choice), measured_cost=cost
-            )
-        )
+        score, least = trials.score(choice), min(least, cost)
+        tried.append(dataclasses.replace(candidate, score=score, measured_cost=cost))
         if cost <= budget.limit:
             return tuple(tried)
-    least = [each.measured_cost for each in tried if each.measured_cost is not None]
-    least += [min(each.cost for each in ranked)]
     raise EvaluationError(
         f"nothing fits {budget.limit:g} {budget.unit}: the float model costs"
-        f" {float_cost:g}, the cheapest assignment about {min(least):g}"
+        f" {float_cost:g}, the cheapest assignment about {least:g}"
     )
+
+
+def _promising(ranked: Sequence[Candidate], limit: float, most: int) -> list[Candidate]:
+    """Choose those predicted to fit, the best first and the cheapest of all last."""
+    fitting = [each for each in ranked if each.cost <= limit]
+    chosen = fitting[: most - 1]
+    cheapest = min(ranked, key=lambda each: each.cost)
+    return chosen if not fitting or cheapest in chosen else [*chosen, cheapest]
 
 
 def _predict(
