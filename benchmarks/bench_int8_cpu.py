@@ -37,11 +37,11 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import compare
+from me2e_compress.graph.nodes import constant_values
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.runtime.constant_values import constant_values
 from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers

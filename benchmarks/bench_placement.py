@@ -32,6 +32,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph import WEIGHTED
+from me2e_compress.graph.nodes import constant_values
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
@@ -44,9 +45,8 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.runtime.constant_values import constant_values, evaluate_constants
 from me2e_compress.runtime.interleaved import time_interleaved
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.session import Session, evaluate_constants
 from me2e_compress.targets.tensorrt import TensorRT
 
 NODES = 8000

@@ -1,7 +1,6 @@
 """All commands together."""
 
 import typer
-from rich.markup import escape
 
 from me2e_compress.cli.commands.calibrate import calibrate
 from me2e_compress.cli.commands.compare import compare
@@ -17,8 +16,7 @@ from me2e_compress.cli.commands.plan import plan
 from me2e_compress.cli.commands.profile import profile
 from me2e_compress.cli.commands.search import search
 from me2e_compress.cli.commands.sensitivity import sensitivity
-from me2e_compress.cli.console import errors
-from me2e_compress.errors import Me2eError, MissingExtraError
+from me2e_compress.errors import MissingExtraError
 from me2e_compress.workflows.extras import ROAD, ZOO, are_there
 
 CLOSED_LOOP = ("evaluate", "routes", "score", "study")
@@ -78,19 +76,3 @@ def _advise_on(app: typer.Typer, name: str, extra: str) -> None:
 
 add_closed_loop(app)
 add_training(app)
-
-
-def run() -> int:
-    """Run the command; our own errors become one line and exit code 1."""
-    try:
-        app(standalone_mode=True)
-    except (Me2eError, OSError) as error:
-        line = " ".join(str(error).split())
-        errors.print(f"me2e-compress: {escape(line)}", soft_wrap=True)
-        return 1
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else int(bool(done.code))
-    except KeyboardInterrupt:
-        errors.print("me2e-compress: interrupted")
-        return 130
-    return 0

@@ -12,13 +12,8 @@ from me2e_compress.graph.files import (
     save,
     sha256_of,
 )
-from me2e_compress.graph.macs import macs, macs_counter, total_macs
 from me2e_compress.graph.nodes import (
-    CONVOLUTIONS,
-    WEIGHTED,
     array_of,
-    bias_of,
-    channel_axis,
     graphs_of,
     has_subgraph,
     input_at,
@@ -28,8 +23,26 @@ from me2e_compress.graph.nodes import (
     producer_of,
 )
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.graph.shapes import infer_shapes, open_shape, rank_of, static_shape
-from me2e_compress.graph.summary import Port, Size, interface, node_count, size
+from me2e_compress.graph.shapes import (
+    CONVOLUTIONS,
+    WEIGHTED,
+    bias_of,
+    channel_axis,
+    infer_shapes,
+    open_shape,
+    rank_of,
+    static_shape,
+)
+from me2e_compress.graph.summary import (
+    Port,
+    Size,
+    interface,
+    macs,
+    macs_counter,
+    node_count,
+    size,
+    total_macs,
+)
 
 __all__ = [
     "CONVOLUTIONS",

@@ -1,14 +1,11 @@
-"""Facts about nodes and values, and about layers with weights."""
+"""Facts about nodes and values: who makes, who reads, and what constants hold."""
 
-import dataclasses
-import math
 from collections.abc import Iterator
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
-
-from me2e_compress.graph.shapes import open_shape, rank_of, static_shape
 
 STANDARD = ("", "ai.onnx")
 """The two spellings of the domain of ONNX's own operators."""
@@ -72,108 +69,100 @@ def array_of(value: ir.Value | None) -> npt.NDArray[np.generic] | None:
     return None if tensor is None else tensor.numpy()
 
 
-CONVOLUTIONS = ("Conv", "ConvTranspose")
-WEIGHTED = (*CONVOLUTIONS, "Gemm", "MatMul")
-"""Operators of weighted layers: those that have an int8 kernel worth feeding."""
+Array: TypeAlias = npt.NDArray[np.generic]
+Numbers: TypeAlias = npt.NDArray[np.float64]
 
-Dims = tuple[int | None, ...]
+FLOATS = frozenset({ir.DataType.DOUBLE, ir.DataType.FLOAT, ir.DataType.FLOAT16})
+"""The floating-point types that numpy itself computes with."""
 
-
-def bias_of(node: ir.Node) -> ir.Value | None:
-    """Return the bias of a Conv, ConvTranspose or Gemm; None if it has none."""
-    return input_at(node, 2)
+CLOSE = 1e-4
+"""How near a constant must be to the textbook's, relative: 0.7071 is 1/sqrt 2."""
 
 
-def channel_axis(node: ir.Node) -> int:
-    """Return the axis of a layer's weight along which its output channels run.
+def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
+    """Return the node that makes a value, if it is one of these standard operators."""
+    node = None if value is None else value.producer()
+    if node is None or not is_standard(node) or node.op_type not in op_types:
+        return None
+    return node
 
-    Conv [M, C/g, ...]: 0. ConvTranspose [C, M/g, ...]: 1. MatMul [..., K, N]: the last.
-    Gemm [K, N]: 1, or 0 where it is transposed.
+
+def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
+    """Return the maker of a value that one node reads, of the same graph."""
+    node = maker(value, *op_types)
+    if node is None or value is None or sole_reader(value) is None:
+        return None
+    return node if value is node.outputs[0] else None
+
+
+def sole_reader(value: ir.Value) -> ir.Node | None:
+    """Return the one node that reads a value, once; None if others do, or outputs.
+
+    None too if it is in another graph than the value's maker, in the body of an If or
+    Loop: that runs seldom, or often, and what it makes stays inside.
     """
-    if node.op_type == "Conv":
-        return 0
-    if node.op_type == "ConvTranspose":
-        return 1
-    if node.op_type == "Gemm":
-        return 0 if node.attributes.get_int("transB", 0) else 1
-    weight = node.inputs[1]
-    rank = 2 if weight is None or weight.shape is None else len(weight.shape)
-    return rank - 1
+    uses = value.uses()
+    if len(uses) != 1 or value.is_graph_output():
+        return None
+    node, made = next(iter(uses)).node, value.producer()
+    return node if made is None or made.graph is node.graph else None
 
 
-@dataclasses.dataclass(frozen=True)
-class Extent:
-    """Size of one matrix product, [M, K] x [K, N].
+def is_read(value: ir.Value) -> bool:
+    """Return whether anything needs a value: a node, or the outside."""
+    return bool(value.uses()) or value.is_graph_output()
 
-    Attributes:
-        rows: M: of a product with a plain weight, all leading dimensions together;
-            of a batch of products, the rows of one. None where that is open.
-        columns: N, likewise of one product.
-        depth: K, what is summed over.
+
+def holds_numbers(value: ir.Value | None) -> bool:
+    """Return whether a value is a constant of a floating-point type."""
+    return value is not None and value.dtype in FLOATS and array_of(value) is not None
+
+
+def numbers_of(value: ir.Value | None) -> Numbers | None:
+    """Return a constant floating-point array, widened to float64."""
+    array = array_of(value) if holds_numbers(value) else None
+    return None if array is None else array.astype(np.float64)
+
+
+def scalar_of(value: ir.Value | None) -> float | None:
+    """Return a constant of one element; None if it is an array or computed."""
+    array = array_of(value) if holds_numbers(value) else None
+    return float(array.item()) if array is not None and array.size == 1 else None
+
+
+def overflow(numbers: Numbers, stored: Array) -> bool:
+    """Return whether numbers are too large for the type of a stored array."""
+    limit = np.finfo(stored.dtype.name).max
+    return not np.all(np.abs(numbers) <= limit)
+
+
+def is_close(value: float | None, expected: float) -> bool:
+    """Return whether a constant is the textbook's, within :data:`CLOSE`."""
+    return value is not None and abs(value - expected) <= CLOSE * abs(expected)
+
+
+_UNSTEADY = frozenset(
+    {
+        "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike",
+        "RandomUniform", "RandomUniformLike",
+    }
+)  # fmt: skip
+
+
+def constant_values(model: ir.Model) -> frozenset[ir.Value]:
+    """Find the initializers and everything computed from them alone.
+
+    Nodes with a body, calls of functions and operators of other domains count as
+    computed. One look at each node: the graph must be in topological order.
     """
-
-    rows: int | None
-    columns: int | None
-    depth: int | None
-
-    @property
-    def is_vector(self) -> bool:
-        """Whether it degenerates to a matrix-vector product."""
-        return 1 in (self.rows, self.columns)
-
-
-def extent(node: ir.Node, *, weight: bool) -> Extent:
-    """Measure a MatMul or Gemm.
-
-    A weight of shape [K, N] (or [1, ..., K, N]) is shared by every row, whatever the
-    rank of the left operand: [1, 1, 256] x [256, 12] has one row, and so does
-    [1, 256] x [256, 12]. Where the right operand differs from batch to batch, the rows
-    of one batch count.
-
-    Args:
-        node: the product.
-        weight: whether its right operand is constant.
-    """
-    left, right = open_shape(node.inputs[0]), open_shape(node.inputs[1])
-    if node.op_type == "Gemm":
-        return _gemm(node, left, right)
-    columns, depth = (None, None) if right is None else _sides(right)
-    if not left:
-        return Extent(None, columns, depth)
-    shared = weight and right is not None and _product(right[:-2]) == 1
-    rows = _product(left[:-1]) if shared or len(left) == 1 else left[-2]
-    return Extent(rows, columns, depth if left[-1] is None else left[-1])
-
-
-def is_one_matrix(product: ir.Node) -> bool:
-    """Return whether a MatMul multiplies every row by one and the same matrix.
-
-    Its right operand is [K, N] then, or [1, ..., K, N] of no more dimensions than the
-    left one has: without the leading ones it gives the same.
-    """
-    left, right = product.inputs[0], static_shape(product.inputs[1])
-    if right is None or len(right) < 2:
-        return False
-    rank = rank_of(left) or 0
-    return len(right) == 2 or (math.prod(right[:-2]) == 1 and len(right) <= rank)
-
-
-def _product(dims: Dims) -> int | None:
-    """Multiply dimensions; None if one of them is open."""
-    known = [dim for dim in dims if dim is not None]
-    return math.prod(known) if len(known) == len(dims) else None
-
-
-def _sides(right: Dims) -> tuple[int | None, int | None]:
-    """Return N and K of a right operand; a vector is one column."""
-    return (right[-1], right[-2]) if len(right) > 1 else (1, _product(right))
-
-
-def _gemm(node: ir.Node, left: Dims | None, right: Dims | None) -> Extent:
-    flip_left = bool(node.attributes.get_int("transA", 0))
-    flip_right = bool(node.attributes.get_int("transB", 0))
-    return Extent(
-        None if left is None else left[1 if flip_left else 0],
-        None if right is None else right[0 if flip_right else 1],
-        None if right is None else right[1 if flip_right else 0],
-    )
+    weights = model.graph.initializers.values()
+    found = {value for value in weights if not value.is_graph_input()}
+    for node in model.graph:
+        if (
+            is_standard(node)
+            and node.op_type not in _UNSTEADY
+            and not has_subgraph(node)
+            and all(each is None or each in found for each in node.inputs)
+        ):
+            found.update(node.outputs)
+    return frozenset(found)

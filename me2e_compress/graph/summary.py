@@ -1,11 +1,14 @@
-"""What a graph takes, gives, weighs and costs."""
+"""What a graph takes, gives, weighs and costs: ports, nodes, bytes, MACs."""
 
 import dataclasses
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 
+import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph.macs import macs_counter, total_macs
+from me2e_compress.graph.nodes import graphs_of, input_at, is_standard
+from me2e_compress.graph.shapes import static_shape
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,3 +78,143 @@ def node_count(model: ir.Model) -> int:
 
 def _ports(values: Iterable[ir.Value]) -> tuple[Port, ...]:
     return tuple(Port(v.name or "", str(v.type), str(v.shape)) for v in values)
+
+
+Counter = Callable[[ir.Node], int | None]
+
+_UNCOUNTED = frozenset(
+    {
+        "AffineGrid", "Attention", "CausalConvWithState", "DFT", "DeformConv", "Det",
+        "GRU", "LSTM", "LinearAttention", "RNN", "STFT", "SequenceMap",
+    }
+)  # fmt: skip
+"""Operators of ONNX that multiply matrices, and that no rule here counts."""
+
+
+def macs(node: ir.Node) -> int | None:
+    """Return a node's MACs: 0 for operators that multiply no matrices.
+
+    Conv and ConvTranspose: output (input) elements x kernel volume x channels per
+    group. Gemm and MatMul: rows x columns x inner dimension x batch. Einsum of two
+    operands: the product of all its dimensions. Their integer forms likewise.
+
+    Returns:
+        The count; None where it is not known: of a plugin, a local function, an
+        operator that no rule counts, a loop around one that multiplies, or a shape
+        that is open.
+    """
+    if not is_standard(node) or not onnx.defs.has(node.op_type, domain=""):
+        return None
+    if node.op_type in ("Loop", "Scan"):  # nobody knows how often it runs
+        return 0 if all(macs(inner) == 0 for inner in _inside(node)) else None
+    if node.op_type in _UNCOUNTED:
+        return None
+    rule = _RULES.get(node.op_type)
+    return 0 if rule is None else rule(node)
+
+
+def macs_counter(model: ir.Model) -> Counter:
+    """Return :func:`macs` for the nodes of a model: calls of its functions count too.
+
+    A call is worth what the nodes of its body are; shapes inside are seldom known, so
+    that a function that multiplies matrices is mostly None.
+    """
+    bodies: dict[ir.OperatorIdentifier, int | None] = {}
+
+    def count(node: ir.Node) -> int | None:
+        key = node.op_identifier()
+        function = model.functions.get(key)
+        if function is None:
+            return macs(node)
+        if key not in bodies:
+            found, unknown = total_macs(count(inner) for inner in function.all_nodes())
+            bodies[key] = found if not unknown else None
+        return bodies[key]
+
+    return count
+
+
+def total_macs(counts: Iterable[int | None]) -> tuple[int | None, int]:
+    """Add up the MACs of nodes.
+
+    Returns:
+        The sum of those that are known, and how many are not: the sum is a lower bound
+        then. None instead of a sum of 0 where some are unknown: not measured is never
+        zero.
+    """
+    total, unknown = 0, 0
+    for count in counts:
+        if count is None:
+            unknown += 1
+        else:
+            total += count
+    return (total if total or not unknown else None), unknown
+
+
+def _inside(node: ir.Node) -> Iterable[ir.Node]:
+    for attribute in node.attributes.values():
+        if attribute.type == ir.AttributeType.GRAPH:
+            for body in graphs_of(attribute.as_graph()):
+                yield from body
+
+
+def _conv(weight: int) -> Counter:
+    def count(node: ir.Node) -> int | None:
+        kernel = static_shape(input_at(node, weight))
+        out = static_shape(node.outputs[0])
+        return None if kernel is None or out is None else math.prod(out + kernel[1:])
+
+    return count
+
+
+def _conv_transpose(node: ir.Node) -> int | None:
+    kernel, source = static_shape(node.inputs[1]), static_shape(node.inputs[0])
+    if kernel is None or source is None:
+        return None
+    return math.prod(source + kernel[1:])
+
+
+def _matmul(node: ir.Node) -> int | None:
+    left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if left is None or out is None:
+        return None
+    return math.prod(out) * (left[-1] if left else 1)
+
+
+def _gemm(node: ir.Node) -> int | None:
+    left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if left is None or out is None:
+        return None
+    transposed = node.attributes.get_int("transA", 0)
+    return math.prod(out) * left[0 if transposed else 1]
+
+
+def _einsum(node: ir.Node) -> int | None:
+    """Count the products of two operands; a sum or transpose of one has none."""
+    if len(node.inputs) == 1:
+        return 0
+    equation = node.attributes.get_string("equation", "").replace(" ", "")
+    terms = equation.partition("->")[0].split(",")
+    shapes = [static_shape(value) for value in node.inputs]
+    if len(terms) != 2 or "." in equation:
+        return None
+    sizes: dict[str, int] = {}
+    for term, shape in zip(terms, shapes, strict=True):
+        if shape is None or len(shape) != len(term):
+            return None
+        for letter, size in zip(term, shape, strict=True):
+            sizes[letter] = max(size, sizes.get(letter, 1))
+    return math.prod(sizes.values())
+
+
+_RULES: dict[str, Counter] = {
+    "Conv": _conv(1),
+    "ConvInteger": _conv(1),
+    "ConvTranspose": _conv_transpose,
+    "Einsum": _einsum,
+    "Gemm": _gemm,
+    "MatMul": _matmul,
+    "MatMulInteger": _matmul,
+    "QLinearConv": _conv(3),
+    "QLinearMatMul": _matmul,
+}

@@ -6,6 +6,20 @@ and the origins of those they replace, and name the pass that made them.
 """
 
 from me2e_compress.graph import array_of, graphs_of, has_subgraph, is_standard
+from me2e_compress.graph.nodes import (
+    FLOATS,
+    Array,
+    Numbers,
+    holds_numbers,
+    is_close,
+    is_read,
+    maker,
+    numbers_of,
+    overflow,
+    scalar_of,
+    sole_maker,
+    sole_reader,
+)
 from me2e_compress.graph.provenance import inherit
 from me2e_compress.rewrite.edits import (
     add_constant,
@@ -35,20 +49,6 @@ from me2e_compress.rewrite.pattern import (
     op,
     product,
     var,
-)
-from me2e_compress.rewrite.values import (
-    FLOATS,
-    Array,
-    Numbers,
-    holds_numbers,
-    is_close,
-    is_read,
-    maker,
-    numbers_of,
-    overflow,
-    scalar_of,
-    sole_maker,
-    sole_reader,
 )
 
 __all__ = [

@@ -8,7 +8,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import graphs_of, provenance
-from me2e_compress.rewrite.values import Array, is_read
+from me2e_compress.graph.nodes import Array, is_read
 
 
 def value_names(graph: ir.Graph) -> set[str]:

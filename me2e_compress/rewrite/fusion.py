@@ -9,6 +9,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import graphs_of, input_at, is_standard, opset_of, provenance
+from me2e_compress.graph.nodes import Array, is_read, sole_reader
 from me2e_compress.rewrite.edits import (
     add_constant,
     put,
@@ -18,7 +19,6 @@ from me2e_compress.rewrite.edits import (
 )
 from me2e_compress.rewrite.match import Match, match
 from me2e_compress.rewrite.pattern import Pattern
-from me2e_compress.rewrite.values import Array, is_read, sole_reader
 
 ROUNDS = 16
 """A fusion can complete the pattern of another: real graphs need two or three."""

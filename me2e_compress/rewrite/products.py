@@ -4,7 +4,7 @@ import dataclasses
 
 import onnx_ir as ir
 
-from me2e_compress.rewrite.values import maker, scalar_of, sole_maker
+from me2e_compress.graph.nodes import maker, scalar_of, sole_maker
 
 _POWERS = (2.0, 3.0)
 """Powers that count as so many factors."""

@@ -8,6 +8,7 @@ import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
 
+from me2e_compress import rewrite
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.opening import (
@@ -19,7 +20,7 @@ from me2e_compress.runtime.opening import (
 )
 from me2e_compress.runtime.recurrence import SessionPort, recurrence
 
-__all__ = ["Session", "SessionPort", "replay", "run_once"]
+__all__ = ["Session", "SessionPort", "evaluate_constants", "replay", "run_once"]
 
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
     "tensor(float)": np.dtype(np.float32),
@@ -206,3 +207,28 @@ def _zeros(name: str, port: SessionPort) -> Array:
 
 def _line(error: Exception) -> str:
     return " ".join(str(error).split())
+
+
+def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array]:
+    """Compute constant values of a graph.
+
+    Args:
+        model: the graph; it stays as it is.
+        names: values that :func:`~me2e_compress.graph.nodes.constant_values` lists.
+
+    Raises:
+        GraphError: onnxruntime cannot compute them.
+        FramesError: one of them depends on an input after all.
+    """
+    if not names:
+        return {}
+    part = model.clone()
+    part.metadata_props.clear()  # it speaks of inputs and outputs that go
+    made = {str(each.name): each for node in part.graph for each in node.outputs}
+    part.graph.outputs.clear()
+    part.graph.outputs.extend(made[name] for name in names)
+    rewrite.sweep(part)
+    used = [value for value in part.graph.inputs if value.uses()]
+    part.graph.inputs.clear()
+    part.graph.inputs.extend(used)
+    return run_once(part, {})

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from me2e_compress.graph.nodes import constant_values
 from me2e_compress.quantization.find_attention import Attention, find_attention
-from me2e_compress.runtime.constant_values import constant_values
 from tests.nets import net
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1, "trt" : 1]>\n'

@@ -13,7 +13,7 @@ from me2e_compress.graph import (
     provenance,
     static_shape,
 )
-from me2e_compress.graph.nodes import is_one_matrix
+from me2e_compress.graph.shapes import is_one_matrix
 from me2e_compress.quantization.plan.decision import (
     FLOAT,
     INT8,

@@ -9,10 +9,10 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.errors import RecipeError
+from me2e_compress.graph.nodes import constant_values
 from me2e_compress.quantization.coordinates import find_coordinates
 from me2e_compress.quantization.find_attention import Attention, find_attention
 from me2e_compress.registry import Registry
-from me2e_compress.runtime.constant_values import constant_values
 
 
 class RuleFacts:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, provenance
-from me2e_compress.graph.nodes import extent
+from me2e_compress.graph.shapes import extent
 from me2e_compress.quantization.find_attention import FUSED
 from me2e_compress.quantization.rules.base import Rule, RuleFacts, RuleSet
 

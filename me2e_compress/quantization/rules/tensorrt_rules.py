@@ -12,7 +12,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import CONVOLUTIONS, static_shape
-from me2e_compress.graph.nodes import extent
+from me2e_compress.graph.shapes import extent
 from me2e_compress.quantization.rules.base import Rule, RuleFacts
 from me2e_compress.quantization.rules.paper_rules import PaperRules
 
