@@ -137,7 +137,7 @@ class StudyResult(Result):
             }
         )
         return {
-            "scheme": drive.variant,
+            "variant": drive.variant,
             "condition": drive.condition,
             **found,
             "size_mb": of.size_mb.value,

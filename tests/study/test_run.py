@@ -162,6 +162,31 @@ def test_what_is_there_is_not_made_again(make: Make, tmp_path: Path) -> None:
     assert one == two
 
 
+def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
+    make: Make, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    toml = tmp_path / "study.toml"
+    toml.write_text(STUDY.replace("routes = 8", "routes = 1"))
+
+    found = run_study(toml, tmp_path / "out", Here(), pictures=0)
+
+    assert capfd.readouterr() == ("", "")
+    assert found.study == load_study(toml)
+
+
+def test_a_study_shows_itself_in_a_notebook(found: StudyResult) -> None:
+    shown = found._repr_html_()
+
+    assert "Scoreboard, ideal: decisions cost no time" in shown
+    assert "<fast>" not in shown
+    assert repr(found) == (
+        "<StudyResult: Slow & <fast>: 4 variants under 2 conditions on 2 of 220 routes>"
+    )
+    assert [(row["variant"], row["condition"]) for row in found.records()] == [
+        (each.variant, each.condition) for each in found.drives
+    ]
+
+
 def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> None:
     engine = Here()
     faster = Variant("faster", "blind:9")
