@@ -26,7 +26,7 @@ Outputs = dict[str, npt.NDArray[np.generic]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Probe:
+class VerificationInputs:
     """The inputs that two graphs are compared on.
 
     Attributes:
@@ -40,7 +40,7 @@ class Probe:
     @classmethod
     def of(
         cls, model: ir.Model, frames: CalibrationSet | None, seed: int, count: int
-    ) -> "Probe":
+    ) -> "VerificationInputs":
         """Take the first recorded frames, or make seeded inputs where none are given.
 
         Raises:
@@ -64,7 +64,7 @@ class Probe:
                     raise GraphError(f"output {name} is no tensor: not compared")
         return found
 
-    def nudged(self, seed: int) -> "Probe":
+    def nudged(self, seed: int) -> "VerificationInputs":
         """Move every float of the inputs by a few units in its last place."""
         signs = np.random.default_rng(seed)
         frames = [
@@ -73,7 +73,7 @@ class Probe:
             )
             for frame in self.frames
         ]
-        return Probe(frames, self.kind)
+        return VerificationInputs(frames, self.kind)
 
 
 def _nudge(
@@ -127,26 +127,29 @@ def tolerances(outputs: Outputs) -> dict[str, float]:
 
 
 def verify(
-    passes: tuple[str, ...], before: ir.Model, after: ir.Model, probe: Probe
+    passes: tuple[str, ...],
+    before: ir.Model,
+    after: ir.Model,
+    inputs: VerificationInputs,
 ) -> Verification:
-    """Compare two graphs on a probe; a graph that no longer runs differs by inf.
+    """Compare two graphs on the same inputs; one that no longer runs differs by inf.
 
     An output that differs is held against what rounding does to it: where the graph
     before moves as far when its inputs change in their last places (a choice between
     candidates that are nearly equal), that output tells nothing about the passes, and
     is named as unsteady. Outputs that are steady are judged all the same.
     """
-    left = probe.run(before)
+    left = inputs.run(before)
     allowed = tolerances(left[0])
     try:
-        right = probe.run(after)
+        right = inputs.run(after)
     except GraphError:
         broken = dict.fromkeys(left[0], float("inf"))
-        return Verification(passes, probe.kind, broken, allowed)
-    found = Verification(passes, probe.kind, errors(left, right), allowed)
+        return Verification(passes, inputs.kind, broken, allowed)
+    found = Verification(passes, inputs.kind, errors(left, right), allowed)
     if passed(found):
         return found
-    rounding = unsteadiness(before, left, probe)
+    rounding = unsteadiness(before, left, inputs)
     unsteady = tuple(
         name
         for name, error in found.errors.items()
@@ -156,21 +159,21 @@ def verify(
 
 
 def unsteadiness(
-    model: ir.Model, answers: Sequence[Outputs], probe: Probe
+    model: ir.Model, answers: Sequence[Outputs], inputs: VerificationInputs
 ) -> dict[str, float]:
     """Measure how far each output moves when inputs change in their last places.
 
     Args:
         model: the graph.
-        answers: what it gave on the probe.
-        probe: the inputs.
+        answers: what it gave on them.
+        inputs: what it was fed.
 
     Returns:
         Output name -> the largest max|a-b|/max|a| of ``NUDGES`` trials.
     """
     session, worst = Session(model), dict.fromkeys(answers[0], 0.0)
     for seed in range(NUDGES):
-        moved = errors(answers, replay(session, probe.nudged(seed).frames))
+        moved = errors(answers, replay(session, inputs.nudged(seed).frames))
         worst = {name: max(worst[name], moved[name]) for name in worst}
     return worst
 

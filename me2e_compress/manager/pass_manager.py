@@ -19,7 +19,7 @@ from me2e_compress.errors import (
     VerificationError,
 )
 from me2e_compress.graph import provenance
-from me2e_compress.manager import contract, equivalence, reproducer
+from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.report import Report, Step, Verification
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
@@ -150,11 +150,11 @@ class _Books:
         stretch, self._stretch = self._stretch, []
         if not stretch or not self.manager.verify_frames:
             return
-        found, runnable, probe = self._compare(stretch, model)
+        found, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(found)
-        if equivalence.passed(found) or probe is None:
+        if equivalence.passed(found) or inputs is None:
             return
-        current, guilty = _bisect(runnable, model, probe)
+        current, guilty = _bisect(runnable, model, inputs)
         judged = [
             name
             for name, error in found.errors.items()
@@ -170,7 +170,7 @@ class _Books:
 
     def _compare(
         self, stretch: Stretch, model: ir.Model
-    ) -> tuple[Verification, Stretch, equivalence.Probe | None]:
+    ) -> tuple[Verification, Stretch, equivalence.VerificationInputs | None]:
         """Compare with the earliest graph that runs (import may make it runnable)."""
         context, count = self.context, self.manager.verify_frames
         frames = context.frames or self.manager.samples
@@ -178,12 +178,14 @@ class _Books:
         for first, (_, before) in enumerate(stretch):
             names = tuple(current.name for current, _ in stretch[first:])
             try:
-                probe = equivalence.Probe.of(before, frames, context.seed, count)
-                found = equivalence.verify(names, before, model, probe)
+                inputs = equivalence.VerificationInputs.of(
+                    before, frames, context.seed, count
+                )
+                found = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)
                 continue
-            return found, stretch[first:], probe
+            return found, stretch[first:], inputs
         names = tuple(current.name for current, _ in stretch)
         return equivalence.skipped(names, reason), stretch, None
 
@@ -246,7 +248,7 @@ def attempt(
     known = graph.digest(model) if digest is None else digest
     try:
         result = current.run(model.clone(), context)
-        return Checked(result, contract.check(current, model, result, known))
+        return Checked(result, pass_contract.check(current, model, result, known))
     except Me2eError as error:
         return error
     except Exception as cause:  # whatever a pass may raise: chained, never swallowed
@@ -256,14 +258,14 @@ def attempt(
 
 
 def _bisect(
-    stretch: Stretch, last: ir.Model, probe: equivalence.Probe
+    stretch: Stretch, last: ir.Model, inputs: equivalence.VerificationInputs
 ) -> tuple[Pass, ir.Model]:
     """Find the first pass after which the outputs differ, in log2 trials."""
     models = [*(model for _, model in stretch), last]
     good, bad = 0, len(stretch)
     while bad - good > 1:
         middle = (good + bad) // 2
-        trial = equivalence.verify((), models[0], models[middle], probe)
+        trial = equivalence.verify((), models[0], models[middle], inputs)
         good, bad = (middle, bad) if equivalence.passed(trial) else (good, middle)
     return stretch[good]
 
@@ -278,8 +280,8 @@ def _fails_alike(
     if not current.exact or isinstance(error, PassError):
         return False
     try:
-        probe = equivalence.Probe.of(part, None, context.seed, 1)
-        found = equivalence.verify((), part, result.result.model, probe)
+        inputs = equivalence.VerificationInputs.of(part, None, context.seed, 1)
+        found = equivalence.verify((), part, result.result.model, inputs)
     except (GraphError, PreconditionError):
         return False
     return not equivalence.passed(found)

@@ -16,7 +16,7 @@ from me2e_compress.modules.module_map import (
     Substitute,
     presets,
 )
-from me2e_compress.modules.paths import Pattern, exits, scope_of
+from me2e_compress.modules.paths import PathGlob, exits, scope_of
 
 __all__ = [
     "Assignment",
@@ -24,7 +24,7 @@ __all__ = [
     "Item",
     "Module",
     "ModuleMap",
-    "Pattern",
+    "PathGlob",
     "Placement",
     "Role",
     "Substitute",

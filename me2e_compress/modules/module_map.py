@@ -11,7 +11,7 @@ from typing import Literal, Self
 import pydantic
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.modules.paths import Pattern, is_malformed
+from me2e_compress.modules.paths import PathGlob, is_malformed
 
 Role = Literal["feature", "prediction"]
 
@@ -37,7 +37,7 @@ class Module:
         name: e.g. ``bev_encoder``.
         role: "feature" for backbone, neck and BEV encoder, "prediction" for the rest:
             what the quantization schemes go by.
-        patterns: its names, as :class:`Pattern`; each must match something.
+        patterns: its names, as :class:`PathGlob`; each must match something.
         optional: more names, of other exports of the same stack; they may not match.
         substitutes: what to re-wire when it is ablated; anything else that reads it
             reads zeros.
@@ -166,9 +166,9 @@ class ModuleMap:
         return [(m.name, text) for m in self.modules for text in m.patterns]
 
     @functools.cached_property
-    def _globs(self) -> tuple[tuple[str, Pattern], ...]:
+    def _globs(self) -> tuple[tuple[str, PathGlob], ...]:
         return tuple(
-            (module.name, Pattern(text))
+            (module.name, PathGlob(text))
             for module in self.modules
             for text in module.patterns + module.optional
         )

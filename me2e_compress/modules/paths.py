@@ -12,7 +12,7 @@ _NAMESPACE = "namespace"
 
 
 @dataclasses.dataclass(frozen=True)
-class Pattern:
+class PathGlob:
     """A glob over whole components of a dotted path.
 
     ``pts_bbox_head.transformer.encoder`` matches that path and everything below it;
@@ -108,7 +108,7 @@ def exits(model: ir.Model, pattern: str) -> tuple[ir.Value, ...]:
         Values made inside that are read outside or are outputs of the graph; the last
         one is what the torch module returned, where it returns one tensor.
     """
-    glob = Pattern(pattern)
+    glob = PathGlob(pattern)
     inside = [node for node in model.graph if _within(glob, scope_of(node))]
     members = set(inside)
     return tuple(
@@ -120,7 +120,7 @@ def exits(model: ir.Model, pattern: str) -> tuple[ir.Value, ...]:
     )
 
 
-def _within(glob: Pattern, scope: str) -> bool:
+def _within(glob: PathGlob, scope: str) -> bool:
     return bool(scope) and glob.reach(tuple(scope.split("."))) is not None
 
 

@@ -9,7 +9,7 @@ import onnx_ir as ir
 from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
-from me2e_compress.modules import Pattern, exits, scope_of
+from me2e_compress.modules import PathGlob, exits, scope_of
 from me2e_compress.runtime.frames import Array
 
 _INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
@@ -24,7 +24,7 @@ def module_of(value: ir.Value) -> str:
 def within(node: ir.Node, scope: str) -> bool:
     """Return whether a node was made in a scope, e.g. ``*.lane_encoder``."""
     path = tuple(part for part in scope_of(node).split(".") if part)
-    return Pattern(scope).reach(path) is not None
+    return PathGlob(scope).reach(path) is not None
 
 
 def result_of(model: ir.Model, scope: str, like: ir.Value | None = None) -> ir.Value:

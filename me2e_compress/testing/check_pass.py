@@ -97,7 +97,7 @@ def _check_exact(
             f"{current.name} is not idempotent: {second.changes} changes on a second"
             " run"
         )
-    probe = equivalence.Probe.of(before, context.frames, context.seed, 2)
-    found = equivalence.verify((current.name,), before, after, probe)
+    inputs = equivalence.VerificationInputs.of(before, context.frames, context.seed, 2)
+    found = equivalence.verify((current.name,), before, after, inputs)
     if not equivalence.passed(found):
         raise VerificationError(f"{current.name} moved the outputs: {found.errors}")

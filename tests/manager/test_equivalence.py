@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from me2e_compress.manager.equivalence import (
-    Probe,
+    VerificationInputs,
     errors,
     passed,
     relative,
@@ -87,8 +87,10 @@ def test_what_counts_as_rounding_depends_on_the_type(
 
 @given(FLOATS, st.integers(0, 9))
 def test_a_nudge_moves_the_last_places_of_floats_only(a: np.ndarray, seed: int) -> None:
-    probe = Probe([Frame(0, True, {"x": a, "n": np.arange(3)})], "recorded")
-    (frame,) = probe.nudged(seed).frames
+    inputs = VerificationInputs(
+        [Frame(0, True, {"x": a, "n": np.arange(3)})], "recorded"
+    )
+    (frame,) = inputs.nudged(seed).frames
     moved = np.abs(frame.arrays["x"].astype(np.float64) - a)
     assert frame.arrays["x"].dtype == a.dtype
     assert np.all(moved <= 8 * np.abs(np.spacing(a)).astype(np.float64))

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.modules import Pattern
+from me2e_compress.modules import PathGlob
 from me2e_compress.modules.paths import is_malformed
 
 WORDS = st.text(string.ascii_lowercase + string.digits + "_", min_size=1, max_size=6)
@@ -34,21 +34,21 @@ PATHS = st.lists(WORDS, min_size=1, max_size=6).map(tuple)
     ],
 )
 def test_reach(pattern: str, path: str, reach: int | None) -> None:
-    assert Pattern(pattern).reach(tuple(path.split("."))) == reach
+    assert PathGlob(pattern).reach(tuple(path.split("."))) == reach
 
 
 @given(PATHS, PATHS)
 def test_a_rooted_pattern_reaches_exactly_its_own_length(
     head: tuple[str, ...], tail: tuple[str, ...]
 ) -> None:
-    assert Pattern(".".join(head)).reach(head + tail) == len(head)
+    assert PathGlob(".".join(head)).reach(head + tail) == len(head)
 
 
 @given(PATHS, PATHS, PATHS)
 def test_an_anywhere_pattern_finds_its_deepest_place(
     before: tuple[str, ...], wanted: tuple[str, ...], after: tuple[str, ...]
 ) -> None:
-    reach = Pattern("*." + ".".join(wanted)).reach(before + wanted + after)
+    reach = PathGlob("*." + ".".join(wanted)).reach(before + wanted + after)
     assert reach is not None
     assert reach >= len(before) + len(wanted)
 

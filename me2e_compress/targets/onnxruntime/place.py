@@ -9,7 +9,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
 from me2e_compress.targets.base import LintRule, Target
 from me2e_compress.targets.onnxruntime.kernels import objection
-from me2e_compress.targets.onnxruntime.lint import RULES
+from me2e_compress.targets.onnxruntime.lint_rules import RULES
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
 from me2e_compress.targets.onnxruntime.region import Region, find_region
 from me2e_compress.targets.weights import weights_of

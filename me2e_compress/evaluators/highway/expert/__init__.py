@@ -1,6 +1,6 @@
 """The privileged expert: a sampling planner on the Frenet frame of the route."""
 
-from me2e_compress.evaluators.highway.expert.decision import (
+from me2e_compress.evaluators.highway.expert.expert_policy import (
     Expert,
     ExpertDecision,
     Memory,
