@@ -12,13 +12,6 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import pydantic
 
 from me2e_compress.errors import Me2eError
-from me2e_compress.registry.describe import (
-    Entry,
-    default_of,
-    fields_of,
-    first_line,
-    options_of,
-)
 from me2e_compress.registry.text import (
     ParsedItem,
     TextError,
@@ -51,7 +44,7 @@ class Registry(Generic[T]):
     A class is a frozen dataclass: its ``name`` is the name it is registered under, its
     fields are its options, in Python, in text and in files alike. It is imported when
     it is asked for. An entry that cannot be used is an error only where it is asked
-    for; :meth:`describe` tells of it.
+    for; :func:`~me2e_compress.registry.entries.describe` tells of it.
 
     Attributes:
         kind: what one entry is, in a word or two, for messages.
@@ -82,7 +75,7 @@ class Registry(Generic[T]):
         if not claims:
             raise self._unknown(name)
         if len(claims) > 1:
-            packages = " and ".join(_source(entry) for entry in claims)
+            packages = " and ".join(self.sources(name))
             raise self.error(
                 f"{self.kind} {name!r} is claimed by {packages}: uninstall one of them"
             )
@@ -90,7 +83,7 @@ class Registry(Generic[T]):
 
     def usable(self) -> tuple[str, ...]:
         """List the names whose classes can be imported."""
-        return tuple(entry.name for entry in self.describe() if not entry.error)
+        return tuple(name for name in self.names() if self._is_usable(name))
 
     def build(self, name: str, options: Mapping[str, object]) -> T:
         """Make an item from its options, each checked against the field's type.
@@ -180,17 +173,16 @@ class Registry(Generic[T]):
         """Write items so that :meth:`parse_all` makes equal ones."""
         return ",".join(self.text(item) for item in items)
 
-    def describe(self) -> tuple[Entry, ...]:
-        """Describe every entry; what cannot be used says why."""
-        return tuple(self._entry(name) for name in self.names())
+    def sources(self, name: str) -> tuple[str, ...]:
+        """Name the packages that bring a name, each with its version."""
+        return tuple(_source(entry) for entry in self._claims(name))
 
-    def _entry(self, name: str) -> Entry:
-        source = " and ".join(_source(entry) for entry in self._claims(name))
+    def _is_usable(self, name: str) -> bool:
         try:
-            cls = self.get(name)
-        except Me2eError as error:
-            return Entry(name, source, error=str(error))
-        return Entry(name, source, first_line(cls), options_of(cls))
+            self.get(name)
+        except Me2eError:
+            return False
+        return True
 
     def _unknown(self, name: str) -> Me2eError:
         there = ", ".join(self.names()) or "none"
@@ -229,6 +221,19 @@ class Registry(Generic[T]):
             raise self.error(f"{what} calls itself {getattr(cls, 'name', None)!r}")
         found: type[T] = cls
         return found
+
+
+def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
+    """Return the fields of a dataclass that are its options, those by keyword last."""
+    fields = [field for field in dataclasses.fields(cls) if field.init]
+    return tuple(sorted(fields, key=lambda field: field.kw_only is True))
+
+
+def default_of(field: "dataclasses.Field[Any]") -> object:
+    """Return what an option is where it is left out; MISSING where it may not be."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
 
 
 @functools.cache

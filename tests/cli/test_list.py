@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.cli.commands.list import KINDS
+from me2e_compress.registry import describe
 from tests.cli.conftest import Command
 from tests.installed import install
 
@@ -23,7 +24,7 @@ def test_every_kind_is_listed_with_its_options(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_ours_can_all_be_used_and_say_what_they_are(kind: str) -> None:
-    for entry in KINDS[kind].describe():
+    for entry in describe(KINDS[kind]):
         assert not entry.error
         assert entry.doc
         for option in entry.options:

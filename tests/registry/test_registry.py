@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.errors import MissingExtraError, StudyError
-from me2e_compress.registry import Option, Registry
+from me2e_compress.registry import Option, Registry, describe
 from tests.installed import install
 
 GROUP = "me2e_compress.shapes"
@@ -271,7 +271,7 @@ def test_the_rest_works_beside_broken_entries() -> None:
 
 @pytest.mark.usefixtures("others")
 def test_every_entry_is_listed_with_its_trouble() -> None:
-    entries = {entry.name: entry for entry in SHAPES.describe()}
+    entries = {entry.name: entry for entry in describe(SHAPES)}
 
     assert list(entries) == [
         *("square", "circle", "point"),
@@ -290,7 +290,7 @@ def test_an_undecorated_class_has_no_options_of_its_own() -> None:
 
 
 def test_an_entry_is_described() -> None:
-    square = SHAPES.describe()[0]
+    square = describe(SHAPES)[0]
 
     assert (square.name, square.source, square.doc) == (
         *("square", "me2e-compress"),
@@ -306,5 +306,5 @@ def test_an_entry_is_described() -> None:
 
 
 def test_what_must_be_given_has_no_default() -> None:
-    (radius,) = SHAPES.describe()[1].options
+    (radius,) = describe(SHAPES)[1].options
     assert radius == Option("radius", "float", None, "")

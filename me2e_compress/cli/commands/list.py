@@ -14,7 +14,7 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES
-from me2e_compress.registry import Entry, Option, Registry
+from me2e_compress.registry import Entry, Option, Registry, describe
 from me2e_compress.targets import TARGETS
 
 KINDS: Mapping[str, Registry[Any]] = {
@@ -37,7 +37,7 @@ def list_entries(
     if kind is not None and kind not in KINDS:
         raise RecipeError(f"no kind {kind!r}; there are {', '.join(KINDS)}")
     chosen = KINDS if kind is None else {kind: KINDS[kind]}
-    found = {name: registry.describe() for name, registry in chosen.items()}
+    found = {name: describe(registry) for name, registry in chosen.items()}
     if as_json:
         print_json(found)
         return

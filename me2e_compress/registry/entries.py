@@ -1,12 +1,16 @@
-"""What can be told of a class whose fields are its options."""
+"""The entries of a registry, described: where from, and with which options."""
 
 import dataclasses
 import inspect
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
+from me2e_compress.errors import Me2eError
+from me2e_compress.registry.registry import NamedItem, Registry, default_of, fields_of
 from me2e_compress.registry.text import write_value
+
+T = TypeVar("T", bound=NamedItem)
 
 _PATH = re.compile(r"[A-Za-z_][\w.]*\.(?=[A-Za-z_])")
 """The module before a name, in a type."""
@@ -51,15 +55,14 @@ class Entry:
     error: str = ""
 
 
-def first_line(cls: type) -> str:
+def describe(registry: Registry[T]) -> tuple[Entry, ...]:
+    """Describe every entry of a registry; what cannot be used says why."""
+    return tuple(_entry(registry, name) for name in registry.names())
+
+
+def _first_line(cls: type) -> str:
     """Return the first line of a docstring, empty without one."""
     return (inspect.getdoc(cls) or "").partition("\n")[0]
-
-
-def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
-    """Return the fields of a dataclass that are its options, those by keyword last."""
-    fields = [field for field in dataclasses.fields(cls) if field.init]
-    return tuple(sorted(fields, key=lambda field: field.kw_only is True))
 
 
 def options_of(cls: type) -> tuple[Option, ...]:
@@ -69,24 +72,17 @@ def options_of(cls: type) -> tuple[Option, ...]:
         Option(
             field.name,
             _type(field.type),
-            write_value(default_of(field)) if has_default(field) else None,
+            write_value(default_of(field)) if _has_default(field) else None,
             docs.get(field.name, ""),
         )
         for field in fields_of(cls)
     )
 
 
-def has_default(field: "dataclasses.Field[Any]") -> bool:
+def _has_default(field: "dataclasses.Field[Any]") -> bool:
     """Return whether an option may be left out."""
     missing = dataclasses.MISSING
     return field.default is not missing or field.default_factory is not missing
-
-
-def default_of(field: "dataclasses.Field[Any]") -> object:
-    """Return what an option is where it is left out; MISSING where it may not be."""
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return field.default
 
 
 def _type(annotation: object) -> str:
@@ -103,3 +99,12 @@ def _docs(cls: type) -> Mapping[str, str]:
     return {
         name: " ".join(text.split()) for name, text in _OPTION.findall(section.group(1))
     }
+
+
+def _entry(registry: Registry[T], name: str) -> Entry:
+    source = " and ".join(registry.sources(name))
+    try:
+        cls = registry.get(name)
+    except Me2eError as error:
+        return Entry(name, source, error=str(error))
+    return Entry(name, source, _first_line(cls), options_of(cls))
