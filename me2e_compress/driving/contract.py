@@ -1,4 +1,31 @@
-"""What every evaluator and every driver is."""
+"""The driving contract: what a policy and an evaluator implement.
+
+A policy is any object with the members of `Policy`; there is no class to derive from.
+An evaluator calls ``reset`` before each route and ``plan`` at each decision. The least
+that drives keeps its speed:
+
+    class KeepSpeed:
+        needs_images = False
+        privileged = False
+
+        def reset(self, route: RouteInfo) -> None:
+            pass
+
+        def plan(self, observation: Observation) -> Plan:
+            seconds = 0.5 * np.arange(1, 7)
+            return np.stack([observation.speed_mps * seconds, np.zeros(6)], axis=1)
+
+An evaluator is any object with the members of `Evaluator`: it yields one `Episode` a
+route, and `me2e_compress.metrics` scores them.
+
+Conventions: the ego frame is x forward, y left, z up, metres, its origin on the ground
+under the centre of the ego; the world is right-handed, x east, y north, headings in
+radians counter-clockwise from east. Times are integer microseconds.
+
+When a plan acts, and which frames are decisions, says `me2e_compress.driving.realtime`;
+what a decision costs, `me2e_compress.driving.latency`; how a policy gets a name,
+`me2e_compress.driving.policies`.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,29 +37,40 @@ import numpy.typing as npt
 from me2e_compress.metrics.episode import Episode
 
 Plan = npt.NDArray[np.floating]
-"""Six waypoints [6, 2], one every 0.5 s: metres in the ego frame, x forward, y left."""
+"""Six waypoints [6, 2], one every 0.5 s: metres in the ego frame of the observation, x
+forward, y left; the first is where the ego is to be 0.5 s later."""
 
 PLAN_SHAPE = (6, 2)
 PLAN_STEP_US = 500_000
+"""Microseconds between two waypoints."""
 CAN_BUS_SIZE = 18
 
 
 class RouteInfo(Protocol):
-    """What a policy is told of the route that it starts on."""
+    """What a policy may know of a route before it drives it.
+
+    A simulator passes its own route, which has more members; a policy that reads only
+    these two drives in every simulator.
+    """
 
     @property
     def id(self) -> str:
-        """Return its name, unique in its set."""
+        """Return the route's name, unique in its set."""
         ...
 
     @property
     def seed(self) -> int:
-        """Return what everything random on it is drawn from."""
+        """Return the seed of everything random on the route, the policy's own too."""
         ...
 
 
 class SceneView(Protocol):
-    """Everything there is at one instant, as a simulator lays it out."""
+    """A snapshot of everything at one instant: ground truth for privileged policies.
+
+    A simulator passes its own scene (highway-env: `me2e_compress.simulator.scene.Scene`
+    with ego, actors and signals). A policy that reads more than the time is written for
+    one simulator and checks the type first.
+    """
 
     @property
     def time_us(self) -> int:
@@ -41,7 +79,12 @@ class SceneView(Protocol):
 
 
 class WorldView(Protocol):
-    """The world behind the scenes; a policy may read it and never steps it."""
+    """The simulated world itself: ground truth for privileged policies, read only.
+
+    A simulator passes its own world (highway-env:
+    `me2e_compress.simulator.world.World` with path, road map and intents). A policy may
+    read it and must never step it.
+    """
 
     @property
     def route(self) -> RouteInfo:
@@ -51,16 +94,16 @@ class WorldView(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy is shown at one decision.
+    """What a policy gets at one decision.
 
     Attributes:
-        time_us: Simulated time since the route began, in microseconds; a model is told
-            it in seconds (``timestamp``), so that a recurrent one knows how far apart
-            its frames are.
-        images: Six cameras, uint8 [6, H, W, 3] in RGB, in the order of the rig;
-            None unless the policy asks for images.
-        lidar2img: float32 [6, 4, 4], ego frame (x forward, y left, z up, metres) to
-            pixels of each camera.
+        time_us: Simulated time since the route began, in microseconds. An ONNX model
+            gets it in seconds (``timestamp``): decisions are not evenly spaced where
+            latency skips some.
+        images: Six cameras, uint8 [6, H, W, 3] in RGB, in the order front, front left,
+            front right, back, back left, back right; None unless `Policy.needs_images`.
+        lidar2img: float32 [6, 4, 4], ego frame to pixels of each camera: for a point p,
+            M @ (p, 1) = (u * depth, v * depth, depth, 1).
         can_bus: float32 [18], laid out as Bench2Drive's UniAD and VAD agents fill it,
             in a right-handed world (x east, y north): [0:3] metres moved since the
             last decision (world frame), [3:7] quaternion w, x, y, z, [7] speed (m/s),
@@ -70,9 +113,8 @@ class Observation:
         command: Where the route goes next: 0 left, 1 right, 2 straight, 3 follow the
             lane, 4 change lane to the left, 5 change lane to the right.
         speed_mps: The ego's speed.
-        scene: Everything there is, only for a privileged policy.
-        world: The world itself, only for a privileged policy, which may read (and
-            never step) its path, its road map and what it knows of the actors.
+        scene: Ground truth at this instant; None unless `Policy.privileged`.
+        world: The world itself; None unless `Policy.privileged`.
     """
 
     time_us: int
@@ -86,7 +128,12 @@ class Observation:
 
 
 class Policy(Protocol):
-    """A driver: it is told the route it starts on and then asked for plans."""
+    """A driver: maps observations to plans, one route after the other.
+
+    One object drives many routes in one process, never two at the same time. What it
+    raises, or a plan of another shape or with a number that is not finite, ends that
+    route as failed (`Ending.POLICY_FAILED`); the other routes go on.
+    """
 
     @property
     def needs_images(self) -> bool:
@@ -95,26 +142,51 @@ class Policy(Protocol):
 
     @property
     def privileged(self) -> bool:
-        """Whether it may see the scene and the world."""
+        """Whether it gets ground truth: `Observation.scene` and `Observation.world`."""
         ...
 
     def reset(self, route: RouteInfo) -> None:
-        """Forget the last route: recurrent state returns to its first value."""
+        """Prepare for a route: recurrent state returns to its initial value.
+
+        After it, the same observations must give the same plans, whatever was driven
+        before.
+
+        Args:
+            route: The route that starts.
+        """
         ...
 
     def plan(self, observation: Observation) -> Plan:
-        """Return six waypoints [6, 2], metres in the ego frame, every 0.5 s."""
+        """Return the plan for one observation.
+
+        Called once a decision, in order of time. The time that it takes counts only
+        where latency is measured.
+
+        Args:
+            observation: What the policy gets at this decision.
+
+        Returns:
+            Six waypoints [6, 2], metres in the ego frame, every 0.5 s; floating point,
+            finite.
+        """
         ...
 
 
 class Evaluator(Protocol):
-    """A source of driven episodes: it says what happened and judges nothing.
+    """A source of driven episodes: it reports what happened and scores nothing.
 
-    A simulator drives a policy to make them; a results reader finds them in files.
+    A simulator drives a policy to make them; a reader of results finds them in files.
+
+    Attributes:
+        name: What the command line and studies call it.
     """
 
     name: ClassVar[str]
 
     def episodes(self) -> Iterator[Episode]:
-        """Yield each route once, in a fixed order, the same for the same seed."""
+        """Yield one episode a route, in a fixed order, the same for the same seed.
+
+        Raises:
+            EvaluationError: It cannot go on: one line that names the culprit.
+        """
         ...

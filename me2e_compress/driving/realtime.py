@@ -60,15 +60,17 @@ class HeldControl(Generic[T]):
         """Take the decision that is due at this frame.
 
         Args:
-            control: What the policy answers to this frame's observation.
+            control: What follows from the plan for this frame's observation.
             latency_us: How long it took, microseconds.
         """
+        # the last decision's control acts from this frame on
         if self._coming is not None:
             self.in_force = self._coming
         skipped = skipped_decisions(latency_us, self.dt_us)
         self._coming = control
         if not skipped:
             self.in_force = control
+        # the next decision is due when this one's control acts
         self._due = self._frame + skipped + 1
 
     def advance(self) -> T:

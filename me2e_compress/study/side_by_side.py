@@ -191,7 +191,7 @@ def _picture(
 def _watched(job: Job, route: Route, time_us: int) -> list[Moment]:
     film = _Film(time_us)
     try:
-        drive(route, job.driver.open(), job.conditions, Listeners(moment=film.see))
+        drive(route, job.driver.open(), job.conditions, Listeners(on_moment=film.see))
     except _Enough:
         return film.moments
     return film.moments

@@ -98,7 +98,7 @@ def test_wrong_words_are_one_line_and_leave_nothing(
 
 
 def test_score_of_another_folder(run: Run, tmp_path: Path) -> None:
-    with pytest.raises(EvaluationError, match="no folder of results"):
+    with pytest.raises(EvaluationError, match="not a results folder"):
         run("score", tmp_path)
 
 

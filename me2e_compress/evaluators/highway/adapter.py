@@ -1,4 +1,4 @@
-"""How a model of another house is made to keep the policy contract."""
+"""How a model with its own names and layouts is adapted to the policy contract."""
 
 import json
 import tomllib
@@ -68,7 +68,7 @@ class Axes(StrEnum):
 
 
 class Adapter(BaseModel):
-    """What a TOML adapter says; everything left out follows from the model.
+    """The contents of a TOML adapter; what is left out follows from the model.
 
     Attributes:
         inputs: The contract's name (img, lidar2img, can_bus, command, timestamp) to
@@ -93,7 +93,7 @@ class Adapter(BaseModel):
         """Read a TOML file.
 
         Raises:
-            EvaluationError: No such file, no TOML, or a key or value that is not known.
+            EvaluationError: No such file, not TOML, or an unknown key or value.
         """
         try:
             return cls.model_validate(tomllib.loads(path.read_text("utf-8")))
@@ -110,15 +110,15 @@ class Adapter(BaseModel):
         """Return the adapter's normalisation, or else the model's own.
 
         Raises:
-            EvaluationError: Neither says how, or the metadata is malformed.
+            EvaluationError: Neither has one, or the metadata is malformed.
         """
         if self.image is not None:
             return self.image
         text = metadata.get(IMAGE)
         if text is None:
             raise EvaluationError(
-                f"the model does not say how its images are normalised: it has no "
-                f"metadata {IMAGE}, and the adapter no [image]"
+                f"image normalisation unknown: the model has no metadata {IMAGE} and "
+                f"the adapter no [image]"
             )
         try:
             return ImageNormalization.model_validate(json.loads(text))
@@ -132,18 +132,19 @@ class Adapter(BaseModel):
         """Return the adapter's reading of the plan, or else the model's own.
 
         Raises:
-            EvaluationError: Nothing says where the plan is, or it is not an output.
+            EvaluationError: Nothing names the plan, or the model has no such output.
         """
         found = self.plan or PlanAdapter.of(metadata, outputs)
         there = ", ".join(outputs)
         if found is None:
             raise EvaluationError(
-                f"the model has no output plan, and nothing says which one it is; "
+                f"the model has no output plan, and no adapter or metadata names one; "
                 f"there are {there}"
             )
         if found.output not in outputs:
             raise EvaluationError(
-                f"the adapter's plan is output {found.output}; there are {there}"
+                f"no output {found.output}, which the adapter names as the plan; there "
+                f"are {there}"
             )
         return found
 

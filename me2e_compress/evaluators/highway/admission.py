@@ -2,7 +2,7 @@
 
 A route is admitted if the privileged expert solves it and the blind driver, who keeps
 one speed on the route's centre, commits an infraction on it at every one of
-`blind.SPEEDS_MPS`. Running out of time, standing blocked or going astray is none.
+`blind.SPEEDS_MPS`. Timing out, standing blocked and leaving the route are none.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ ENDS_ONLY = (
     InfractionKind.VEHICLE_BLOCKED,
     InfractionKind.ROUTE_DEVIATION,
 )
-"""What says only that a route was not finished; no infraction for the gate."""
+"""Infractions that only mean that the route was not finished: the gate ignores them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class DryRun:
         triggered: Whether the scenario's event happened.
         actors_crashed: Whether two actors collided: a fault of the scenario.
         seconds: Simulated time at the end.
-        failure: What the policy raised, if it did.
+        failure: What the policy raised, if anything.
     """
 
     infractions: tuple[InfractionKind, ...]
@@ -46,14 +46,14 @@ class DryRun:
 
     @property
     def solved(self) -> bool:
-        """Goal reached and nothing done wrong."""
+        """Whether the goal was reached without an infraction."""
         return self.ending is Ending.COMPLETED and not self.infractions
 
 
 def dry_run(route: Route, policy: Policy) -> DryRun:
-    """Drive a route with a privileged policy that decides at every frame."""
+    """Drive a route once with a policy that decides at every frame."""
     seen = _WorldListener()
-    episode = drive(route, policy, Conditions(), Listeners(asking=seen.watch))
+    episode = drive(route, policy, Conditions(), Listeners(on_query=seen.watch))
     kinds = [event.kind for event in seen.events]
     faults = [found.kind for found in episode.infractions]
     return DryRun(
@@ -67,7 +67,7 @@ def dry_run(route: Route, policy: Policy) -> DryRun:
 
 
 class _WorldListener:
-    """Keeps hold of the world that the runner drives in."""
+    """Keeps the world that the runner drives in."""
 
     def __init__(self) -> None:
         self._world: World | None = None
@@ -82,11 +82,11 @@ class _WorldListener:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """What the gate says of one route.
+    """The gate's verdict on one route.
 
     Attributes:
         route: Which.
-        expert: How the expert drove it; None if the blind driver had decided already.
+        expert: How the expert drove it; None if the blind drives decided already.
         blind: How the blind driver drove it at each speed that was tried.
     """
 
@@ -122,7 +122,7 @@ class Admission:
 
 
 def examine(route: Route) -> Admission:
-    """Put one route through the gate; the cheap blind drives come first."""
+    """Check one route; the cheap blind drives come first."""
     drives = list[DryRun]()
     for speed in SPEEDS_MPS:
         drives.append(dry_run(route, Blind(speed)))

@@ -1,6 +1,6 @@
 """A driver that sees nothing: constant speed along the centre of the route.
 
-What it survives asks nothing of a driver, so no such route is admitted.
+A route that it solves demands nothing of a driver, so it is not admitted.
 """
 
 from dataclasses import dataclass, field
@@ -32,9 +32,9 @@ REENTRY_S = 1.5
 
 @dataclass
 class Blind:
-    """Follows the centre of the route at one speed, whatever stands there.
+    """Follows the centre of the route at one speed, whatever is in the way.
 
-    It is privileged in one thing: it knows the route's centre line and its own pose.
+    It is privileged in one respect: it knows the route's centre line and its pose.
 
     Args:
         speed_mps: The speed.
@@ -46,7 +46,7 @@ class Blind:
     _at_m: float | None = field(default=None, init=False, repr=False)
 
     def reset(self, route: RouteInfo) -> None:
-        """Forget where it was."""
+        """Forget the last position."""
         self._at_m = None
 
     def plan(self, observation: Observation) -> Plan:
@@ -58,7 +58,7 @@ class Blind:
 
 
 def centre_plan(ego: Ego, path: RoutePath, near_m: float, speed_mps: float) -> Plan:
-    """Waypoints [6, 2] (m, ego frame) along the centre of a route.
+    """Return waypoints [6, 2] (m, ego frame) along the centre of a route.
 
     Args:
         ego: The ego.

@@ -2,8 +2,8 @@
 
 A plan is tracked in the world, from the pose at which it was computed, along a smooth
 curve that leaves the ego on its course. Steering is pursuit with the circle of the
-real bicycle; speed comes from where the plan wants to be half a second and a second
-from now, and knows that brakes and motor lag.
+real bicycle; speed follows from where the plan is half a second and a second from now,
+with the lag of brakes and engine.
 
 Three faults make waypoint trackers leave the road in roundabouts, even with perfect
 waypoints (measured on highway-env's own roundabout, 12 seeds, the same expert, same
@@ -45,7 +45,7 @@ from me2e_compress.simulator.traffic.bodies import (
 STEP_S = 0.5
 """Time between two waypoints."""
 MIN_STEP_M = 0.3
-"""Waypoints nearer than this to the one before say nothing about direction."""
+"""Waypoints nearer than this to the one before give no direction."""
 STATION_M = 0.25
 """Spacing of the curve that is tracked."""
 BEYOND_M = 20.0
@@ -78,7 +78,7 @@ class AnchoredPlan:
         return cls(time_us, local @ turn + (ego.x, ego.y), travel)
 
     def nearest(self, x: float, y: float) -> float:
-        """Arc length (m) of the point of the curve nearest to a position."""
+        """Return the arc length (m) of the point of the curve nearest to a position."""
         start, step = self.curve[:-1], np.diff(self.curve, axis=0)
         offset = np.array([x, y]) - start
         share = np.clip(np.sum(offset * step, 1) / np.sum(step * step, 1), 0.0, 1.0)
@@ -87,13 +87,13 @@ class AnchoredPlan:
         return (i + float(share[i])) * STATION_M
 
     def point(self, arc_m: float) -> tuple[float, float]:
-        """Position at an arc length."""
+        """Return the position at an arc length."""
         stations = np.arange(len(self.curve)) * STATION_M
         x, y = (np.interp(arc_m, stations, column) for column in self.curve.T)
         return float(x), float(y)
 
     def travel_at(self, seconds: float) -> float:
-        """Where (m) the plan wants to be some time after it was computed.
+        """Return how far (m) the plan is some time after it was computed.
 
         After the last waypoint the plan goes on at its last speed.
         """
@@ -107,14 +107,14 @@ class AnchoredPlan:
 class Controller:
     """Tracks an anchored plan; has no state of its own.
 
-    The runner asks it only when a new decision acts; what it answers is then held as
-    long as equation 4 says.
+    The runner calls it once a decision; its control is then held as long as equation 4
+    prescribes.
 
     Args:
         lookahead_s: How far ahead the pursuit looks, in seconds of travel.
         min_lookahead_m: The same at walking pace.
         wheel_lag_s: Lag of the steering: pursuit starts where the ego will be then.
-        thrust_lag_s: Lag of brakes and motor (`traffic.bodies`).
+        thrust_lag_s: Lag of brakes and engine (`traffic.bodies`).
         acceleration_mps2: (strongest braking, strongest acceleration).
     """
 
@@ -130,13 +130,14 @@ class Controller:
         return Control(self._acceleration(plan, ego, age), self._steering(plan, ego))
 
     def _acceleration(self, plan: AnchoredPlan, ego: Ego, age_s: float) -> float:
-        """Acceleration that, with the motor's lag, best meets the next two waypoints.
+        """Return the acceleration that best meets the next two waypoints, with lag.
 
-        Least squares over the places wanted in 0.5 s and 1 s.
+        Least squares over the planned places in 0.5 s and 1 s.
         """
         here, speed = plan.nearest(ego.x, ego.y), ego.speed_mps
         asked = weight = 0.0
         for ahead in (STEP_S, 2 * STEP_S):
+            # distance lost to the lag, distance coasted, distance per m/s2 asked for
             late = self.thrust_lag_s * (ahead - self.thrust_lag_s)
             late += self.thrust_lag_s**2 * math.exp(-ahead / self.thrust_lag_s)
             free = speed * ahead + ego.acceleration_mps2 * late
@@ -147,9 +148,11 @@ class Controller:
         return min(max(asked / weight, low), high)
 
     def _steering(self, plan: AnchoredPlan, ego: Ego) -> float:
+        # from where the ego is once the wheels have turned
         travel = ego.speed_mps * self.wheel_lag_s
         pose = (ego.x, ego.y, ego.heading)
         x, y, heading = advance(*pose, ego.steering_rad, travel, ego.length)
+        # to the point of the curve one lookahead further
         lookahead = max(self.min_lookahead_m, self.lookahead_s * ego.speed_mps)
         target_x, target_y = plan.point(plan.nearest(x, y) + lookahead)
         cos, sin = math.cos(heading), math.sin(heading)
@@ -159,10 +162,13 @@ class Controller:
 
 
 def _advance_only(points: Floats) -> tuple[Floats, Floats]:
-    """([K, 2] points that move on, [N] metres travelled at each of [N, 2] points).
+    """Drop the waypoints [N, 2] that do not advance.
 
-    A stop plan is a heap of points around one place: they neither bend the curve nor
-    add to its length.
+    The waypoints of a plan that stops lie around one place: they must neither bend the
+    curve nor add to its length.
+
+    Returns:
+        ([K, 2] waypoints that advance, [N] metres travelled at each waypoint).
     """
     knots, travel, arc = [points[0]], [0.0], 0.0
     direction = np.array([1.0, 0.0])
@@ -179,7 +185,7 @@ def _advance_only(points: Floats) -> tuple[Floats, Floats]:
 
 
 def _smooth(knots: Floats, course: float) -> Floats:
-    """[M, 2] points every 0.25 m: cubic through the knots, then straight on.
+    """Return [M, 2] points every 0.25 m: cubic through the knots, then straight.
 
     The curve leaves the first knot along ``course`` (rad, where the car really goes)
     and has no curvature at the last.

@@ -1,4 +1,4 @@
-"""Calibration frames on demand: the expert drives, the model's cameras look on."""
+"""Calibration frames: the expert drives, and what the model would see is recorded."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -28,15 +28,14 @@ SEED_OFFSET = 1_000_000
 def driven_frames(
     policy: OnnxPolicy, count: int, *, seed: int, scene_length: int = 16
 ) -> Iterator[Frame]:
-    """See fresh routes as a model would that is asked every half second.
+    """Record what a model sees on fresh routes, every half second.
 
-    A scene is a stretch of one route, driven by the expert without latency; which
-    stretch, the seed decides. Its clock, its CAN bus and (since they are left out) its
-    recurrent inputs begin anew with it. The scenario types take turns; none of the
-    routes is one of the shipped 220.
+    A scene is a random stretch of one route, driven by the expert without latency. Its
+    clock, its CAN bus and (since they are left out) its recurrent inputs start anew.
+    The scenario types take turns; none of the routes is one of the shipped 220.
 
     Args:
-        policy: Says what is seen and how it is laid out: image size, normalisation,
+        policy: Decides what is seen and its layout: image size, normalisation,
             names, types.
         count: Frames in all.
         seed: Of routes and stretches, 0 or more.
@@ -50,10 +49,10 @@ def driven_frames(
     """
     if count < 1 or scene_length < 1:
         raise FramesError(
-            f"{count} frames in scenes of {scene_length}: both must be >= 1"
+            f"{count} frames in scenes of {scene_length}: both must be at least 1"
         )
     if seed < 0:
-        raise FramesError(f"seed {seed}: it must be 0 or more")
+        raise FramesError(f"seed {seed}: must be 0 or more")
     done = 0
     for place, route in enumerate(fresh_routes(seed)):
         random = np.random.default_rng([SEED_OFFSET + seed, place])
@@ -69,9 +68,9 @@ def driven_frames(
 
 
 def fresh_routes(seed: int) -> Iterator[Route]:
-    """Propose routes without end, one type after the other, in an order of the seed.
+    """Yield proposed routes without end, one type after the other, randomly ordered.
 
-    Routes of the shipped 220 are passed over; nothing else is asked of a route.
+    Routes of the shipped 220 are skipped; the routes are not put through the gate.
     """
     judged = {(route.scenario, route.seed) for route in load_routes()}
     types = np.random.default_rng(SEED_OFFSET + seed).permutation(sorted(EXPERT_S))
@@ -87,7 +86,7 @@ def fresh_routes(seed: int) -> Iterator[Route]:
 def _look(
     policy: OnnxPolicy, route: Route, begin_us: int, count: int
 ) -> Iterator[dict[str, Array]]:
-    """Feeds of the model from a moment on, until there are enough or the route ends."""
+    """Yield the model's feeds from a moment on, until enough or the route ends."""
     world, expert, controller, rules = (
         World(route),
         Expert(),

@@ -1,4 +1,4 @@
-"""How long routes take, to begin with the long ones."""
+"""How long routes take, so that the long ones start first."""
 
 from collections.abc import Sequence
 
@@ -57,6 +57,6 @@ the order in which routes begin depends on them, never a result."""
 def longest_first(routes: Sequence[Route]) -> list[Route]:
     """Order routes by the time their type takes, the longest first.
 
-    A long route that begins last would keep all other workers waiting.
+    A long route that starts last would keep all other workers waiting.
     """
     return sorted(routes, key=lambda route: (-EXPERT_S[route.scenario], route.id))

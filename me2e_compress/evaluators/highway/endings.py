@@ -16,7 +16,7 @@ ASTRAY_SHARE = 0.3
 
 @dataclass
 class EndingRules:
-    """Watches one route; constants of Bench2Drive's atomic_criteria.py.
+    """Decides when one route is over; constants of Bench2Drive's atomic_criteria.py.
 
     * the goal is reached, or the ego collides: the world itself ends there. CARLA
       drives on after a collision, so its driving scores multiply more penalties;
@@ -33,7 +33,7 @@ class EndingRules:
     def ending(self, world: World, speed_mps: float) -> Ending | None:
         """Return why the route is over after the world's last step, None if it is not.
 
-        Must be asked after every step.
+        Call it after every step.
 
         Args:
             world: After the step.

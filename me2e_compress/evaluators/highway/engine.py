@@ -59,7 +59,7 @@ def _watch(
     finished: "queue.SimpleQueue[Driven | Exception]",
     stop: threading.Event,
 ) -> None:
-    """Drive what waits, in one process; the main thread hears of every error."""
+    """Drive what waits, in one process; errors go to the main thread."""
     worker = RouteWorker(job)
     try:
         while not stop.is_set():

@@ -59,10 +59,10 @@ class RayEngine:
 
 
 def _check_reachable(address: str) -> None:
-    """Find out in seconds that nobody is there: Ray itself tries for minutes.
+    """Fail within seconds where nothing listens: Ray itself tries for minutes.
 
     Raises:
-        OSError: Nobody listens.
+        OSError: Nothing listens.
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():

@@ -1,4 +1,4 @@
-"""From what happens in a world to the episode that is scored."""
+"""Records what happens in a world as the episode that is scored."""
 
 import math
 from dataclasses import dataclass, field
@@ -49,14 +49,14 @@ ENDINGS = {
 
 @dataclass
 class EpisodeRecorder:
-    """Writes down one route: a frame every 50 ms, whatever the world's own step."""
+    """Records one route: a frame every 50 ms, whatever the world's own step."""
 
     world: World
     frames: list[EgoFrame] = field(default_factory=list)
     decisions: list[InferenceRecord] = field(default_factory=list)
 
-    def see(self, scene: Scene) -> None:
-        """Write down an instant if its time has come."""
+    def record(self, scene: Scene) -> None:
+        """Record a frame if one is due."""
         if scene.time_us >= len(self.frames) * FRAME_US:
             self.frames.append(_frame(scene, self.world.progress_m))
 
@@ -81,7 +81,7 @@ class EpisodeRecorder:
 
 
 def failed_episode(route: Route, completion_percent: float, failure: str) -> Episode:
-    """Return the episode of a route whose driver took the record down with it."""
+    """Return the episode of a route whose process was lost, and the record with it."""
     world = World(route)
     return Episode(
         route=route.id,
@@ -142,7 +142,7 @@ def _frame(scene: Scene, route_m: float) -> EgoFrame:
 
 
 def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
-    """Translate the world's events, and the end of the route, into CARLA's words."""
+    """Translate the world's events, and the end of the route, into infractions."""
     found = [
         _infraction(kind, event)
         for event in world.events

@@ -47,7 +47,7 @@ class HighwayEvaluator:
         set_size: How many routes the whole set has.
         engine: Where the routes are driven.
         on_progress: Called at the start and after every route.
-        on_warning: Called with one line a surprise.
+        on_warning: Called with each warning, one line.
     """
 
     name: ClassVar[str] = "highway"
@@ -95,7 +95,7 @@ class HighwayEvaluator:
 
 
 def progress_of(episodes: Sequence[Episode], total: int) -> DrivingProgress:
-    """Sum up the episodes that there are."""
+    """Return the progress of the episodes so far."""
     if not episodes:
         return DrivingProgress(0, total, None, None)
     return DrivingProgress(

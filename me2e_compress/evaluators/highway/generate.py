@@ -24,7 +24,7 @@ MOST_TRIES = 8
 
 @dataclass(frozen=True)
 class ScenarioRoutes:
-    """What one scenario type gave.
+    """The routes of one scenario type.
 
     Attributes:
         scenario: Which.
@@ -43,7 +43,7 @@ class ScenarioRoutes:
 
 
 def propose(scenario: str, seed: int, name: str) -> Route:
-    """One route of a type, with every parameter written out.
+    """Return a route of a type, with every parameter written out.
 
     Args:
         scenario: One of the 44 types.
@@ -62,7 +62,7 @@ def propose(scenario: str, seed: int, name: str) -> Route:
 
 
 def seed_of(seed: int, scenario: str, attempt: int) -> int:
-    """The seed of the n-th proposal of a type, different for every type."""
+    """Return the seed of the n-th proposal of a type, different for every type."""
     words = [seed, zlib.crc32(scenario.encode()), attempt]
     return int(np.random.SeedSequence(words).generate_state(1)[0])
 
@@ -97,7 +97,7 @@ def generate(
     variants: int = VARIANTS,
     workers: int = 1,
 ) -> Iterator[ScenarioRoutes]:
-    """Harvest several types, in their order, whatever the number of workers.
+    """Generate routes of several types, in order, for any number of workers.
 
     Args:
         seed: Decides everything.
@@ -105,10 +105,10 @@ def generate(
         variants: Routes of each type.
         workers: Processes; 1 stays in this one.
     """
-    reap = partial(admitted_routes, seed=seed, variants=variants)
+    of_type = partial(admitted_routes, seed=seed, variants=variants)
     if workers == 1:
-        yield from map(reap, scenarios)
+        yield from map(of_type, scenarios)
         return
     context = get_context("spawn")
     with ProcessPoolExecutor(workers, context, end_with_parent) as pool:
-        yield from pool.map(reap, scenarios)
+        yield from pool.map(of_type, scenarios)

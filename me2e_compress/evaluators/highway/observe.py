@@ -1,4 +1,4 @@
-"""What a policy is shown."""
+"""Observations: what a policy gets at each decision."""
 
 import math
 from dataclasses import dataclass, field
@@ -15,13 +15,13 @@ from me2e_compress.simulator.world import World
 
 @dataclass
 class ObservationBuilder:
-    """Makes the observations of one route.
+    """Builds the observations of one route.
 
     Args:
         world: Which is observed.
-        policy: Decides what is shown.
+        policy: Decides what it gets.
         rig: Gives lidar2img, also to a policy that sees no images.
-        cameras: Render the images; None if there are none to see.
+        cameras: Render the images; None if none are needed.
     """
 
     world: World
@@ -31,7 +31,7 @@ class ObservationBuilder:
     _last: Ego | None = field(default=None, init=False)
 
     def observe(self, scene: Scene) -> Observation:
-        """Return what the policy decides on: it is asked at this scene, and only then.
+        """Return what the policy sees at this scene; call it once a decision.
 
         The CAN bus counts metres and degrees since the last call.
         """
@@ -51,20 +51,20 @@ class ObservationBuilder:
 
 
 def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
-    """Return what a privileged policy is shown of this simulator.
+    """Return the scene and the world that a privileged policy of this simulator gets.
 
     Args:
         observation: What it decides on.
         who: Its name, for the message.
 
     Raises:
-        EvaluationError: It is shown none, or those of another simulator.
+        EvaluationError: It gets none, or those of another simulator.
     """
     scene, world = observation.scene, observation.world
     if isinstance(scene, Scene) and isinstance(world, World):
         return scene, world
     raise EvaluationError(
-        f"{who}: the observation has no highway-env world, and it is privileged"
+        f"{who} needs a highway-env world, and the observation has none"
     )
 
 

@@ -1,4 +1,4 @@
-"""A driver from an ONNX file."""
+"""A policy that runs an ONNX file."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,13 +35,13 @@ MICROSECONDS = 1_000_000
 
 @dataclass
 class OnnxPolicy:
-    """Keeps the policy contract with an ONNX graph, one onnxruntime thread, no spin.
+    """Runs an ONNX graph on one onnxruntime thread that does not spin.
 
     Inputs ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus`` [18],
     ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route began, of
     which a model may lack any; recurrent inputs ``X`` answered by ``X_out``, zeros at
-    the start of a route; output ``plan`` [1, 6, 2]. An `Adapter` explains what is named
-    or laid out otherwise.
+    the start of a route; output ``plan`` [1, 6, 2]. An `Adapter` maps other names and
+    layouts.
 
     Attributes:
         session: The loaded graph.
@@ -49,8 +49,8 @@ class OnnxPolicy:
         plan_adapter: How its plan is read.
         names: The graph's name for each input of the contract.
         recurrent: Recurrent input to the output that answers it.
-        normalization: Of the images; None if it sees none.
-        image_size: Rows and columns that it sees.
+        normalization: Of the images; None without an image input.
+        image_size: Rows and columns of the images.
     """
 
     session: Session
@@ -111,7 +111,7 @@ class OnnxPolicy:
         """Run the model once.
 
         Raises:
-            EvaluationError: It sees images and there are none.
+            EvaluationError: It needs images and there are none.
             GraphError: A node of the model failed.
         """
         feeds = self.feeds(observation)
@@ -125,7 +125,7 @@ class OnnxPolicy:
         """Lay an observation out as the graph takes it, recurrent inputs left out.
 
         Raises:
-            EvaluationError: It sees images and there are none.
+            EvaluationError: It needs images and there are none.
         """
         arrays: dict[str, Array] = {
             "lidar2img": self.adapter.projection(observation.lidar2img),
@@ -135,7 +135,7 @@ class OnnxPolicy:
         }
         if self.normalization is not None:
             if observation.images is None:
-                raise EvaluationError("the model sees images, and none were rendered")
+                raise EvaluationError("the model needs images, and none were rendered")
             arrays["img"] = self.normalization.apply(observation.images)
         ports = self.session.inputs
         return {
@@ -145,7 +145,7 @@ class OnnxPolicy:
         }
 
     def _dry_run(self) -> None:
-        """Run once on zeros: what does not fit here would not on any route."""
+        """Run once on zeros: what does not fit here would fail on every route."""
         self.reset(None)
         nothing = Observation(
             0,
@@ -158,7 +158,7 @@ class OnnxPolicy:
         found = self.plan(nothing).shape
         if found != PLAN_SHAPE:
             raise EvaluationError(
-                f"output {self.plan_adapter.output} holds a plan of shape "
+                f"output {self.plan_adapter.output}: the plan has shape "
                 f"{list(found)}, it must be {list(PLAN_SHAPE)}"
             )
         for name, answer in self.recurrent.items():

@@ -1,4 +1,4 @@
-"""Inputs of a model held against the policy contract, before anything drives."""
+"""Checks of a model's inputs against the policy contract, before anything drives."""
 
 from collections.abc import Mapping
 
@@ -31,7 +31,7 @@ def check_inputs(
     names: Mapping[str, str],
     recurrent: Mapping[str, str],
 ) -> None:
-    """Hold a graph's ports against the contract.
+    """Check the inputs of a graph against the contract.
 
     Args:
         inputs: Of the graph.
@@ -57,8 +57,8 @@ def check_inputs(
             continue
         if name not in contract:
             raise EvaluationError(
-                f"input {name} is none of {', '.join(CONTRACT)}, and no output "
-                "is known that answers it"
+                f"input {name} is none of {', '.join(CONTRACT)}, and no output is "
+                "known to feed it"
             )
         _check_shape(name, port.shape, CONTRACT[contract[name]])
 
@@ -86,14 +86,14 @@ def zeros(name: str, port: SessionPort) -> Array:
 
 
 def fed(array: Array, port: SessionPort) -> Array:
-    """Give an array the number of dimensions and the type that a port takes."""
+    """Return an array with the number of dimensions and the type of a port."""
     missing = len(port.shape) - array.ndim
     sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]
     return array.reshape(sides).astype(DTYPES[port.type], copy=False)
 
 
 def fits(found: Shape, wanted: Shape) -> bool:
-    """Say whether two shapes agree where both are known."""
+    """Return whether two shapes agree where both are known."""
     return len(found) == len(wanted) and all(
         not isinstance(side, int) or not isinstance(other, int) or side == other
         for side, other in zip(found, wanted, strict=True)

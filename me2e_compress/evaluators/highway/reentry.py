@@ -1,4 +1,4 @@
-"""Re-entering a route: waypoints of somebody who wants to be on a line beside it."""
+"""Re-entering a route: a smooth way from the ego to a line beside the route."""
 
 import math
 
@@ -13,7 +13,7 @@ STEEPEST = 0.6
 
 
 def slope_of(ego: Ego, path: RoutePath, s_m: float) -> float:
-    """Metres to the left per metre of route that the ego gains on its course."""
+    """Return the metres to the left per metre of route of the ego's course."""
     course = ego.heading + slip_of(ego.steering_rad)
     away = course - float(path.value(path.headings, s_m))
     away = math.remainder(away, 2 * math.pi)
@@ -23,7 +23,7 @@ def slope_of(ego: Ego, path: RoutePath, s_m: float) -> float:
 def reentry(
     travel_m: Floats, offset_m: float, slope: float, target_m: Floats, length_m: Floats
 ) -> Floats:
-    """Lateral offsets of a cubic from (offset, slope) to a flat (target, 0).
+    """Return the lateral offsets of a cubic from (offset, slope) to (target, 0).
 
     Planned anew at every step it is a damped feedback on offset e and slope e', since
     it starts with curvature -6 e / L^2 - 4 e' / L (damping 0.82). Starting flat, as if
@@ -33,7 +33,7 @@ def reentry(
         travel_m: [K, T] metres of route since now.
         offset_m: Where the ego is, metres left of the route.
         slope: How it moves, see `slope_of`.
-        target_m: [K] where it wants to be.
+        target_m: [K] where it is to be.
         length_m: [K] metres of route that the change takes.
 
     Returns:
@@ -46,14 +46,14 @@ def reentry(
 
 
 def beyond(path: RoutePath, s_m: Floats, lateral_m: Floats) -> tuple[Floats, ...]:
-    """(x, y, heading) at arc lengths, the route extended straight at its end."""
+    """Return (x, y, heading) at arc lengths of a route extended straight."""
     x, y, heading = path.at(s_m, lateral_m)
     over = np.maximum(s_m - path.length_m, 0.0) + np.minimum(s_m, 0.0)
     return x + over * np.cos(heading), y + over * np.sin(heading), heading
 
 
 def in_ego_frame(x: Floats, y: Floats, ego: Ego) -> Floats:
-    """[N, 2] points of the plane, x forward and y left of the ego."""
+    """Convert points to the ego frame: [N, 2], x forward and y left."""
     cos, sin = math.cos(ego.heading), math.sin(ego.heading)
     dx, dy = x - ego.x, y - ego.y
     return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)

@@ -1,4 +1,4 @@
-"""A picture of how a driver drives one route."""
+"""Pictures of how a policy drives one route."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,7 +55,7 @@ def render(job: Job, route: Route, folder: Path) -> tuple[Path, Path]:
         EvaluationError: The policy cannot be opened, or a file cannot be written.
     """
     film = _Film()
-    drive(route, job.driver.open(), job.conditions, Listeners(moment=film.see))
+    drive(route, job.driver.open(), job.conditions, Listeners(on_moment=film.see))
     world = World(route)
     texture = paint_texture(world.roadmap, world.path.points)
     title = f"{route.scenario} {route.id} {job.driver.label}"

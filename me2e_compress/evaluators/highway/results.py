@@ -44,7 +44,7 @@ def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, A
 
 @dataclass
 class ResultsFolder:
-    """Results on disk; every file is whole or not there.
+    """Results on disk; every file is complete or absent.
 
     Attributes:
         path: The folder.
@@ -80,7 +80,7 @@ class ResultsFolder:
             if old != new:
                 raise EvaluationError(
                     f"{path}: holds the results of another evaluation: its {key} is "
-                    f"{_short(old)}, this one's {_short(new)}; take another folder"
+                    f"{_short(old)}, this one's {_short(new)}; choose another folder"
                 )
         return folder
 
@@ -89,14 +89,14 @@ class ResultsFolder:
         """Read what a folder is.
 
         Raises:
-            EvaluationError: It is no folder of results.
+            EvaluationError: It is not a results folder.
         """
         try:
             made_by = json.loads((path / MANIFEST).read_bytes())
         except (OSError, ValueError) as error:
             words = error.strerror if isinstance(error, OSError) else "not JSON"
             raise EvaluationError(
-                f"{path}: no folder of results: {MANIFEST}: {words}"
+                f"{path}: not a results folder: {MANIFEST}: {words}"
             ) from error
         if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
             raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
@@ -169,13 +169,13 @@ def read_results(paths: Iterable[Path]) -> list[ResultsFolder]:
     """Open several folders.
 
     Raises:
-        EvaluationError: One of them is none.
+        EvaluationError: One of them is not a results folder.
     """
     return [ResultsFolder.open(path) for path in paths]
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Refuse a folder that is not ours; a kill leaves a draft and no more in ours."""
+    """Refuse a folder that is not ours; in ours a kill leaves no more than a draft."""
     names = [file.name for file in path.iterdir() if not file.name.startswith(".")]
     if any(name != ROUTES for name in names):
         raise EvaluationError(f"{path}: not empty, and holds no {MANIFEST}")
@@ -186,7 +186,7 @@ def _refuse_foreign(path: Path) -> None:
 def _unwritable(path: Path, error: OSError) -> EvaluationError:
     if error.errno == errno.ENOSPC:
         return EvaluationError(
-            f"{path}: the disk is full; what is written is whole, run again to go on"
+            f"{path}: the disk is full; written files are complete, run again to resume"
         )
     return EvaluationError(f"{path}: cannot be written: {error.strerror or error}")
 

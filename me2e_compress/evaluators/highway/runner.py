@@ -1,4 +1,4 @@
-"""One route: the policy decides, the world charges for it, the episode remains."""
+"""Drives one route: the policy decides, the world charges, an episode results."""
 
 import math
 import time
@@ -34,11 +34,11 @@ Plan = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Conditions:
-    """Under what a policy drives.
+    """The conditions that a policy drives under.
 
     Args:
         latency: What its decisions cost.
-        dt_us: Step of the world, a whole part of 50 ms; what a finer one changes says
+        dt_us: Step of the world, a divisor of 50 ms; for what a finer one changes see
             `realtime.skipped_decisions`. Frames are recorded every 50 ms all the same.
         image_size: Rows and columns of each camera.
         weather: Weather and sensor faults.
@@ -56,29 +56,29 @@ class Conditions:
         """Check the step."""
         if self.dt_us <= 0 or FRAME_US % self.dt_us:
             raise EvaluationError(
-                f"a step of {self.dt_us / 1e3:g} ms: it must be a whole part of "
+                f"a step of {self.dt_us / 1e3:g} ms: it must divide "
                 f"{FRAME_US // 1000} ms"
             )
 
 
 class PolicyFailedError(Exception):
-    """A policy broke its contract; the message says how."""
+    """A policy broke its contract; the message is the reason."""
 
 
 @dataclass(frozen=True)
 class Listeners:
-    """Who is told what while a route is driven; none of them changes the drive.
+    """Callbacks while a route is driven; none of them changes the drive.
 
     Args:
-        asking: Called with the world before the policy is asked.
-        answered: Called when it has answered.
-        moment: Called at every frame with what a picture needs, the latest plan as
+        on_query: Called with the world before the policy is called.
+        on_answer: Called when it has returned.
+        on_moment: Called at every frame with what a picture needs, the latest plan as
             seen from the ego now; makes the cameras render for any policy.
     """
 
-    asking: Callable[[World], None] = lambda world: None
-    answered: Callable[[], None] = lambda: None
-    moment: Callable[[Moment], None] | None = None
+    on_query: Callable[[World], None] = lambda world: None
+    on_answer: Callable[[], None] = lambda: None
+    on_moment: Callable[[Moment], None] | None = None
 
 
 NO_LISTENERS = Listeners()
@@ -102,7 +102,7 @@ def drive(
         route: What to drive.
         policy: Who drives.
         conditions: Latency, step, cameras.
-        listeners: For a watchdog or for pictures.
+        listeners: Callbacks, for a watchdog or for pictures.
     """
     return _Drive(route, policy, conditions, listeners).run()
 
@@ -111,9 +111,9 @@ class _Drive:
     """The state of one route while it is driven."""
 
     def __init__(
-        self, route: Route, policy: Policy, conditions: Conditions, to: Listeners
+        self, route: Route, policy: Policy, conditions: Conditions, listeners: Listeners
     ) -> None:
-        self.route, self.policy, self.to = route, policy, to
+        self.route, self.policy, self.listeners = route, policy, listeners
         self.world = world = World(route, dt_us=conditions.dt_us)
         self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
         self.held = HeldControl(Control(0.0, 0.0), conditions.dt_us)
@@ -121,7 +121,7 @@ class _Drive:
         self.controller = Controller()
         rig = CameraRig(*conditions.image_size)
         self.cameras = None
-        if policy.needs_images or to.moment is not None:
+        if policy.needs_images or listeners.on_moment is not None:
             texture = paint_texture(world.roadmap, world.path.points)
             self.cameras = Cameras(texture, rig, conditions.weather)
         needed = self.cameras if policy.needs_images else None
@@ -132,11 +132,11 @@ class _Drive:
         world, ending = self.world, None
         scene = world.scene()
         try:
-            self.to.asking(world)
+            self.listeners.on_query(world)
             _reset(self.policy, self.route)
-            self.to.answered()
+            self.listeners.on_answer()
             while ending is None:
-                self.recorder.see(scene)
+                self.recorder.record(scene)
                 if self.held.decision_is_due:
                     self.decide(scene)
                 self.show(scene)
@@ -145,18 +145,18 @@ class _Drive:
                 ending = self.rules.ending(world, scene.ego.speed_mps)
         except PolicyFailedError as failure:
             return self.recorder.episode(Ending.POLICY_FAILED, str(failure))
-        self.recorder.see(scene)
+        self.recorder.record(scene)
         self.show(scene)
         return self.recorder.episode(ending)
 
     def decide(self, scene: Scene) -> None:
-        """Ask the policy at this frame, and let equation 4 say when it acts."""
+        """Query the policy at this frame; equation 4 says when its answer acts."""
         observation = self.observer.observe(scene)
-        self.to.asking(self.world)
+        self.listeners.on_query(self.world)
         begun = time.perf_counter_ns()
         answer = _ask(self.policy, observation)
         took_us = (time.perf_counter_ns() - begun) // 1_000
-        self.to.answered()
+        self.listeners.on_answer()
         plan = _checked(answer)
         self.plan = scene.ego, plan
         latency_us = self.charge(took_us)
@@ -166,15 +166,15 @@ class _Drive:
         self.held.decide(control, latency_us)
 
     def show(self, scene: Scene) -> None:
-        """Render this frame for whoever draws pictures."""
-        if self.to.moment is not None and self.cameras is not None:
+        """Render this frame for the listener that draws pictures."""
+        if self.listeners.on_moment is not None and self.cameras is not None:
             images = self.cameras.render(scene)
             plan = None if self.plan is None else _seen_from(scene.ego, *self.plan)
-            self.to.moment(Moment(scene, images, plan, self.world.events))
+            self.listeners.on_moment(Moment(scene, images, plan, self.world.events))
 
 
 def _seen_from(ego: Ego, planned_at: Ego, plan: Plan) -> Plan:
-    """Turn the waypoints of an earlier ego frame into today's."""
+    """Convert the waypoints of an earlier ego frame to the present one."""
     cos, sin = math.cos(planned_at.heading), math.sin(planned_at.heading)
     world = plan @ np.array([[cos, sin], [-sin, cos]]) + (planned_at.x, planned_at.y)
     cos, sin = math.cos(ego.heading), math.sin(ego.heading)
@@ -189,7 +189,7 @@ def _reset(policy: Policy, route: Route) -> None:
 
 
 def _ask(policy: Policy, observation: Observation) -> object:
-    """Call foreign code: whatever it raises is a crash of the policy, not of ours."""
+    """Call the policy; whatever it raises is its failure, not ours."""
     try:
         return policy.plan(observation)
     except Exception as error:
@@ -205,7 +205,7 @@ def _failure(error: Exception) -> PolicyFailedError:
 
 def _checked(answer: object) -> Plan:
     if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
-        raise PolicyFailedError(f"the plan is no float array but {_kind(answer)}")
+        raise PolicyFailedError(f"the plan is not a float array but {_kind(answer)}")
     if answer.shape != PLAN_SHAPE:
         raise PolicyFailedError(
             f"the plan has shape {list(answer.shape)}, it must be {list(PLAN_SHAPE)}"

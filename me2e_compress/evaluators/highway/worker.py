@@ -29,13 +29,13 @@ POLL_S = 0.05
 FRAME_LIMIT_S = 60.0
 
 Heartbeat: TypeAlias = "SynchronizedArray[float]"
-"""[0] number of the question the policy is thinking about, 0 while it is not asked;
-[1] percent of the route passed."""
+"""[0] number of the call that the policy is in, 0 outside of one; [1] percent of the
+route passed."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What every route of an evaluation has in common.
+    """What all routes of an evaluation have in common.
 
     Args:
         driver: Who drives.
@@ -74,7 +74,7 @@ class RouteWorker:
 
     job: Job
     _process: SpawnProcess | None = field(default=None, init=False)
-    _pulse: Heartbeat | None = field(default=None, init=False)
+    _heartbeat: Heartbeat | None = field(default=None, init=False)
     _line: Connection[Route, Driven | Me2eError] | None = field(
         default=None, init=False
     )
@@ -84,24 +84,24 @@ class RouteWorker:
 
         Args:
             route: Which.
-            stop: Gives up when set.
+            stop: Ends the drive when set.
 
         Returns:
-            What was driven, None if it was told to stop.
+            What was driven, None if it was stopped.
 
         Raises:
             EvaluationError: The process ended for another reason than the policy.
         """
         begun = time.perf_counter()
-        process, pulse, line = self._started()
+        process, heartbeat, line = self._started()
         line.send(route)
         asked, since = 0.0, begun
         while not _ready(line):
             if stop is not None and stop.is_set():
                 self.close()
                 return None
-            if pulse[0] != asked:
-                asked, since = pulse[0], time.perf_counter()
+            if heartbeat[0] != asked:
+                asked, since = heartbeat[0], time.perf_counter()
             elif asked and time.perf_counter() - since > self.job.frame_limit_s:
                 limit = f"{self.job.frame_limit_s:g} s"
                 return self._lost(route, begun, f"no plan within {limit}")
@@ -121,26 +121,26 @@ class RouteWorker:
             self._process.join()
         if self._line is not None:
             self._line.close()
-        self._process = self._pulse = self._line = None
+        self._process = self._heartbeat = self._line = None
 
     def _started(
         self,
     ) -> tuple[SpawnProcess, Heartbeat, Connection[Route, Driven | Me2eError]]:
-        if self._process is None or self._pulse is None or self._line is None:
+        if self._process is None or self._heartbeat is None or self._line is None:
             context = multiprocessing.get_context("spawn")
-            pulse = context.Array("d", 2)
+            heartbeat = context.Array("d", 2)
             ours, theirs = context.Pipe()
             process = context.Process(
-                target=_serve, args=(theirs, pulse, self.job), daemon=True
+                target=_serve, args=(theirs, heartbeat, self.job), daemon=True
             )
             process.start()
             theirs.close()
-            self._process, self._pulse, self._line = process, pulse, ours
-        return self._process, self._pulse, self._line
+            self._process, self._heartbeat, self._line = process, heartbeat, ours
+        return self._process, self._heartbeat, self._line
 
     def _cause(self, route: Route, process: SpawnProcess) -> str:
         code = process.exitcode
-        if code == -signal.SIGKILL or not self._pulse or not self._pulse[0]:
+        if code == -signal.SIGKILL or not self._heartbeat or not self._heartbeat[0]:
             self.close()
             killed = code == -signal.SIGKILL
             how = "was killed (out of memory?)" if killed else f"ended with code {code}"
@@ -148,7 +148,7 @@ class RouteWorker:
         return f"the policy ended its process with code {code}"
 
     def _lost(self, route: Route, begun: float, failure: str) -> Driven:
-        percent = self._pulse[1] if self._pulse else 0.0
+        percent = self._heartbeat[1] if self._heartbeat else 0.0
         self.close()
         episode = failed_episode(route, percent, failure)
         return Driven(episode, time.perf_counter() - begun, 0)
@@ -162,29 +162,29 @@ def _ready(line: Connection[Route, Driven | Me2eError]) -> bool:
 
 
 def _serve(
-    line: Connection[Driven | Me2eError, Route], pulse: Heartbeat, job: Job
+    line: Connection[Driven | Me2eError, Route], heartbeat: Heartbeat, job: Job
 ) -> None:
-    """Drive what comes down the line until the other end is gone."""
+    """Drive the routes that come down the line until its other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     asked = 0
 
-    def asking(world: World) -> None:
+    def on_query(world: World) -> None:
         nonlocal asked
         asked += 1
-        pulse[1] = completion_percent(world)
-        pulse[0] = float(asked)
+        heartbeat[1] = completion_percent(world)
+        heartbeat[0] = float(asked)
 
-    def answered() -> None:
-        pulse[0] = 0.0
+    def on_answer() -> None:
+        heartbeat[0] = 0.0
 
     try:
         policy = job.driver.open()
         while True:
             route = line.recv()
             begun = time.perf_counter()
-            listeners = Listeners(asking, answered)
+            listeners = Listeners(on_query, on_answer)
             episode = drive(route, policy, job.conditions, listeners)
-            answered()
+            on_answer()
             memory = psutil.Process().memory_info().rss
             line.send(Driven(episode, time.perf_counter() - begun, memory))
     except Me2eError as error:

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.highway.bev_grid import cell_centres, grid_of
+from me2e_compress.zoo.highway.blocks import Residual, conv_block, mlp, sample
 from me2e_compress.zoo.highway.config import CAMERAS, HighwayConfig
-from me2e_compress.zoo.highway.layers import Residual, conv_block, mlp, sample
 
 NEAREST_M = 0.3
 """Nearer to the image plane than this a point is not seen."""

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from me2e_compress.zoo.highway.bev_grid import grid_of
+from me2e_compress.zoo.highway.blocks import sample
 from me2e_compress.zoo.highway.config import BevArea
-from me2e_compress.zoo.highway.layers import sample
 
 DISCS_M = (-1.5, 0.0, 1.5)
 """The ego as three discs along its axis."""

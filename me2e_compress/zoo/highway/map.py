@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.highway.bev_grid import grid_of, route_points
+from me2e_compress.zoo.highway.blocks import DecoderLayer, conv_block, mlp, sample
 from me2e_compress.zoo.highway.config import (
     CAMERAS,
     COMMANDS,
@@ -14,7 +15,6 @@ from me2e_compress.zoo.highway.config import (
     SIGNAL_STATES,
     HighwayConfig,
 )
-from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp, sample
 
 FORWARD_CAMERAS = 3
 """The first three cameras look ahead, and to both sides of it."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.highway.blocks import DecoderLayer, mlp
 from me2e_compress.zoo.highway.config import STEP_S, STEPS, HighwayConfig
-from me2e_compress.zoo.highway.layers import DecoderLayer, mlp
 from me2e_compress.zoo.highway.map import RoadMap
 from me2e_compress.zoo.highway.track import Tracks
 

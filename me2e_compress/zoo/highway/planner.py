@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.highway.blocks import DecoderLayer, conv_block, mlp
 from me2e_compress.zoo.highway.config import (
     COMMANDS,
     PATH_STEP_M,
@@ -28,7 +29,6 @@ from me2e_compress.zoo.highway.interfaces import (
     EgoState,
     PlannerInput,
 )
-from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
 from me2e_compress.zoo.highway.map import GAP_SCALE_M
 
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.highway.bev_encoder import BevEncoder
+from me2e_compress.zoo.highway.blocks import Residual, conv_block
 from me2e_compress.zoo.highway.config import STEPS, HighwayConfig
 from me2e_compress.zoo.highway.interfaces import EgoState, PlannerInput, gather
-from me2e_compress.zoo.highway.layers import Residual, conv_block
 from me2e_compress.zoo.highway.map import Choice, Map, RoadMap
 from me2e_compress.zoo.highway.motion import Futures, Motion
 from me2e_compress.zoo.highway.planner import Planner

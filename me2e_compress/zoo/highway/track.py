@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from me2e_compress.zoo.highway.bev_grid import cell_centres
+from me2e_compress.zoo.highway.blocks import DecoderLayer, conv_block, mlp
 from me2e_compress.zoo.highway.config import AGENT_CLASSES, HighwayConfig
-from me2e_compress.zoo.highway.layers import DecoderLayer, conv_block, mlp
 
 SPEED_SCALE_MPS = 10.0
 """Velocities are predicted in these units, about 1 in size."""

@@ -45,5 +45,5 @@ def test_without_a_world_it_says_what_is_missing() -> None:
         command=3,
         speed_mps=0.0,
     )
-    with pytest.raises(EvaluationError, match="blind: the observation has no"):
+    with pytest.raises(EvaluationError, match="blind needs a highway-env world"):
         Blind().plan(nothing)

@@ -130,9 +130,9 @@ def test_no_route_is_one_that_drivers_are_judged_on(
 @pytest.mark.parametrize(
     ("count", "seed", "length", "words"),
     [
-        (0, 0, 4, "0 frames in scenes of 4: both must be >= 1"),
-        (4, 0, 0, "4 frames in scenes of 0: both must be >= 1"),
-        (4, -1, 4, "seed -1: it must be 0 or more"),
+        (0, 0, 4, "0 frames in scenes of 4: both must be at least 1"),
+        (4, 0, 0, "4 frames in scenes of 0: both must be at least 1"),
+        (4, -1, 4, "seed -1: must be 0 or more"),
     ],
 )
 def test_bad_numbers(

@@ -14,7 +14,7 @@ from tests.evaluators.highway.tiny_world import actor, ego_at
 def traffic_speed(*actors: Actor) -> float | None:
     """Return the speed of the traffic that a frame keeps; the ego stands at (5, 0)."""
     recorder = EpisodeRecorder(cast(World, SimpleNamespace(progress_m=0.0)))
-    recorder.see(Scene(0, ego_at(5.0, 0.0), actors, ()))
+    recorder.record(Scene(0, ego_at(5.0, 0.0), actors, ()))
     (frame,) = recorder.frames
     return frame.traffic_speed_mps
 

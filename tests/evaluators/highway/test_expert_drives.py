@@ -90,5 +90,5 @@ def test_without_a_world_it_says_what_is_missing() -> None:
         command=3,
         speed_mps=0.0,
     )
-    with pytest.raises(EvaluationError, match="expert: the observation has no"):
+    with pytest.raises(EvaluationError, match="expert needs a highway-env world"):
         Expert().plan(nothing)

@@ -14,7 +14,7 @@ from me2e_compress.evaluators.highway.expert.lateral_targets import (
 from me2e_compress.evaluators.highway.expert.speed_limits import (
     LATERAL_MPS2,
     ceiling,
-    somebody_comes,
+    must_give_way,
 )
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Actor, ActorKind, Scene
@@ -127,6 +127,6 @@ def test_targets_stay_on_the_road() -> None:
 def test_who_crosses_soon_has_priority_and_who_leads_has_not() -> None:
     path = straight()
     crossing = look(path, actor(45.0, -16.0, 8.0, math.pi / 2))
-    assert somebody_comes(crossing, 40.0, 1.0)
-    assert not somebody_comes(crossing, 40.0, 4.5)
-    assert not somebody_comes(look(path, actor(45.0, 0.0, 8.0)), 40.0, 1.0)
+    assert must_give_way(crossing, 40.0, 1.0)
+    assert not must_give_way(crossing, 40.0, 4.5)
+    assert not must_give_way(look(path, actor(45.0, 0.0, 8.0)), 40.0, 1.0)

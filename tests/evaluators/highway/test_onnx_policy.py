@@ -225,7 +225,7 @@ def test_the_projection_is_turned_with_the_axes() -> None:
         ({"inputs": "string[1] command"}, "it cannot be fed"),
         (
             {"inputs": "float[1, 6, 3, 16, 24] img"},
-            "does not say how its images are normalised",
+            "image normalisation unknown",
         ),
         (
             {"outputs": "float[1, 6, 2] way", "body": "way = Identity (ahead)"},
@@ -246,7 +246,7 @@ def test_the_projection_is_turned_with_the_axes() -> None:
                 "initializers": ", int64[1] from = {0}, int64[1] to = {4},"
                 " int64[1] axes = {1}",
             },
-            "a plan of shape [4, 2], it must be [6, 2]",
+            "the plan has shape [4, 2], it must be [6, 2]",
         ),
     ],
 )
@@ -267,7 +267,10 @@ def test_a_model_that_breaks_the_contract_never_drives(
     ("text", "words"),
     [
         ("[inputs]\npicture = 'img'", "adapter inputs.picture"),
-        ("[plan]\noutput = 'way'", "the adapter's plan is output way; there are plan"),
+        (
+            "[plan]\noutput = 'way'",
+            "no output way, which the adapter names as the plan; there are plan",
+        ),
         ("[inputs]\nimg = 'image'", "the adapter names input image; there are command"),
         ("[recurrent]\ncommand = 'x'", "the adapter names output x; there are plan"),
         ("axes = 'up'", "adapter axes"),

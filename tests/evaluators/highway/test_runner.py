@@ -134,8 +134,8 @@ def test_a_late_control_acts_late() -> None:
         ("raise", r"KeyError: 'lost\\nmy way'"),
         ("not-finite", "the plan is not finite"),
         ("shape", r"the plan has shape \[5, 2\], it must be \[6, 2\]"),
-        ("integers", "the plan is no float array but an array of int64"),
-        ("list", "the plan is no float array but list"),
+        ("integers", "the plan is not a float array but an array of int64"),
+        ("list", "the plan is not a float array but list"),
     ],
 )
 def test_a_policy_that_breaks_its_contract_has_failed(way: str, reason: str) -> None:
@@ -214,7 +214,7 @@ def test_a_step_must_divide_50_ms() -> None:
 def test_watching_changes_nothing() -> None:
     moments = list[Moment]()
     small = Conditions(image_size=(16, 16))
-    watched = drive(PARKED, Blind(), small, Listeners(moment=moments.append))
+    watched = drive(PARKED, Blind(), small, Listeners(on_moment=moments.append))
 
     assert watched == drive(PARKED, Blind(), small)
     assert len(moments) == len(watched.frames)
@@ -228,7 +228,7 @@ def test_a_held_plan_stays_where_it_was_made() -> None:
     """Seen from an ego that has moved on, its waypoints come nearer."""
     moments = list[Moment]()
     slow = Conditions(FixedLatency(500_000), image_size=(16, 16))
-    drive(PARKED, Standing(plans=8.0), slow, Listeners(moment=moments.append))
+    drive(PARKED, Standing(plans=8.0), slow, Listeners(on_moment=moments.append))
     first, later = moments[0], moments[9]
     assert first.plan is not None
     assert later.plan is not None

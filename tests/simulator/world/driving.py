@@ -28,7 +28,7 @@ def coast(world: World, frames: int, control: Control | None = None) -> None:
         world.step(control or Control(0.0, 0.0))
 
 
-def sleepwalk(route: Route, speed_mps: float) -> DryRun:
+def drive_blind(route: Route, speed_mps: float) -> DryRun:
     return dry_run(route, Blind(speed_mps))
 
 

@@ -9,7 +9,7 @@ from me2e_compress.simulator.scenarios.catalogue import (
 )
 from me2e_compress.simulator.traffic.traffic_road import overlap
 from me2e_compress.simulator.world import World
-from tests.simulator.world.driving import route_of, sleepwalk
+from tests.simulator.world.driving import drive_blind, route_of
 
 TYPES = tuple(SCENARIO_ABILITIES)
 
@@ -35,7 +35,7 @@ def test_no_two_types_share_both_layout_and_script() -> None:
 
 @pytest.mark.parametrize("name", TYPES)
 def test_its_event_happens_to_who_does_not_look(name: str) -> None:
-    drive = sleepwalk(route_of(name, seed=11), 8.0)
+    drive = drive_blind(route_of(name, seed=11), 8.0)
 
     assert drive.triggered
     assert drive.infractions

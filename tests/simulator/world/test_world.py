@@ -15,9 +15,9 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 from me2e_compress.simulator.world import EndReason, EventKind, World
 from tests.simulator.world.driving import (
     coast,
+    drive_blind,
     empty_road,
     route_of,
-    sleepwalk,
     trace,
 )
 
@@ -243,7 +243,7 @@ def test_a_slick_patch_takes_grip_away() -> None:
 
 
 def test_running_a_red_light_does_not_end_a_route() -> None:
-    drive = sleepwalk(route_of("VanillaSignalizedTurnEncounterRedLight", 1), 8.0)
+    drive = drive_blind(route_of("VanillaSignalizedTurnEncounterRedLight", 1), 8.0)
 
     assert drive.infractions == (InfractionKind.RED_LIGHT,)
     assert drive.ending is Ending.COMPLETED

@@ -1,4 +1,4 @@
-"""The privileged expert: a sampling planner on the Frenet frame of the route."""
+"""The privileged expert: a sampling planner in the Frenet frame of the route."""
 
 from me2e_compress.evaluators.highway.expert.expert_policy import (
     Expert,

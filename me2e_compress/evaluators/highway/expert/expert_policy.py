@@ -35,7 +35,7 @@ WAYPOINTS = np.searchsorted(TIMES_S, np.arange(0.5, 3.01, 0.5))
 
 @dataclass(frozen=True)
 class Memory:
-    """What one decision leaves to the next; the default is no past at all.
+    """What one decision leaves to the next; the default is no past.
 
     Args:
         at_m: Arc length at which the ego was last seen.
@@ -78,28 +78,33 @@ def decide(
 
     Args:
         scene: What there is.
-        known: What the actors mean to do, and which signals are on the route.
+        known: What the actors intend, and which signals are on the route.
         path: The route.
         top: [N] speed ceiling along it, of `speed.ceiling`.
         memory: What the last decision left, or ``Memory()``.
     """
+    # where the ego is on its route
     ego = scene.ego
     s, lateral = path.project(ego.x, ego.y, memory.at_m)
     speed = max(ego.speed_mps, 0.0)
     here = float(path.value(top, s))
     slope, gaining = slope_of(ego, path, s), ego.acceleration_mps2
     place = Place(s, lateral, slope, speed, gaining, here)
+    # what the others will do, where signals stop the ego, which offsets are open
     intents = {intent.actor_id: intent for intent in known.intents}
     seen = forecast(scene, intents, path, s)
     stop = obey(scene, known.phases, seen, s, memory.served)
     options = lateral_targets(path, place, ego, seen)
+    # futures: accelerations times lateral targets
     future = sample(path, slowed(top, stop), ego, place, options, stop.line_m)
+    # what each costs
     cost = drive_cost(future, ego, place, memory.target_m)
     cost += rule_cost(future, path, ego, place, stop.line_m)
     if len(seen.length):
         cost += collision_cost(future, seen, ego, place)
         cost += headway_cost(future, seen, ego, place, options.passable)
         cost += emergency_cost(future, seen, ego, place)
+    # the cheapest one, as waypoints
     best = int(np.argmin(cost))
     target = float(future.target_m[best])
     columns = future.x[best, WAYPOINTS], future.y[best, WAYPOINTS]
@@ -114,7 +119,7 @@ def decide(
 
 @dataclass
 class Expert:
-    """Drives by `decide`, remembering its target lane and the signs it obeyed.
+    """Drives by `decide`, and keeps its target lane and the signs it obeyed.
 
     Args:
         last: The last decision, for labels and pictures; None before the first.

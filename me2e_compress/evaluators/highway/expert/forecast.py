@@ -1,4 +1,4 @@
-"""Where every actor will be, by its own intent, for the next six seconds."""
+"""Forecasts of every actor, by its own intent, for the next six seconds."""
 
 import math
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ TIMES_S = np.concatenate([np.arange(0.25, 3.01, 0.25), np.arange(3.5, 6.01, 0.5)
 """[18] seconds: fine for the three seconds that are handed out, coarse after."""
 NOW_S = np.concatenate([[0.0], TIMES_S])
 REACH_M = 150.0
-"""Actors farther away than this do not matter; oncoming ones do matter early."""
+"""Actors farther away than this do not matter; oncoming ones matter early."""
 ROUTE_SPAN_M = (-60.0, 160.0)
 """Part of the route, from the ego, onto which actors are projected."""
 EASY_MPS2 = 0.3
@@ -117,7 +117,7 @@ def _yields(intent: Intent | None) -> bool:
 
 
 def _roll_out(actor: Actor, intent: Intent | None) -> Floats:
-    """[4, T] x, y, heading, speed at `NOW_S`."""
+    """Return [4, T]: x, y, heading, speed at `NOW_S`."""
     first = 0.0 if intent is None else intent.acceleration_mps2
     briskest = max(first, EASY_MPS2)
     goal = _goal(actor, intent)
@@ -138,14 +138,14 @@ def _goal(actor: Actor, intent: Intent | None) -> float:
 def _speeds(
     now: float, goal: float, first: float, briskest: float
 ) -> tuple[Floats, Floats]:
-    """Speeds and distances at `NOW_S`: one acceleration for 1 s, then to the goal.
+    """Return speeds and distances at `NOW_S`: hold for 1 s, then to the goal.
 
     Args:
         now: Speed.
         goal: Wanted speed.
         first: Acceleration of the first second.
-        briskest: Strongest acceleration later; who crawls behind somebody will not
-            leap ahead.
+        briskest: Strongest acceleration later; an actor that crawls behind another
+            will not leap ahead.
     """
     hardest = min(first, -2.0)
     speed, travel = [now], [0.0]
@@ -161,7 +161,7 @@ def _speeds(
 
 
 def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
-    """[3, T] x, y, heading on a line that begins where the actor stands."""
+    """Return [3, T], x, y and heading on a line that begins at the actor."""
     steps = line[1:] - line[:-1]
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
     headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -176,7 +176,7 @@ def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
 def _on_route(
     path: RoutePath, x: Floats, y: Floats, heading: Floats, ego_s_m: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Arc length, lateral offset and relative heading on the route: each [A, T]."""
+    """Return arc length, lateral offset and relative heading: each [A, T]."""
     low = int(max(ego_s_m + ROUTE_SPAN_M[0], 0))
     high = int(min(ego_s_m + ROUTE_SPAN_M[1], len(path.points)))
     points, headings = path.points[low:high], path.headings[low:high]

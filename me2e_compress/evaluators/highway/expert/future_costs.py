@@ -21,21 +21,20 @@ CORNER_M = 0.1
 """Added to the discs, which miss 0.41 m at the corners of the ego; less than
 `MARGIN_M` remains."""
 SWEEP_S = 0.12
-"""Everybody is this much longer at both ends, since the times are 0.25 s apart."""
+"""Every box is this much longer at both ends, since the times are 0.25 s apart."""
 REACH_M = 12.0
-"""Half of two long vehicles and the margins; who is farther away needs no look."""
+"""Half of two long vehicles and the margins; actors farther away are skipped."""
 PRIORITY_S = 1.3
-"""Nobody is to be met within this time ahead of a moving car's bumper."""
+"""The way of a moving car is kept free for this time ahead of its bumper."""
 
 
 def collision_cost(
     future: SampledFutures, seen: Forecast, ego: Ego, place: Place
 ) -> Floats:
-    """[K] cost of touching, nearly touching, or cutting off an actor.
+    """Return the [K] cost of touching, nearly touching, or cutting off an actor.
 
     The ego is four discs of its width, an actor its rectangle, longer in front by
-    what it drives in `PRIORITY_S`. Who follows in the ego's own lane looks after
-    himself.
+    what it drives in `PRIORITY_S`. Who follows in the ego's own lane is left out.
     """
     others = ~followers(seen, ego, place) & _in_reach(future, seen)
     if not np.any(others):
@@ -47,7 +46,7 @@ def collision_cost(
 
 
 def followers(seen: Forecast, ego: Ego, place: Place) -> Flags:
-    """[A] whether an actor follows the ego, in a lane that the ego is in."""
+    """Return [A]: whether an actor follows the ego, in a lane that the ego is in."""
     aligned = np.cos(seen.away[:, 0]) > 0.5
     apart = np.abs(seen.lateral_m[:, 0] - place.lateral_m)
     beside = apart < seen.half_breadth[:, 0] + ego.width / 2
@@ -56,7 +55,7 @@ def followers(seen: Forecast, ego: Ego, place: Place) -> Flags:
 
 
 def _in_reach(future: SampledFutures, seen: Forecast) -> Flags:
-    """[A] whether an actor comes near anything that the ego might do."""
+    """Return [A]: whether an actor comes near any future of the ego."""
     margin = REACH_M + PRIORITY_S * seen.speed_mps[:, 1:]
     near = np.ones_like(margin, bool)
     for mine, other in ((future.x, seen.x), (future.y, seen.y)):
@@ -66,7 +65,7 @@ def _in_reach(future: SampledFutures, seen: Forecast) -> Flags:
 
 
 def _worst(clearance: Floats, margin: float) -> Floats:
-    """[A, K] the largest faded intrusion into a margin, 0 to 1."""
+    """Return [A, K], the largest faded intrusion into a margin, 0 to 1."""
     inside = np.clip((margin - clearance) / margin, 0.0, 1.0)
     return np.asarray(np.max(inside * FADE, axis=-1))
 
@@ -74,7 +73,7 @@ def _worst(clearance: Floats, margin: float) -> Floats:
 def _clearances(
     future: SampledFutures, seen: Forecast, ego: Ego, others: Flags
 ) -> tuple[Floats, Floats]:
-    """Metres from the ego's discs to each actor, and to its way ahead: [A, K, T]."""
+    """Return [A, K, T] metres from the ego to each actor, and to its way ahead."""
     radius = ego.width / 2 + CORNER_M
     reach = (ego.length - ego.width) / 2 + SWEEP_S * future.speed_mps
     x, y, heading, speed = (
@@ -113,7 +112,7 @@ STANDOFF_M, GAP_S = 2.0, 0.8
 SWING_OUT_M = 8.0
 """Standing distance to an obstacle that has to be driven around."""
 BESIDE_M = 0.3
-"""A leader is whoever is not passed with this much room."""
+"""A leader is an actor that is not passed with this much room."""
 EMERGENCY, EMERGENCY_PER_MPS, EMERGENCY_SHARE, EMERGENCY_M = 60.0, 4.0, 0.35, 60.0
 """Staying in the way of an emergency vehicle that is this near behind, or driving
 faster than this share of its speed."""
@@ -126,9 +125,9 @@ def rule_cost(
     place: Place,
     stop_m: float | None,
 ) -> Floats:
-    """[K] cost of leaving the road, of the wrong side, and of passing a stop line.
+    """Return the [K] cost of leaving the road, the wrong side, and stop lines.
 
-    Who is off the road already pays only for going farther.
+    An ego that is off the road already pays only for going farther.
     """
     half = ego.width / 2 - 0.05
     metre = np.clip(np.rint(future.along_m).astype(np.int64), 0, len(path.left_m) - 1)
@@ -151,10 +150,10 @@ def rule_cost(
 def headway_cost(
     future: SampledFutures, seen: Forecast, ego: Ego, place: Place, passable: bool
 ) -> Floats:
-    """[K] cost of driving too close behind somebody, or up to an obstacle.
+    """Return the [K] cost of driving too close to a leader or an obstacle.
 
-    What is slow on a passable road is followed at the distance that lets the
-    ego swing out.
+    A slow leader on a passable road is followed at the distance that lets the ego swing
+    out.
     """
     along, lateral = seen.along_m[:, None, 1:], seen.lateral_m[:, None, 1:]
     ahead = along - future.along_m[None]
@@ -173,7 +172,7 @@ def headway_cost(
 def emergency_cost(
     future: SampledFutures, seen: Forecast, ego: Ego, place: Place
 ) -> Floats:
-    """[K] cost of not letting an emergency vehicle pass that comes from behind.
+    """Return the [K] cost of holding up an emergency vehicle from behind.
 
     First the ego leaves its lane, then it slows down.
     """
@@ -190,7 +189,7 @@ def emergency_cost(
 
 
 def drive_cost(future: SampledFutures, ego: Ego, place: Place, kept_m: float) -> Floats:
-    """[K] lack of progress, effort, and restlessness.
+    """Return the [K] cost of little progress, of effort and of restlessness.
 
     Args:
         future: The sampled futures.

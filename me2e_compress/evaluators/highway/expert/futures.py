@@ -13,7 +13,7 @@ from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S
 
 ACCELERATIONS_MPS2 = (-7.5, -5.5, -4.0, -2.8, -1.8, -1.0, -0.4, 0.0, 0.6, 1.2, 2.0)
 HARDEST_EASE_MPS2 = 3.0
-"""Braking for what the road allows, never more."""
+"""Braking for the speed ceiling, never more."""
 CHANGE_S = 2.6
 """Duration of a whole lane change; shorter shifts take less."""
 SHORTEST_CHANGE_M = 9.0
@@ -90,7 +90,7 @@ def sample(
 
 
 def _speeds(top: Floats, place: Place, rates: Floats) -> tuple[Floats, Floats]:
-    """Arc lengths and speeds, each [rates, T], with the lag of the actuators."""
+    """Return arc lengths and speeds, each [rates, T], with the actuators' lag."""
     along = np.full_like(rates, max(place.s_m, 0.0))
     speed = np.full_like(rates, place.speed_mps)
     alongs, speeds = [], []
@@ -110,7 +110,7 @@ def _speeds(top: Floats, place: Place, rates: Floats) -> tuple[Floats, Floats]:
 
 
 def _laterals(place: Place, travel: Floats, target: Floats) -> Floats:
-    """[K, T] offsets on the way to a lateral target."""
+    """Return [K, T] offsets on the way to a lateral target."""
     share = np.sqrt(np.abs(target - place.lateral_m) / FULL_CHANGE_M)
     seconds = CHANGE_S * np.clip(share, 0.6, 1.2)
     length = np.maximum(

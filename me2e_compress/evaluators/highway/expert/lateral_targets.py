@@ -1,4 +1,4 @@
-"""Which lateral offsets the expert may aim at: lanes, nudges, the oncoming lane."""
+"""The lateral offsets that the expert may aim at: lanes, nudges, oncoming lane."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,12 @@ from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Command, Ego, RoutePath
 
 NUDGES_M = (0.5, -0.5, 1.0, -1.0)
-"""Small shifts within what is drivable: past a door, away from who cuts the bend."""
+"""Small shifts within the drivable width: past a door, away from a car that cuts the
+bend."""
 ASIDE_M = 0.7
 """The same in the lane beside, away from what is passed."""
 JUNCTION = (int(Command.LEFT), int(Command.RIGHT), int(Command.STRAIGHT))
-"""Nobody overtakes here."""
+"""No overtaking here."""
 SLOW_MPS = 3.0
 """What is slower than this in the own lane is passed, not followed."""
 CHAIN_M = 14.0
@@ -76,10 +77,10 @@ class Block:
 
 
 def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> Options:
-    """Look at the road a little ahead.
+    """Return the lateral offsets that the road a little ahead allows.
 
-    The oncoming lane is offered only behind a blocked own lane and with a gap, or to
-    who is already in it.
+    The oncoming lane is offered only behind a blocked own lane and with a gap, or when
+    the ego is already in it.
     """
     ahead = place.s_m + max(6.0, 0.8 * place.speed_mps)
     columns = (path.lane_widths, path.left_m, path.right_m, path.oncoming_m)
@@ -106,7 +107,7 @@ def _may_face(
     left_m: float,
     lane_m: float,
 ) -> bool:
-    """Whether the oncoming lane may be used: with a gap, or by who is in it."""
+    """Return whether the oncoming lane may be used: with a gap, or if already in it."""
     if place.lateral_m + ego.width / 2 > left_m + 0.3:
         return True
     block = blocked_stretch(place, ego, seen)
@@ -126,7 +127,7 @@ def gap_for_passing(
     left_m: float,
     lane_m: float,
 ) -> bool:
-    """Whether what blocks the own lane can be passed before anybody comes.
+    """Return whether the blocker can be passed before oncoming traffic arrives.
 
     The stretch beside the blockers must be left before the first oncoming car
     reaches its end, with `CLEAR_S` to spare.
@@ -149,8 +150,8 @@ def gap_for_passing(
 def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:
     """Find what has to be driven around; None if the lane is free.
 
-    That is anything slow along the centre line (0.3 m to spare), but nobody who
-    crosses; neighbours within `CHAIN_M` count as one.
+    That is anything slow along the centre line (0.3 m to spare) that does not cross it;
+    neighbours within `CHAIN_M` count as one.
     """
     lateral, half = seen.lateral_m[:, 0], seen.half_breadth[:, 0]
     fastest = np.max(seen.speed_mps[:, :9], axis=1)
@@ -175,7 +176,7 @@ def blocked_stretch(place: Place, ego: Ego, seen: Forecast) -> Block | None:
 
 
 def _seconds_for(distance_m: float, speed: float, top: float) -> float:
-    """Time for a distance from a speed, accelerating to ``top``."""
+    """Return the time for a distance from a speed, accelerating to ``top``."""
     top = max(top, speed, 1.0)
     ramp_s = (top - speed) / PASS_MPS2
     ramp_m = (speed + top) / 2 * ramp_s

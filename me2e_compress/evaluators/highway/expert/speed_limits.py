@@ -26,7 +26,7 @@ SLOWEST_MPS = 2.5
 
 
 def ceiling(path: RoutePath) -> Floats:
-    """[N] highest speed (m/s) at every metre of a route, without any traffic."""
+    """Return [N], the highest speed (m/s) at every metre of a route without traffic."""
     window = np.full(5, 0.2)
     bends = np.convolve(np.pad(np.abs(path.curvature), 2, mode="edge"), window, "valid")
     in_bend = np.sqrt(LATERAL_MPS2 / np.maximum(bends, 1e-4))
@@ -45,16 +45,16 @@ SERVED_WITHIN_M = 4.0
 YELLOW_MPS2 = 3.0
 """A yellow light is obeyed if braking no harder than this stops in time."""
 GIVE_WAY_S = 2.4
-"""Nobody with priority is met within this time after crossing a give-way line."""
+"""No priority traffic is met within this time after crossing a give-way line."""
 CONFLICT_M, MEETING_M = 30.0, 2.0
 """How far behind the line, and how near the route, priority is looked for."""
 GIVE_WAY_MPS = 5.0
-"""Speed at a give-way line: slow enough to stop for who has priority."""
+"""Speed at a give-way line: slow enough to stop for priority traffic."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """What the signals ask for.
+    """What the signals demand.
 
     Args:
         line_m: Arc length that the ego's centre must not pass now, or None.
@@ -74,7 +74,7 @@ def obey(
     ego_s_m: float,
     served: frozenset[int],
 ) -> Stop:
-    """Look at every signal ahead on the route.
+    """Return where the signals ahead on the route make the ego stop or slow down.
 
     Args:
         scene: What there is.
@@ -96,7 +96,7 @@ def obey(
             served = served | {signal.id} if _stands(ego) else served
         if signal.kind is SignalKind.GIVE_WAY:
             slow.append(line - ego.length / 2)
-            if somebody_comes(seen, line, _arrival(gap, ego.speed_mps)):
+            if must_give_way(seen, line, _arrival(gap, ego.speed_mps)):
                 lines.append(line - ego.length / 2 - min(BEFORE_LINE_M, gap))
         if _closed(signal, gap, ego.speed_mps, served):
             lines.append(line - ego.length / 2 - min(BEFORE_LINE_M, gap))
@@ -104,7 +104,7 @@ def obey(
 
 
 def slowed(top: Floats, stop: Stop) -> Floats:
-    """The ceiling with a give-way line ahead, if there is one."""
+    """Return the ceiling lowered before a give-way line, if there is one."""
     if stop.slow_m is None:
         return top
     before = np.maximum(stop.slow_m - np.arange(len(top)), 0.0)
@@ -113,8 +113,8 @@ def slowed(top: Floats, stop: Stop) -> Floats:
     return np.where(past, top, np.minimum(top, slow))
 
 
-def somebody_comes(seen: Forecast, line_m: float, crossing_s: float) -> bool:
-    """Whether an actor with priority meets the route when the ego crosses a line.
+def must_give_way(seen: Forecast, line_m: float, crossing_s: float) -> bool:
+    """Return whether priority traffic meets the route when the ego crosses a line.
 
     Args:
         seen: The other road users.
@@ -132,7 +132,7 @@ def somebody_comes(seen: Forecast, line_m: float, crossing_s: float) -> bool:
 
 
 def _arrival(gap_m: float, speed: float) -> float:
-    """When the front will be at a line, from a speed or from rest at 2 m/s2."""
+    """Return when the front is at a line, from a speed or from rest at 2 m/s2."""
     return float(min(gap_m / max(speed, 0.1), np.sqrt(gap_m)))
 
 
