@@ -1,4 +1,4 @@
-"""What training has come to, in one file."""
+"""Checkpoints of training, one file each."""
 
 import os
 import pickle
@@ -17,7 +17,7 @@ Weights = Mapping[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What a stage begins with: a `TrainingCheckpoint`, or a file that holds no more.
+    """What a stage starts from: of a `TrainingCheckpoint`, or of the file that ships.
 
     Attributes:
         mean: weights and buffers that drive.
@@ -39,7 +39,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class TrainingCheckpoint:
-    """Everything that going on needs.
+    """Everything that resuming needs.
 
     Attributes:
         model: weights and buffers that learn.
@@ -62,12 +62,12 @@ class TrainingCheckpoint:
         """Read a checkpoint.
 
         Raises:
-            TrainingError: it is none.
+            TrainingError: it is not one.
         """
         return cls(**_read(path, [field.name for field in fields(cls)]))
 
     def save(self, path: Path) -> None:
-        """Write it in one step.
+        """Write it atomically.
 
         Raises:
             TrainingError: it cannot be written.
@@ -97,10 +97,10 @@ def _read(path: Path, names: Sequence[str]) -> dict[str, Any]:
 
 
 def fit(module: nn.Module, weights: Weights, path: Path) -> None:
-    """Give a module the weights of a checkpoint.
+    """Load the weights of a checkpoint into a module.
 
     Args:
-        module: that takes them.
+        module: that gets them.
         weights: by the names of its state.
         path: of the checkpoint, for the message.
 

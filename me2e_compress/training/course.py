@@ -1,4 +1,4 @@
-"""The whole way from nothing to a driver: collect, train, let it drive, train again."""
+"""A course of training, from nothing to a driver: collect, train, drive, repeat."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -29,10 +29,10 @@ NO_LATENCY = FixedLatency()
 
 @dataclass(frozen=True)
 class CourseProgress:
-    """What a course is at.
+    """How far a course is.
 
     Attributes:
-        what: in words.
+        what: the present part, in words.
         done: of the present part.
         total: of the present part.
     """
@@ -44,7 +44,7 @@ class CourseProgress:
 
 @dataclass(frozen=True)
 class RoundResult:
-    """What came of a round.
+    """The result of a round.
 
     Attributes:
         driver: the ``.onnx``.
@@ -64,24 +64,24 @@ def run(
     course: Course,
     folder: Path,
     workers: int,
-    on_news: Listener = lambda news: None,
+    on_progress: Listener = lambda progress: None,
     latency: LatencySource = NO_LATENCY,
 ) -> tuple[RoundResult, ...]:
-    """Go the whole way, or what is left of it after an interruption.
+    """Run the whole course, or what is left of it after an interruption.
 
-    The same course comes to the same bytes with as many workers, however often it was
-    interrupted.
+    The same course gives the same bytes for the same number of workers, however often
+    it was interrupted.
 
     Args:
         course: the rounds.
         folder: gets a folder a round: ``episodes/``, ``training-0/``, ``trial/``,
             ``driver.onnx``.
         workers: processes, for driving and for training.
-        on_news: told how far it is.
+        on_progress: called with how far it is.
         latency: what a decision costs in the trials.
 
     Returns:
-        What came of each round; the last driver is the one that was asked for.
+        The result of each round; the last driver is the one that was asked for.
 
     Raises:
         TrainingError: the folder is of another course, an episode is damaged, or a
@@ -90,40 +90,45 @@ def run(
     """
     course = course.on(workers)
     claim(folder, course)
-    way = _Way(course, folder, workers, on_news, latency)
-    return tuple(way.go(number, each) for number, each in enumerate(course.rounds))
+    course_run = _CourseRun(course, folder, workers, on_progress, latency)
+    return tuple(
+        course_run.run_round(number, each) for number, each in enumerate(course.rounds)
+    )
 
 
-class _Way:
-    """What the rounds hand on to each other."""
+class _CourseRun:
+    """A course while it runs: what a round hands to the next."""
 
     def __init__(
         self,
         course: Course,
         folder: Path,
         workers: int,
-        on_news: Listener,
+        on_progress: Listener,
         latency: LatencySource,
     ) -> None:
         self.course, self.folder, self.workers = course, folder, workers
-        self.on_news, self.latency = on_news, latency
+        self.on_progress, self.latency = on_progress, latency
         self.learned, self.held_out = list[Path](), list[Path]()
         self.start: Path | None = None
         self.driver: Path | None = None
 
-    def go(self, number: int, each: Round) -> RoundResult:
-        """One round."""
+    def run_round(self, number: int, each: Round) -> RoundResult:
+        """Run one round."""
         place, label = self.folder / f"round-{number}", f"round {number}"
+        # drive: the expert, later the last driver and the expert in turns (DAgger)
         files = self._collect(each, place / "episodes", label)
         if number == 0:
             self.held_out = held_out_files(files)
         fresh = [file for file in files if file not in self.held_out]
         self.learned += fresh * each.repeat
+        # learn from everything collected so far, from the last weights on
         self.start, log = self._train(each, place, label)
         self.driver = place / "driver.onnx"
         if not self.driver.exists():
             write(load(self.start, self.course.config), self.driver)
-        scores = self._try(self.driver, place / "trial", label)
+        # drive routes that were never learned from, for the log
+        scores = self._evaluate(self.driver, place / "trial", label)
         row = {"learned_frames": frames_in(self.learned), **trial.row_of(scores)}
         log.add("closed_loop", each.trainings[-1].steps, row)
         return RoundResult(self.driver, scores, log.path)
@@ -138,39 +143,45 @@ class _Way:
             expert_share=each.expert_share,
             student=None if student is None else sha256_of(student),
         )
-        tell = self._teller(f"{label}: driving")
+        on_done = self._progress(f"{label}: driving")
         collect(
-            folder, what, student, self.workers, lambda now: tell(now.done, now.total)
+            folder,
+            what,
+            student,
+            self.workers,
+            lambda now: on_done(now.done, now.total),
         )
         return episodes_in(folder)
 
     def _train(self, each: Round, place: Path, label: str) -> tuple[Path, Log]:
-        """All stages: the checkpoint and the log of the last."""
+        """Run all stages and return the last one's checkpoint and log."""
         made, config = list[Path](), self.course.config
         for number, training in enumerate(each.trainings):
-            tell = self._teller(f"{label}: training {number + 1}/{len(each.trainings)}")
+            on_done = self._progress(
+                f"{label}: training {number + 1}/{len(each.trainings)}"
+            )
             folder = place / f"training-{number}"
             files = (self.learned, self.held_out)
             start = made[-1] if made else self.start
-            made.append(train(training, config, *files, start, folder, tell))
+            made.append(train(training, config, *files, start, folder, on_done))
         return made[-1], Log(made[-1].with_name(LOG))
 
-    def _try(self, driver: Path, folder: Path, label: str) -> Scores:
+    def _evaluate(self, driver: Path, folder: Path, label: str) -> Scores:
         what, path = self.course.trial, self.folder / "trial.json"
-        tell = self._teller("finding routes to try the driver on")
-        routes = trial.routes_of(what, path, self.workers, tell)
-        tell = self._teller(f"{label}: trying the driver")
-        return trial.drive(driver, routes, folder, self.workers, tell, self.latency)
+        on_done = self._progress("finding routes for the trial")
+        routes = trial.routes_of(what, path, self.workers, on_done)
+        on_done = self._progress(f"{label}: driving the trial")
+        return trial.drive(driver, routes, folder, self.workers, on_done, self.latency)
 
-    def _teller(self, what: str) -> Callable[[int, int], None]:
-        return lambda done, total: self.on_news(CourseProgress(what, done, total))
+    def _progress(self, what: str) -> Callable[[int, int], None]:
+        return lambda done, total: self.on_progress(CourseProgress(what, done, total))
 
 
 def load(checkpoint: Path, config: HighwayConfig) -> Highway:
-    """The driver of a checkpoint: its averaged weights.
+    """Return the driver of a checkpoint, with its averaged weights.
 
     Raises:
-        TrainingError: it is no checkpoint, or one of another model.
+        TrainingError: it is not a checkpoint, or one of another model.
     """
     model = Highway(config)
     fit(model, Start.load(checkpoint).mean, checkpoint)
@@ -178,7 +189,7 @@ def load(checkpoint: Path, config: HighwayConfig) -> Highway:
 
 
 def episodes_in(folder: Path) -> list[Path]:
-    """The episodes of a folder, in order, drafts left out."""
+    """Return the episodes of a folder, in order, without drafts."""
     return sorted(
         file for file in folder.glob("*.npz") if not file.name.startswith(".")
     )
@@ -188,7 +199,7 @@ def claim(folder: Path, course: Course) -> None:
     """Make a folder that of a course, or check that it is.
 
     Raises:
-        TrainingError: it is another one's, or holds something else.
+        TrainingError: it belongs to another one, or holds something else.
         OSError: it cannot be written.
     """
     manifest = folder / MANIFEST
@@ -206,13 +217,13 @@ def claim(folder: Path, course: Course) -> None:
     if (words := difference(before, asdict(course))) is not None:
         name, old, new = words
         raise TrainingError(
-            f"{folder}: another course was begun here: its {name} is {old}, this one's "
-            f"{new}; take another folder, or the same options"
+            f"{folder}: holds another course: its {name} is {old}, this one's {new}; "
+            "choose another folder, or the same options"
         )
 
 
 def frames_in(files: Iterable[Path]) -> int:
-    """How many samples different episodes hold, six camera images each.
+    """Return how many camera frames distinct episodes hold, six images each.
 
     Raises:
         TrainingError: a file is not an episode.

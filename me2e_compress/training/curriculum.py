@@ -12,8 +12,8 @@ from me2e_compress.training.process import Training
 from me2e_compress.zoo.highway.config import HighwayConfig
 
 HELD_OUT_FIRST, HELD_OUT_EVERY = 7, 28
-"""Of the expert's episodes these are only looked at: one of every other type, where
-there are 14 of each."""
+"""Which of the expert's episodes are held out: one of every other type, where there
+are 14 of each."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Round:
     Attributes:
         seed: of the routes that are driven.
         variants: routes of each type.
-        expert_share: share of the driving that the expert does; less than 1 lets the
-            driver of the round before drive (DAgger, Ross et al., 2011).
-        trainings: what is learned then, one stage after the other.
+        expert_share: share of the driving that the expert does; the rest is driven by
+            the driver of the round before (DAgger, Ross et al., 2011).
+        trainings: stages of training, one after the other.
         scenarios: types of routes; empty for all 44.
         repeat: how often its episodes are among those to learn from.
     """
@@ -40,7 +40,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Trial:
-    """Fresh routes, admitted as those of the benchmark are, that nobody learns from.
+    """Fresh routes, admitted as those of the benchmark are, and never learned from.
 
     Attributes:
         seed: of the routes.
@@ -63,8 +63,8 @@ class Course:
         config: sizes of the model.
 
     Raises:
-        TrainingError: nobody could drive a round, nothing is learned in one, or the
-            trial's routes would be learned from.
+        TrainingError: no driver for a round, a round without training, or a trial on
+            routes that are learned from.
     """
 
     rounds: tuple[Round, ...]
@@ -74,18 +74,18 @@ class Course:
     def __post_init__(self) -> None:
         """Check the rounds."""
         if not self.rounds or self.rounds[0].expert_share != 1.0:
-            raise TrainingError("course: the expert drives alone in the first round")
+            raise TrainingError("course: the expert must drive the first round alone")
         for number, each in enumerate(self.rounds):
             if not each.trainings:
-                raise TrainingError(f"course: nothing is learned in round {number}")
+                raise TrainingError(f"course: round {number} has no training")
             if each.seed == self.trial.seed:
                 raise TrainingError(
-                    f"course: the trial has the seed of round {number}, {each.seed}: "
-                    "it would drive what was learned by heart"
+                    f"course: the trial and round {number} share the seed {each.seed}: "
+                    "it would drive routes that were learned from"
                 )
 
     def on(self, workers: int) -> Self:
-        """The same with at most so many processes in training."""
+        """Return the course with at most so many processes in training."""
         rounds = tuple(
             replace(
                 each,
@@ -100,7 +100,7 @@ class Course:
 
 
 def held_out_files(files: Sequence[Path]) -> list[Path]:
-    """Those of the expert's episodes that are only looked at, at least one."""
+    """Return the expert's episodes that are held out, at least one."""
     return list(files[HELD_OUT_FIRST::HELD_OUT_EVERY] or files[:1])
 
 
@@ -114,7 +114,7 @@ FULL = Course(
         Round(500, 4, 0.15, (Training(steps=600, rate=6e-4, seed=4), _PLANNER), (), 2),
     )
 )
-"""A straight way to a driver such as the one that ships; hours on four cores."""
+"""A direct way to a driver such as the one that ships; hours on four cores."""
 
 
 _FEW = ("ControlLoss", "DynamicObjectCrossing", "HighwayCutIn")
@@ -137,7 +137,7 @@ SMALL = Course(
     Trial(routes=2, scenarios=_FEW[:2]),
     HighwayConfig(stages=(8, 8, 16, 16), anchors=16),
 )
-"""A minute on two cores. Who has learned nothing stands or creeps until the rules end
-the route, after 60 to 200 s: hence the expert drives most of the second round."""
+"""A minute on two cores. A driver that has learned nothing stands or creeps until the
+route times out, after 60 to 200 s: so the expert drives most of the second round."""
 SMALL_LATENCY = FixedLatency(1_000_000)
-"""Of a decision in its trials, for the same reason: 200 are enough to get nowhere."""
+"""Of a decision in its trials, for the same reason: 200 decisions are enough."""

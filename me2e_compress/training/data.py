@@ -23,25 +23,25 @@ Indices = npt.NDArray[np.int64]
 JUNCTION = (0, 1, 2)
 """Commands given in a junction: left, right, straight."""
 SLOW_MPS = 2.0
-"""Only who is slower than this can stand within a metre of `BRAKE_MPS2`."""
+"""Below this speed the ego can stop within a metre at `BRAKE_MPS2`."""
 CREEPING_MPS = 1.5
-"""Speed at the end of a plan that goes on rolling, and does not set off."""
+"""Final speed of a plan that keeps rolling and does not set off."""
 HELD_M = 2.0
-"""Without anybody there the plan would be so much longer: it waits for somebody."""
+"""A plan that would be this much longer without other road users waits for one."""
 BRAKE_MPS2 = 2.0
 """A comfortable stop."""
 
 
 def is_creeping(moves: Floats, tables: dict[str, Array], alone: Floats) -> Flags:
-    """Which plans roll on slowly towards somebody who has to be let by.
+    """Return which plans roll on slowly towards road users who have priority.
 
-    The expert weighs such a plan afresh at every frame and knows everybody's speed to
-    the centimetre; who imitates it rolls a little faster, and into the conflict.
+    The expert reconsiders such a plan at every frame and knows every speed exactly; an
+    imitator rolls a little faster, and into the conflict.
 
     Args:
         moves: [N, 6, 2] metres along the route and aside.
         tables: ``can_bus`` and ``command`` of N samples.
-        alone: [N, 6, 2] the plans without anybody, in the ego frame.
+        alone: [N, 6, 2] the plans without other road users, in the ego frame.
     """
     arc = moves[..., 0]
     slow = tables["can_bus"][:, 7] < SLOW_MPS
@@ -51,7 +51,7 @@ def is_creeping(moves: Floats, tables: dict[str, Array], alone: Floats) -> Flags
 
 
 def shortened_to_stop(plans: Floats, speed_mps: Floats) -> Floats:
-    """The same plans, shortened to a comfortable stop.
+    """Return the plans, shortened to a comfortable stop.
 
     Args:
         plans: [N, 6, 2] of any frame that begins where the ego is.
@@ -67,10 +67,10 @@ def shortened_to_stop(plans: Floats, speed_mps: Floats) -> Floats:
 
 
 DECISIVE_M = 0.5
-"""A plan that the actors change by more than this, on average over its waypoints, is
-decided by them: half a second at walking speed, or half a car's width aside."""
+"""Actors that change a plan by more than this, on average over its waypoints, decide
+it: half a second at walking speed, or half a car's width aside."""
 VERY_DECISIVE_M = 2.0
-"""Half a car's length: braking for somebody, or going around."""
+"""Half a car's length: braking for an actor, or going around it."""
 LINE_NEAR_M = 25.0
 """A stop line this near decides: braking at 2 m/s^2 from 10 m/s takes 25 m."""
 CHANGE_M = 1.0
@@ -95,7 +95,7 @@ class Sequences:
 
 
 class Episodes:
-    """Everything of some episodes, pictures still compressed."""
+    """All samples of some episodes, pictures still compressed."""
 
     def __init__(self, files: Sequence[Path], image_size: tuple[int, int]) -> None:
         """Read episodes.
@@ -105,11 +105,11 @@ class Episodes:
             image_size: rows and columns of a camera that the model sees.
 
         Raises:
-            TrainingError: there is none, one is not an episode, or its cameras are
+            TrainingError: there are none, one is not an episode, or its cameras are
                 laid out otherwise.
         """
         if not files:
-            raise TrainingError("there is no episode to learn from")
+            raise TrainingError("there are no episodes to learn from")
         times = Counter(files)
         episodes = [read(file, image_size) for file in times]
         self.pictures = [one for each in episodes for one in each.pictures]
@@ -129,7 +129,7 @@ class Episodes:
         self.shift_m: Floats = shift.mean(-1)
 
     def _stop_for_others(self) -> None:
-        """Let those who creep in a junction stand."""
+        """Turn plans that creep in a junction into stops."""
         rows = is_creeping(self.moves, self.tables, self.tables["plan_alone"])
         speed = self.tables["can_bus"][rows, 7]
         self.moves[rows] = shortened_to_stop(self.moves[rows], speed)
@@ -140,11 +140,11 @@ class Episodes:
         return len(self.last)
 
     def forget_pictures(self) -> None:
-        """Make room: from now on only the rows are asked for."""
+        """Free the pictures: from now on only the rows are needed."""
         self.pictures.clear()
 
     def departures(self) -> Floats:
-        """[N, 6, 2] the expert's plans less going on at the speed of now."""
+        """Return [N, 6, 2], the expert's plans minus coasting at the present speed."""
         times = STEP_S * np.arange(1, self.moves.shape[1] + 1)
         speed = self.tables["can_bus"][:, 7, None]
         coasting = np.stack([speed * times, np.zeros_like(speed * times)], -1)
@@ -152,7 +152,7 @@ class Episodes:
 
     @cached_property
     def weights(self) -> Floats:
-        """How often each sample is drawn: more where something decides or changes."""
+        """Probability of each sample: more where something decides or changes."""
         command, signals = self.tables["command"], self.tables["signals"]
         line = (signals[..., 0] >= 0) & (np.abs(signals[..., 6]) < LINE_NEAR_M)
         weight = 1.0 + 2.0 * (self.shift_m > DECISIVE_M)
@@ -165,7 +165,7 @@ class Episodes:
         return np.asarray(weight / weight.sum())
 
     def draw(self, rng: np.random.Generator, count: int, how: Sequences) -> Indices:
-        """[count, length] samples of one episode each, in order."""
+        """Draw [count, length] samples, each row in order from one episode."""
         stride = rng.choice(how.strides, count)
         last = rng.choice(len(self), count, p=self.weights)
         steps = np.arange(how.length) - (how.length - 1)
@@ -175,16 +175,16 @@ class Episodes:
         return np.asarray(np.minimum(picked, self.last[last][:, None]))
 
     def images(self, picked: Indices) -> Bytes:
-        """[n] samples to uint8 [n, 6, H, W, 3]."""
+        """Decode the images of [n] samples: uint8 [n, 6, H, W, 3]."""
         return np.stack([decode(self.pictures[i]) for i in picked])
 
     def rows(self, picked: npt.NDArray[np.int64]) -> dict[str, Array]:
-        """Rows of [B] samples as [B, ...]."""
+        """Return the rows of [B] samples as [B, ...]."""
         rows = {name: table[picked] for name, table in self.tables.items()}
         return {**rows, "moves": self.moves[picked], "shift_m": self.shift_m[picked]}
 
     def batch(self, picked: Indices) -> dict[str, Array]:
-        """Rows of [B, L] samples as [B, L, ...].
+        """Return the rows of [B, L] samples as [B, L, ...].
 
         Besides `KEPT`: ``moves``, the expert's plan as metres along the route and to
         the left of where the ego is beside it; ``shift_m``, how much the actors change

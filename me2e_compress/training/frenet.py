@@ -12,7 +12,7 @@ ASIDE = 2.0
 
 
 def project(points: Floats, path: Floats) -> Floats:
-    """Arc length and offset of points beside a route.
+    """Return the arc length and offset of points beside a route.
 
     Args:
         points: [N, T, 2] metres.
@@ -37,7 +37,7 @@ def project(points: Floats, path: Floats) -> Floats:
 
 
 def anchors_of(plans: Floats, count: int, rounds: int = 15) -> Floats:
-    """Typical plans: k-means from a farthest-point start, so rare ones keep a place.
+    """Return typical plans: k-means from a farthest-point start that keeps rare ones.
 
     Args:
         plans: [N, T, 2] arc lengths and offsets.

@@ -1,4 +1,4 @@
-"""What a batch should say: the labels of every module as tensors."""
+"""Labels of every module as tensors."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from me2e_compress.zoo.highway.config import SIGNAL_KINDS, BevArea
 
 SIGNAL_SEEN_M = (-3.0, 40.0)
 """A signal is there if its line is this far from the ego's centre: a lamp farther than
-that is under two pixels wide, and behind the front axle nobody stops for it."""
+that is under two pixels wide, and behind the front axle it no longer matters."""
 WIDEST_M = 12.0
 """More free road to a side than three lanes is as good as three lanes."""
 ROAD = (
@@ -103,7 +103,7 @@ def labels_of(batch: dict[str, Array], area: BevArea) -> Labels:
 
 
 def raster_of(ground: Tensor) -> Tensor:
-    """Classes [B, H, W] of `PixelClass` to road, shoulder, marking, stop line."""
+    """Convert `PixelClass` [B, H, W] to road, shoulder, marking, stop line."""
     layers = [
         torch.isin(ground, torch.tensor(ROAD)),
         ground == PixelClass.SHOULDER,
@@ -114,7 +114,7 @@ def raster_of(ground: Tensor) -> Tensor:
 
 
 def signals_of(signals: Tensor) -> Tensor:
-    """The nearest signal of each kind on the route: [B, S, 8] to [B, 3, 3]."""
+    """Return the nearest signal of each kind on the route: [B, S, 8] to [B, 3, 3]."""
     gap = signals[..., 6]
     low, high = SIGNAL_SEEN_M
     found = torch.zeros(len(signals), SIGNAL_KINDS, 3)

@@ -1,4 +1,4 @@
-"""What training says of itself: one JSON object a line."""
+"""The log of training: one JSON object a line."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ Row = dict[str, Any]
 
 
 class Log:
-    """A log that is whole after any interruption, and tells nothing twice.
+    """A log that stays complete after any interruption, without duplicates.
 
     Rows have ``what`` (``losses`` or ``closed_loop``) and ``step``, and one row of each
     step and kind.
@@ -26,10 +26,10 @@ class Log:
         self.path = path
 
     def rows(self) -> list[Row]:
-        """All rows, in order.
+        """Return all rows, in order.
 
         Raises:
-            TrainingError: the file is no log.
+            TrainingError: the file is not a log.
         """
         if not self.path.exists():
             return []
@@ -46,7 +46,7 @@ class Log:
         self._write([*kept, {"what": what, "step": step, **row}])
 
     def rewind(self, step: int) -> None:
-        """Forget what was said after a step: it is done again."""
+        """Drop the rows after a step: those steps are run again."""
         rows = self.rows()
         kept = [row for row in rows if row["step"] <= step]
         if kept != rows:

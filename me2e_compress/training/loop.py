@@ -24,9 +24,9 @@ from me2e_compress.zoo.highway.config import HighwayConfig
 __all__ = ["Training", "train"]
 
 POLL_S = 0.5
-"""Between two looks at how far the processes are."""
+"""Between two checks of how far the processes are."""
 MAY_CHANGE = ("steps", "save_every", "check_every", "check_count")
-"""Of a stage that goes on: the rest decides what its checkpoint means."""
+"""Options of a stage that may change when it resumes."""
 
 
 def train(
@@ -40,18 +40,18 @@ def train(
 ) -> Path:
     """Run a stage, or what is left of it.
 
-    With the same arguments it comes to the same weights, however often it was
-    interrupted; another number of workers draws other batches.
+    The same arguments give the same weights, however often it was interrupted; another
+    number of workers draws other batches.
 
     Args:
         what: the stage.
         config: sizes of the model.
         files: episodes to learn from; what is named twice is drawn twice as often.
-        held_out: episodes that are only looked at.
+        held_out: episodes for validation only.
         start: checkpoint to begin with, or the one that ships
             (`me2e_compress.zoo.shipped.checkpoint`); None begins with random weights.
         folder: gets ``last.pt`` and ``log.jsonl``.
-        on_step: told now and then how many steps of how many are done.
+        on_step: called from time to time with the steps done and their total.
 
     Returns:
         The checkpoint.
@@ -88,23 +88,23 @@ def _process(rank: int, task: StageTask, group: ProcessGroup) -> None:
 
 
 def _told(error: ProcessException) -> str:
-    """The last line of what a process died of, without the name of our own errors."""
+    """Return the last line of a process's traceback, without our errors' names."""
     last = str(error).strip().splitlines()[-1]
     kind, _, words = last.partition(": ")
     return words if kind.startswith("me2e_compress.errors.") else last
 
 
 def _steps(checkpoint: Path, what: Training) -> int:
-    """How many steps a checkpoint of this stage has behind it.
+    """Return how many steps a checkpoint of this stage has taken.
 
     Raises:
-        TrainingError: it is none, or of another stage.
+        TrainingError: it is not one, or of another stage.
     """
     found = TrainingCheckpoint.load(checkpoint)
     words = difference(json.loads(found.what), asdict(what), MAY_CHANGE)
     if words is not None:
         raise TrainingError(
-            f"{checkpoint}: of another training: its {words[0]} is {words[1]}, this "
+            f"{checkpoint}: of another stage: its {words[0]} is {words[1]}, this "
             f"one's {words[2]}"
         )
     return found.step

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from me2e_compress.training.process_group import ProcessGroup
 
 CLIP = 5.0
-"""Longest gradient: a batch with a wreck in it must not undo a hundred others."""
+"""Longest gradient: one outlier batch must not undo a hundred others."""
 WEIGHT_DECAY = 1e-3
 """A tenth of AdamW's default: a course is short, and the data is fresh."""
 AVERAGED = 0.998
@@ -32,7 +32,7 @@ class AveragedAdamW:
         self.adamw = torch.optim.AdamW(self.learning, rate, weight_decay=WEIGHT_DECAY)
 
     def step(self, loss: Tensor, rate: float, rank: int) -> None:
-        """Take one step down; every process must call it.
+        """Take one optimizer step; every process must call it.
 
         Args:
             loss: of this process.
@@ -58,7 +58,7 @@ class AveragedAdamW:
 
 
 class WeightAverage:
-    """Running mean of the weights (Polyak and Juditsky, 1992), which is what drives."""
+    """Running mean of the weights (Polyak and Juditsky, 1992), the ones that drive."""
 
     def __init__(self, model: nn.Module) -> None:
         """Begin with the weights of a model."""

@@ -10,7 +10,7 @@ Words = tuple[str, str, str]
 def difference(
     before: Mapping[str, Any], now: Mapping[str, Any], but: Collection[str] = ()
 ) -> Words | None:
-    """The first option that has another value: (dotted name, before, now).
+    """Return the first option that differs: (dotted name, before, now).
 
     An option that one side does not know is another value, too.
 
@@ -28,7 +28,7 @@ def difference(
 
 
 def _flat(options: Mapping[str, Any]) -> dict[str, str]:
-    """Values as JSON by dotted names, of options within options and lists of them."""
+    """Flatten options within options, and lists of them, to JSON by dotted name."""
     flat = dict[str, str]()
     for name, value in options.items():
         inner = value

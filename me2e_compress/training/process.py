@@ -1,4 +1,4 @@
-"""One of the processes that train."""
+"""One process of training."""
 
 import json
 import math
@@ -31,7 +31,7 @@ WARM_UP = 100
 LAST_SHARE = 0.01
 """Of the highest learning rate, when the cosine has come to its end."""
 SMOOTH = 0.97
-"""Decay of the losses that the log tells: they look back over about 30 steps."""
+"""Decay of the running losses in the log: they look back over about 30 steps."""
 PLANNER_ALONE = ("planner",)
 
 
@@ -46,12 +46,12 @@ class Training:
         rate: highest learning rate.
         seed: of everything random.
         save_every: steps between checkpoints.
-        check_every: steps between looks at held-out samples.
-        check_count: sequences of a look.
-        modules: which learn; empty: all. The planner alone learns from what the others
-            said once.
+        check_every: steps between validations on held-out samples.
+        check_count: sequences of a validation.
+        modules: which learn; empty: all. The planner alone learns from cached outputs
+            of the others.
         sequences: how sequences are drawn.
-        augmentation: what is made harder.
+        augmentation: of the samples.
     """
 
     steps: int
@@ -75,9 +75,9 @@ class StageTask:
         what: the stage.
         config: sizes of the model.
         files: episodes to learn from.
-        held_out: episodes that are only looked at.
-        start: checkpoint to begin with, or what is left of one (`Start`); None begins
-            with random weights.
+        held_out: episodes for validation only.
+        start: checkpoint to start from, or its `Start` alone; None starts with random
+            weights.
         folder: gets ``last.pt`` and ``log.jsonl``.
     """
 
@@ -90,7 +90,7 @@ class StageTask:
 
 
 class TrainingProcess:
-    """What one process holds while it trains."""
+    """One of the processes that train a stage together."""
 
     def __init__(self, rank: int, group: ProcessGroup, task: StageTask) -> None:
         """Read the episodes and begin, or go on where the checkpoint is.
@@ -158,7 +158,7 @@ class TrainingProcess:
             self.log.rewind(self.step)
 
     def _spent_s(self) -> float:
-        """What the log says that was spent before, seconds."""
+        """Return the seconds spent before, by the log."""
         rows = self.log.rows() if self.rank == 0 else []
         return max((row.get("seconds", 0.0) for row in rows), default=0.0)
 
@@ -166,6 +166,7 @@ class TrainingProcess:
         """Train to the end."""
         what = self.task.what
         while self.step < what.steps:
+            # losses of drawn samples, averaged gradients, a step, the running mean
             rng = np.random.default_rng([what.seed, self.step, self.rank])
             losses = self.sampled.draw(self.model, self.lamps, rng)
             self.optimizer.step(total(losses), rate_at(what, self.step), self.rank)
@@ -173,6 +174,7 @@ class TrainingProcess:
             if self.rank == 0:
                 self.average.update(self.model, self.step)
             self.step += 1
+            # validation, checkpoint and progress
             last = self.step == what.steps
             if self.step % what.check_every == 0 or last:
                 self._check()
@@ -188,7 +190,7 @@ class TrainingProcess:
             self.running[name] = SMOOTH * old + (1 - SMOOTH) * value
 
     def _check(self) -> None:
-        """Look at held-out samples with the averaged weights; log."""
+        """Validate the averaged weights on held-out samples, and log it."""
         if self.held_out is None:
             return
         mine = {k: v.clone() for k, v in self.model.state_dict().items()}
@@ -219,7 +221,7 @@ class TrainingProcess:
 
 
 def rate_at(what: Training, step: int) -> float:
-    """The learning rate of a step: it warms up, then falls along a cosine."""
+    """Return the learning rate of a step: linear warm-up, then a cosine."""
     warm = min(1.0, (step + 1) / WARM_UP)
     cosine = 0.5 * (1 + math.cos(math.pi * step / what.steps))
     return what.rate * warm * (cosine + LAST_SHARE)

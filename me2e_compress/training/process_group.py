@@ -26,7 +26,7 @@ class ProcessGroup:
     Attributes:
         rows: float32 [processes, numbers].
         barrier: all processes meet here.
-        steps: int64 [1], what the first of them has told.
+        steps: int64 [1], as the first process reported.
     """
 
     rows: Tensor
@@ -43,7 +43,7 @@ class ProcessGroup:
         return cls(rows, mp.get_context("spawn").Barrier(workers), steps)
 
     def average(self, rank: int, mine: Tensor) -> Tensor:
-        """Average one flat tensor over the processes; every process must call."""
+        """Average one flat tensor over the processes; every process must call it."""
         count = mine.numel()
         self.rows[rank, :count] = mine
         self.barrier.wait(PATIENCE_S)
@@ -52,9 +52,9 @@ class ProcessGroup:
         return found
 
     def report(self, step: int) -> None:
-        """Let the process that started the others know how many steps are done."""
+        """Report to the parent process how many steps are done."""
         self.steps[0] = step
 
     def steps_done(self) -> int:
-        """How many steps are done."""
+        """Return how many steps are done."""
         return int(self.steps[0])

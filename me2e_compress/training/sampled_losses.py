@@ -23,7 +23,7 @@ from me2e_compress.zoo.highway.stack import Highway
 GRIDS = ("raster", "occupancy")
 """Probabilities of whole grids: kept in 256 steps."""
 FRAMES = 24
-"""Looked at together."""
+"""Run together when the planner's inputs are cached."""
 
 
 @dataclass
@@ -56,7 +56,7 @@ class PlannerInputCache:
         return cls(rows)
 
     def world(self, picked: Indices) -> PlannerInput:
-        """The worlds of [B] samples."""
+        """Return the planner's inputs of [B] samples."""
         index = torch.from_numpy(picked)
         found = {}
         for name, rows in self.rows.items():
@@ -105,12 +105,12 @@ def _packed(name: str, value: Tensor) -> Tensor:
 
 
 CACHED = 4
-"""The planner alone learns from so many times more samples a step, a part at a time:
-what every candidate would meet is large, and is needed only until it is costed."""
+"""The planner alone learns from this many times more samples a step, a part at a time:
+the costs of all candidates take much memory, and only until they are summed."""
 
 
 class SampledLosses:
-    """Losses of drawn samples."""
+    """Draws samples and computes their losses."""
 
     def __init__(
         self,
@@ -127,14 +127,14 @@ class SampledLosses:
             lidar2img: [6, 4, 4].
             batch: sequences a step.
             sequences: how they are drawn.
-            augmentation: what is made harder.
+            augmentation: of the samples.
         """
         self.episodes, self.lidar2img, self.batch = episodes, lidar2img, batch
         self.sequences, self.augmentation = sequences, augmentation
         self._cache: PlannerInputCache | None = None
 
     def freeze(self, model: Highway) -> None:
-        """From now on only the planner learns: ask the other modules once."""
+        """Freeze all modules but the planner: run the others once, and cache."""
         model.eval()
         self._cache = PlannerInputCache.of(model, self.episodes, self.lidar2img)
         self.episodes.forget_pictures()
@@ -142,7 +142,7 @@ class SampledLosses:
     def draw(
         self, model: Highway, lamps: LampHead, rng: np.random.Generator
     ) -> dict[str, Tensor]:
-        """Losses by name, not weighted, of samples that ``rng`` draws."""
+        """Draw samples with ``rng`` and return their losses by name, not weighted."""
         torch.manual_seed(int(rng.integers(2**31)))
         if self._cache is not None:
             return self._of_planner(model, self._cache, rng)
@@ -151,7 +151,7 @@ class SampledLosses:
     def _of_all(
         self, model: Highway, lamps: LampHead, rng: np.random.Generator
     ) -> dict[str, Tensor]:
-        """Losses of all modules on sequences."""
+        """Return the losses of all modules on sequences."""
         picked = self.episodes.draw(rng, self.batch, self.sequences)
         images = self.episodes.images(picked.ravel())
         images = images.reshape(*picked.shape, *images.shape[1:])
@@ -163,7 +163,7 @@ class SampledLosses:
     def _of_planner(
         self, model: Highway, cache: PlannerInputCache, rng: np.random.Generator
     ) -> dict[str, Tensor]:
-        """Losses of the planner on what the frozen modules once said."""
+        """Return the losses of the planner on the cached outputs of the others."""
         count = self.batch * self.sequences.length * CACHED
         picked = self.episodes.draw(rng, count, Sequences(length=1))[:, 0]
         model.eval()

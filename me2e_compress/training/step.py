@@ -20,7 +20,7 @@ from me2e_compress.training.losses.detection_losses import match
 from me2e_compress.training.stored_episode import Array
 from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of
 from me2e_compress.zoo.highway.interfaces import Candidates, EgoState, PlannerInput
-from me2e_compress.zoo.highway.stack import STOOD_S, Highway, Seen
+from me2e_compress.zoo.highway.stack import STOOD_S, Highway, ModuleOutputs
 
 MEAN, STD = 110.0, 60.0
 """Grey levels: about the mean and spread of the rendered images."""
@@ -51,13 +51,13 @@ WEIGHTS = {
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What is made harder in training.
+    """Augmentation of the training samples.
 
     Attributes:
         light: spread of brightness and contrast.
         speed_mps: noise of the measured speed.
-        forget: share whose memory of standing is lost.
-        hints: share whose agents are certainly among the queries.
+        forget: share of samples that lose the memory of standing.
+        hints: share of samples whose agents are certain to be among the queries.
         no_occ: share that plan on the mean occupancy, so that boxes are used too.
     """
 
@@ -73,18 +73,18 @@ NO_AUGMENTATION = Augmentation(0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass
 class StepOutcome:
-    """What came of a batch.
+    """The outcome of a batch.
 
     Attributes:
         losses: by name, not weighted.
         seen: outputs of the modules.
-        world: what the planner read.
-        candidates: what it considered.
+        world: inputs of the planner.
+        candidates: of the planner.
         wanted: the labels.
     """
 
     losses: dict[str, Tensor]
-    seen: Seen
+    seen: ModuleOutputs
     world: PlannerInput
     candidates: Candidates
     wanted: Labels
@@ -97,14 +97,14 @@ def run_planner(
     rng: np.random.Generator,
     how: Augmentation,
 ) -> dict[str, Tensor]:
-    """Run the planner alone on what the other modules said, and return its losses.
+    """Run the planner alone on cached outputs of the other modules; return its losses.
 
     Args:
         model: the stack.
         world: of B samples.
         batch: arrays [B, ...].
-        rng: for the augmentation.
-        how: what to make harder.
+        rng: of the augmentation.
+        how: the augmentation.
     """
     wanted = labels_of(batch, model.config.area)
     with torch.autocast("cpu", torch.bfloat16):
@@ -115,7 +115,7 @@ def run_planner(
 
 
 def total(losses: Mapping[str, Tensor]) -> Tensor:
-    """Weighted sum of losses."""
+    """Return the weighted sum of losses."""
     return torch.stack([WEIGHTS[name] * loss for name, loss in losses.items()]).sum()
 
 
@@ -136,19 +136,22 @@ def run(
         images: uint8 [B, L, 6, H, W, 3].
         batch: arrays [B, L, ...] of `Episodes.batch`.
         lidar2img: [6, 4, 4].
-        rng: for the augmentation.
-        how: what to make harder.
+        rng: of the augmentation.
+        how: the augmentation.
     """
     flat = {name: rows.reshape(-1, *rows.shape[2:]) for name, rows in batch.items()}
     wanted = labels_of(flat, model.config.area)
     count = len(wanted.command)
     calibration = lidar2img.expand(count, -1, -1, -1)
     with torch.autocast("cpu", torch.bfloat16):
+        # cameras to bird's-eye view, the memory fed forward through each sequence
         fine, middle = model.look(pixels_of(images, rng, how))
         now = model.bev_encoder.look(fine, calibration)
         bev = model.bev_encoder.fuse(remember(model, now.float(), batch))
+        # the task modules, on all frames at once
         hints = _hints(wanted, model.config.area.cells, rng, how)
         seen = model.understand(bev, model.bev_encoder.tokens(bev), middle, hints)
+        # the planner, on augmented inputs
         world = model.world(seen, wanted.command)
         world = _without_occ(world, rng, how)
         ego = _ego(flat, rng, how)
@@ -167,7 +170,7 @@ def run(
 
 
 def _settled(world: PlannerInput) -> PlannerInput:
-    """The planner bends its own plans, not the map under them."""
+    """Detach the map from the planner's loss: it refines plans, not the map."""
     return replace(
         world,
         lateral=world.lateral.detach(),
@@ -177,7 +180,7 @@ def _settled(world: PlannerInput) -> PlannerInput:
 
 
 def pixels_of(images: Array, rng: np.random.Generator, how: Augmentation) -> Tensor:
-    """uint8 [B, L, 6, H, W, 3] to the model's input [B * L, 6, 3, H, W]."""
+    """Convert uint8 [B, L, 6, H, W, 3] to the model's input [B * L, 6, 3, H, W]."""
     count = images.shape[0] * images.shape[1]
     pixels = torch.from_numpy(images).flatten(0, 1).permute(0, 1, 4, 2, 3)
     spread = rng.normal(0, how.light, (2, count, 6, 1, 1, 1))

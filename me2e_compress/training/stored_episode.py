@@ -83,7 +83,7 @@ def read(file: Path, image_size: tuple[int, int]) -> Stored:
 
 
 def samples_in(file: Path) -> int:
-    """How many samples an episode holds.
+    """Return how many samples an episode holds.
 
     Raises:
         TrainingError: it is not an episode.
@@ -92,7 +92,7 @@ def samples_in(file: Path) -> int:
 
 
 def _arrays(file: Path, names: tuple[str, ...]) -> dict[str, Array]:
-    """What is read of a file; nothing is known of it yet but the names."""
+    """Read arrays of a file, which need not be an episode."""
     try:
         with file.open("rb") as source:
             content = np.load(source)

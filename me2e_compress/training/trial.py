@@ -29,17 +29,17 @@ OnDone = Callable[[int, int], None]
 def routes_of(
     what: Trial, path: Path, workers: int, on_done: OnDone
 ) -> tuple[Route, ...]:
-    """The routes of a trial, from its file once they are found.
+    """Return the routes of a trial, from its file once they were found.
 
     Args:
         what: the trial.
         path: their manifest; written if it is not there.
         workers: processes.
-        on_done: told how many types of how many have theirs.
+        on_done: called with the types done and their total.
 
     Raises:
-        TrainingError: one of them is a route that ships: those are for judging.
-        EvaluationError: a type has no such routes, or the manifest is none.
+        TrainingError: one of them is a route that ships: those are for evaluation.
+        EvaluationError: a type has no such routes, or the manifest is not one.
     """
     if path.exists():
         return load_routes(path)
@@ -54,8 +54,8 @@ def routes_of(
         if (route.scenario, route.seed) in shipped:
             raise TrainingError(
                 f"trial: seed {what.seed} gives route "
-                f"{shipped[route.scenario, route.seed]}, which is for evaluation; take "
-                "another"
+                f"{shipped[route.scenario, route.seed]}, which is for evaluation; "
+                "choose another"
             )
     picked = pick_routes(found, str(what.routes))
     save_routes(picked, path)
@@ -77,7 +77,7 @@ def drive(
         routes: of the trial.
         folder: for the results.
         workers: processes.
-        on_done: told how many routes of how many are driven.
+        on_done: called with the routes done and their total.
         latency: what a decision costs.
 
     Raises:
@@ -85,7 +85,7 @@ def drive(
             killed.
     """
 
-    def tell(progress: DrivingProgress) -> None:
+    def on_progress(progress: DrivingProgress) -> None:
         on_done(progress.done, progress.total)
 
     who = OnnxDriver(driver)
@@ -95,13 +95,13 @@ def drive(
         folder,
         len(routes),
         LocalEngine(workers),
-        tell,
+        on_progress,
     )
     return score(tuple(evaluator.episodes()), len(routes))
 
 
 def row_of(scores: Scores) -> dict[str, Any]:
-    """What the log tells: driving score and success rate, percent, 95 % intervals."""
+    """Return the log's row: driving score and success rate, percent, 95 % intervals."""
     return {
         "routes": scores.routes,
         "driving_score_percent": _brief(scores.driving_score),
@@ -110,6 +110,6 @@ def row_of(scores: Scores) -> dict[str, Any]:
 
 
 def _brief(estimate: Estimate) -> list[float | None]:
-    """Mean, lower end, upper end."""
+    """Return mean, lower and upper bound."""
     numbers = (estimate.value, estimate.low, estimate.high)
     return [None if number is None else round(number, 2) for number in numbers]

@@ -1,4 +1,4 @@
-"""How a model does on samples that it never learned from."""
+"""Validation: losses and plan displacements on held-out samples."""
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ def validate(
     count: int = 240,
     batch: int = 10,
 ) -> dict[str, float]:
-    """Mean losses and plan displacements (m) over a fixed draw of sequences.
+    """Return mean losses and plan displacements (m) on held-out sequences.
 
     Args:
         model: in evaluation mode.

@@ -66,7 +66,7 @@ def export(
 
 
 def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Path:
-    """Write what was traced and what it says of itself; give the path.
+    """Write a traced graph with its metadata, and return the path.
 
     Args:
         graph: Gets the metadata.
@@ -84,7 +84,7 @@ def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Pat
 def build(
     stack: str, *, opset: int = 17, seed: int = 0, heads: "HeadsName" = "nuscenes"
 ) -> "nn.Module":
-    """The torch module of a stack, initialised from a seed and ready to run.
+    """Return the torch module of a stack, initialised from a seed, ready to run.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -92,7 +92,7 @@ def build(
     """
     if find(stack).trained:
         raise GraphError(
-            f"{stack} is trained, a seed does not make it: zoo.shipped has its file"
+            f"{stack} has trained weights, not a seed's: zoo.shipped has its file"
         )
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
@@ -136,7 +136,7 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
 
 
 def example(spec: Stack) -> "tuple[Tensor, ...]":
-    """Zeros in the shapes and types of the inputs: a trace looks at nothing else."""
+    """Return zeros in the shapes and types of the inputs, all that a trace needs."""
     import torch
 
     types = {"float32": torch.float32, "int64": torch.int64}
@@ -148,7 +148,7 @@ def example(spec: Stack) -> "tuple[Tensor, ...]":
 
 @contextmanager
 def _quiet_exporter() -> Iterator[None]:
-    """Silence what torch says of its exporter, and of traced shapes; nothing else."""
+    """Silence torch's warnings about its exporter and traced shapes; nothing else."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You are using the legacy TorchScript")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")

@@ -8,7 +8,7 @@ from me2e_compress.errors import GraphError
 
 
 def write(path: Path, content: bytes) -> Path:
-    """Write a file, and its folder where there is none; give the path.
+    """Write a file, and its folder where there is none, and return the path.
 
     Args:
         path: The file; replaced in one step.

@@ -1,4 +1,4 @@
-"""Trained models that come with the package, each beside a card that vouches for it."""
+"""Trained models that come with the package, each with a card and digests."""
 
 import functools
 import hashlib
@@ -68,7 +68,7 @@ class ModelCard(pydantic.BaseModel):
         """Read a card.
 
         Raises:
-            GraphError: the file is missing or no card.
+            GraphError: the file is missing or not a card.
         """
         try:
             return cls.model_validate_json(path.read_bytes(), strict=True)
@@ -81,7 +81,7 @@ class ModelCard(pydantic.BaseModel):
 
 
 def card(name: str, folder: Path | None = None) -> ModelCard:
-    """Give the card of a shipped model.
+    """Return the card of a shipped model.
 
     Raises:
         GraphError: no such model, or its card is missing or malformed.
@@ -92,7 +92,7 @@ def card(name: str, folder: Path | None = None) -> ModelCard:
 
 
 def shipped(name: str, folder: Path | None = None) -> Path:
-    """Give the file of a shipped model, once its digest agrees with its card.
+    """Return the file of a shipped model, once its digest matches its card.
 
     A process checks a file once.
 
@@ -107,7 +107,7 @@ def shipped(name: str, folder: Path | None = None) -> Path:
 
 
 def checkpoint(name: str, folder: Path | None = None) -> Path:
-    """Give the weights of a shipped model as training goes on from them.
+    """Return the weights of a shipped model as training goes on from them.
 
     It is a file of `me2e_compress.training.checkpoint.Start`.
 
@@ -121,7 +121,7 @@ def checkpoint(name: str, folder: Path | None = None) -> Path:
     folder = folder or WEIGHTS
     expected = card(name, folder).checkpoint_sha256
     if expected is None:
-        raise GraphError(f"{name}: its card knows no checkpoint")
+        raise GraphError(f"{name}: its card names no checkpoint")
     return _same(folder / f"{name}.pt", expected)
 
 
@@ -168,7 +168,7 @@ def _same(path: Path, expected: str) -> Path:
 
 
 def copy(name: str, target: Path, folder: Path | None = None) -> Path:
-    """Write a copy of a shipped model, replaced in one step; give its path.
+    """Write a copy of a shipped model, replaced in one step, and return its path.
 
     Raises:
         GraphError: as `shipped`, or ``target`` is the shipped file itself or cannot be

@@ -1,4 +1,4 @@
-"""What the zoo holds: the face of every stack, without its torch code."""
+"""The stacks of the zoo: inputs, outputs and conventions, without their torch code."""
 
 import json
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ class Stack:
     """Inputs, outputs and conventions of a stack.
 
     Attributes:
-        name: What the command line calls it.
+        name: Its name on the command line.
         inputs: Shapes by input name.
         outputs: Names of the outputs, in order.
         recurrent: Output that answers each recurrent input.
@@ -61,7 +61,7 @@ class Stack:
     trained: bool = False
 
     def metadata(self, heads: str | None = None) -> dict[str, str]:
-        """What the exported file says of itself, as ONNX metadata properties.
+        """Return the ONNX metadata properties that describe the exported file.
 
         Args:
             heads: Key of `default_mode`; None where the plan has one row.
@@ -144,13 +144,13 @@ HIGHWAY = Stack(
     trained=True,
 )
 """The toolkit's own driver: the policy contract of highway-env, 32 x 24 cells of 64
-channels and how well each is known, and two numbers that it remembers of the ego."""
+channels and how well each is known, and two numbers of memory about the ego."""
 
 STACKS: dict[str, Stack] = {stack.name: stack for stack in (VAD_TINY, HIGHWAY)}
 
 
 def find(name: str) -> Stack:
-    """The stack of that name.
+    """Return the stack of that name.
 
     Raises:
         GraphError: There is none.

@@ -56,14 +56,14 @@ class Pinhole:
     intrinsics: Array
 
     def lidar2img(self) -> Array:
-        """[4, 4]: lidar metres to (u * depth, v * depth, depth, 1)."""
+        """Return [4, 4]: lidar metres to (u * depth, v * depth, depth, 1)."""
         out = np.eye(4, dtype=np.float32)
         out[:3, :3] = self.intrinsics @ self.to_camera
         out[:3, 3] = -out[:3, :3] @ self.position
         return out
 
     def rays(self) -> Array:
-        """[360, 640, 3]: directions through the pixel centres, depth 1, lidar frame."""
+        """Return [360, 640, 3] rays through the pixel centres, depth 1, lidar frame."""
         focal, cx, cy = (
             self.intrinsics[0, 0],
             self.intrinsics[0, 2],
@@ -76,7 +76,7 @@ class Pinhole:
 
 @cache
 def rig() -> tuple[Pinhole, ...]:
-    """The six cameras, in the order of the image input."""
+    """Return the six cameras, in the order of the image input."""
     cameras = []
     for _, yaw_deg, position, (focal, cx, cy) in MOUNTS:
         yaw = math.radians(yaw_deg)
@@ -128,7 +128,7 @@ def render(
 def _background(
     world: SyntheticWorld, ego: EgoPose, camera: Pinhole, rays: Array
 ) -> tuple[Array, Array]:
-    """Sky and ground: colour [360, 640, 3] and depth [360, 640]."""
+    """Draw sky and ground: colour [360, 640, 3] and depth [360, 640]."""
     rise = np.clip(rays[..., 2:] / 0.5, 0, 1)
     colour = SKY_LOW * (1 - rise) + SKY_HIGH * rise
     depth = np.full(rays.shape[:2], np.float32(0))
@@ -176,7 +176,7 @@ def _draw(
 
 
 def _window(box: Cuboid, ego: EgoPose, camera: Pinhole) -> tuple[slice, slice] | None:
-    """Rows and columns that the box may touch, or None."""
+    """Return the rows and columns that the box may touch, or None."""
     x, y, z = box.corners()
     right, ahead = ego.to_lidar(x, y)
     points = np.stack([right, ahead, z - LIDAR_HEIGHT_M], -1) - camera.position

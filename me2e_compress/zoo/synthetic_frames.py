@@ -31,7 +31,9 @@ def frames(spec: Stack, n: int, seed: int, scene_length: int = 8) -> Iterator[Fr
         FramesError: A count below 1.
     """
     if n < 1 or scene_length < 1:
-        raise FramesError(f"{n} frames in scenes of {scene_length}: both must be >= 1")
+        raise FramesError(
+            f"{n} frames in scenes of {scene_length}: both must be at least 1"
+        )
     lidar2img = np.stack([camera.lidar2img() for camera in rig()])[None]
     for scene, start in enumerate(range(0, n, scene_length)):
         world = draw_world(np.random.default_rng([seed, scene]))
@@ -49,7 +51,7 @@ def frames(spec: Stack, n: int, seed: int, scene_length: int = 8) -> Iterator[Fr
 def _normalise(
     spec: Stack, seen: NDArray[np.uint8], noise: np.random.Generator
 ) -> NDArray[np.float32]:
-    """[6, h, w, 3] RGB pixels to the image input, padded with zeros below."""
+    """Turn [6, h, w, 3] RGB pixels into the image input, zero-padded below."""
     grain = noise.normal(0, SENSOR_NOISE, seen.shape[:3])[..., None]
     pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
     mean = np.array(spec.image.mean, np.float32)
@@ -61,7 +63,7 @@ def _normalise(
 
 
 def _can_bus(world: SyntheticWorld, step: int) -> NDArray[np.float32]:
-    """What the vehicle says of its motion, [18] float32.
+    """Return the vehicle's motion as CAN bus, [18] float32.
 
     0-2 metres moved since the last frame (world axes), 3-6 quaternion, 7 speed, 10-12
     acceleration, 13-15 angular rate, 16 yaw in radians, 17 change of yaw in degrees;
@@ -86,7 +88,7 @@ TINT = 22.0
 
 
 def draw_world(rng: np.random.Generator) -> SyntheticWorld:
-    """A road with 8 to 12 vehicles, parked ones, buildings, people and cones."""
+    """Draw a road with 8 to 12 vehicles, parked ones, buildings, people and cones."""
     bend = float(rng.uniform(-0.008, 0.008))
     speed_mps = float(rng.uniform(3, 10))
     boxes = [
@@ -109,18 +111,18 @@ def draw_world(rng: np.random.Generator) -> SyntheticWorld:
 
 
 def _place(bend: float, along: float, aside: float) -> tuple[float, float, float]:
-    """World x, y and yaw at a station and an offset of the road."""
+    """Return world x, y and yaw at a station and an offset of the road."""
     return along, bend * along**2 / 2 + aside, math.atan(bend * along)
 
 
 def _colour(rng: np.random.Generator, bounds: Range) -> tuple[float, float, float]:
-    """Mostly grey, as cars and houses are."""
+    """Draw a colour, mostly grey, as cars and houses are."""
     red, green, blue = np.clip(rng.uniform(*bounds) + rng.normal(0, TINT, 3), 0, 255)
     return float(red), float(green), float(blue)
 
 
 def _vehicle(rng: np.random.Generator, bend: float, ego_mps: float) -> Cuboid:
-    """One that drives; in the lane of the ego vehicle about as fast as that."""
+    """Draw a vehicle that drives; in the ego's lane about as fast as the ego."""
     lane = int(rng.integers(0, LANES)) - LANES // 2
     ahead = lane != 0 or rng.random() < 0.7
     along = float(rng.uniform(9, 60) if ahead else rng.uniform(-50, -9))
@@ -159,7 +161,7 @@ def _building(rng: np.random.Generator, bend: float) -> Cuboid:
 
 
 def _small(rng: np.random.Generator, bend: float) -> Cuboid:
-    """A pedestrian who walks along the pavement, or a cone."""
+    """Draw a pedestrian who walks along the pavement, or a cone."""
     side = 1 if rng.random() < 0.5 else -1
     x, y, yaw = _place(bend, float(rng.uniform(-20, 40)), side * rng.uniform(6, 8.5))
     if rng.random() < 0.4:

@@ -1,4 +1,4 @@
-"""A small world: a bent road with markings, vehicles that move, things that stand."""
+"""A small world: a curved road with markings, moving vehicles, static objects."""
 
 import math
 from dataclasses import dataclass, replace
@@ -35,14 +35,14 @@ class EgoPose:
     yaw: float
 
     def to_world(self, right: Array, ahead: Array) -> tuple[Array, Array]:
-        """Lidar frame (x right, y forward) to world."""
+        """Convert lidar frame (x right, y forward) to world."""
         cos, sin = np.float32(math.cos(self.yaw)), np.float32(math.sin(self.yaw))
         x = np.float32(self.x) + cos * ahead + sin * right
         y = np.float32(self.y) + sin * ahead - cos * right
         return x, y
 
     def to_lidar(self, x: float | Array, y: float | Array) -> tuple[Array, Array]:
-        """World to lidar frame (x right, y forward)."""
+        """Convert world to lidar frame (x right, y forward)."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = np.asarray(x) - self.x, np.asarray(y) - self.y
         right, ahead = sin * dx - cos * dy, cos * dx + sin * dy
@@ -68,7 +68,7 @@ class Cuboid:
     window_m: float | None = None
 
     def moved(self, seconds: float) -> "Cuboid":
-        """The same box later, straight on."""
+        """Return the same box later, straight on."""
         way = self.speed_mps * seconds
         return replace(
             self,
@@ -77,7 +77,7 @@ class Cuboid:
         )
 
     def corners(self) -> tuple[Array, Array, Array]:
-        """World x, y and height above the ground of the 8 corners."""
+        """Return world x, y and height above the ground of the 8 corners."""
         signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (0, 1)])
         a, b = signs[:, 0] * self.length / 2, signs[:, 1] * self.width / 2
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
@@ -91,7 +91,7 @@ class Cuboid:
     def paint(
         self, at: Array, half: Array, axis: NDArray[np.intp], sun: Array
     ) -> Array:
-        """Colour of points on the surface.
+        """Return the colour of points on the surface.
 
         Args:
             at: [N, 3] in the frame of the box (length, width, height).
@@ -138,7 +138,7 @@ class SyntheticWorld:
     lane_m: float
 
     def ego(self, seconds: float) -> EgoPose:
-        """Where the ego vehicle is: it keeps its lane."""
+        """Return where the ego vehicle is; it keeps its lane."""
         way = self.speed_mps * seconds + self.accel_mps2 * seconds**2 / 2
         return EgoPose(
             way,
@@ -147,11 +147,11 @@ class SyntheticWorld:
         )
 
     def boxes_at(self, seconds: float) -> tuple[Cuboid, ...]:
-        """Everything that stands or moves, at a time."""
+        """Return all boxes at a time."""
         return tuple(box.moved(seconds) for box in self.boxes)
 
     def ground(self, x: Array, y: Array) -> Array:
-        """Colour [..., 3] of the ground at world positions in metres."""
+        """Return the colour [..., 3] of the ground at world positions in metres."""
         aside = y - self.bend * x * x / 2
         away = np.abs(aside)
         edge = LANES * LANE_M / 2

@@ -35,7 +35,7 @@ NOT_COMPUTE = frozenset({"Constant", "Identity"})
 
 @dataclass(frozen=True)
 class Truth:
-    """What the trace knew.
+    """What the trace recorded.
 
     Attributes:
         modules: Module of every compute node (all but Constant and Identity), by node
@@ -51,7 +51,7 @@ class Truth:
 def record(
     stack: str, *, seed: int = 0, heads: "HeadsName" = "nuscenes", opset: int = 17
 ) -> Truth:
-    """Export twice, plainly and with marks, and run once to count.
+    """Export a stack with and without marks, and count its MACs in one run.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -102,7 +102,7 @@ def _push_scope(module: str) -> Iterator[None]:
 
 
 def count_macs(spec: Stack, model: "nn.Module") -> dict[str, int]:
-    """Multiply-accumulates of one forward pass by module.
+    """Return the multiply-accumulates of one forward pass by module.
 
     Raises:
         GraphError: Something multiplied outside of every region.

@@ -21,7 +21,7 @@ def test_a_folder_of_another_course(
     claim(tmp_path, FULL.on(4))
 
     assert command("train", "highway", "--small", "-o", tmp_path) == 1
-    words = "another course was begun here: its config.anchors is 64, this one's 16;"
+    words = "holds another course: its config.anchors is 64, this one's 16;"
     assert words in (said := capsys.readouterr().err)
     assert said.count("\n") == 1
 

@@ -117,7 +117,7 @@ def test_a_finished_course_is_not_gone_again(small: Path) -> None:
 
 def test_another_course_is_refused_there(small: Path) -> None:
     other = replace(SMALL, trial=replace(SMALL.trial, seed=901))
-    words = "another course was begun here: its trial.seed is 900, this one's 901; take"
+    words = "holds another course: its trial.seed is 900, this one's 901; choose"
     with pytest.raises(TrainingError, match=words):
         run(other, small, WORKERS)
 
@@ -247,10 +247,10 @@ ONE = Round(1, 1, 1.0, (Training(steps=1),))
 @pytest.mark.parametrize(
     ("rounds", "trial", "words"),
     [
-        ((), Trial(), "the expert drives alone in the first round"),
-        ((replace(ONE, expert_share=0.5),), Trial(), "the expert drives alone"),
-        ((ONE, replace(ONE, trainings=())), Trial(), "nothing is learned in round 1"),
-        ((ONE,), Trial(seed=1), "the trial has the seed of round 0, 1"),
+        ((), Trial(), "the expert must drive the first round alone"),
+        ((replace(ONE, expert_share=0.5),), Trial(), "the expert must drive"),
+        ((ONE, replace(ONE, trainings=())), Trial(), "round 1 has no training"),
+        ((ONE,), Trial(seed=1), "the trial and round 0 share the seed 1"),
     ],
 )
 def test_a_course_that_makes_no_sense(

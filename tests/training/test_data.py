@@ -129,7 +129,7 @@ def test_pictures_belong_to_their_samples(episodes: Episodes) -> None:
 
 
 def test_no_episode_is_an_error() -> None:
-    with pytest.raises(TrainingError, match="there is no episode to learn from"):
+    with pytest.raises(TrainingError, match="there are no episodes to learn from"):
         Episodes([], SIZE)
 
 
@@ -153,7 +153,7 @@ def without(name: str) -> dict[str, Any]:
     [
         ({"plan": np.zeros((2, 5, 2))}, r"plan is \[2, 5, 2\], with 2 pictures it"),
         ({"pose": np.zeros((1, 3))}, r"pose is \[1, 3\], with 2 pictures it must be"),
-        ({"jpeg": np.zeros(99, np.uint8)}, "is no JPEG"),
+        ({"jpeg": np.zeros(99, np.uint8)}, "is not a JPEG"),
         ({"jpeg_offsets": np.array([0])}, "with 0 pictures"),
     ],
 )

@@ -218,7 +218,7 @@ def test_a_student_of_other_images_is_refused(tmp_path: Path) -> None:
         metadata={"me2e.image": json.dumps(norm)},
     )
 
-    with pytest.raises(EvaluationError, match=r"sees images of \(32, 48\), the coll"):
+    with pytest.raises(EvaluationError, match=r"takes images of \(32, 48\), the coll"):
         collect(tmp_path / "data", taught(model), model, 1, nobody)
 
 
@@ -252,7 +252,7 @@ def test_a_student_that_is_not_there_is_an_error(tmp_path: Path) -> None:
         ({"variants": 0}, "variants is 0, it must be at least 1"),
         ({"every": 0}, "every is 0"),
         ({"noise": float("nan")}, "noise is nan"),
-        ({"expert_share": 1.5}, "expert_share is 1.5, it must be within 0 and 1"),
+        ({"expert_share": 1.5}, "expert_share is 1.5, it must be between 0 and 1"),
         ({"expert_share": 0.5}, "expert_share is 0.5 with no student"),
         ({"student": "0" * 64}, "expert_share is 1.0 with a student"),
     ],
@@ -268,5 +268,5 @@ def test_no_workers_is_an_error(tmp_path: Path) -> None:
 
 
 def test_no_jpeg_is_an_error() -> None:
-    with pytest.raises(EvaluationError, match="a picture of 8 bytes is no JPEG"):
+    with pytest.raises(EvaluationError, match="a picture of 8 bytes is not a JPEG"):
         decode(np.zeros(8, np.uint8))

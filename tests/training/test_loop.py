@@ -164,7 +164,7 @@ def test_a_stage_of_something_else_is_not_gone_on_with(
 ) -> None:
     stage(replace(task, what=replace(WHAT, steps=2))).run()
     other = replace(WHAT, rate=3e-3)
-    words = r"last\.pt: of another training: its rate is 0\.0015, this one's 0\.003"
+    words = r"last\.pt: of another stage: its rate is 0\.0015, this one's 0\.003"
     with pytest.raises(TrainingError, match=words):
         train(other, LITTLE, files[1:], files[:1], None, task.folder)
 

@@ -156,7 +156,7 @@ def test_unknown_stack(tmp_path: Path) -> None:
 
 
 def test_a_trained_stack_is_not_made_from_a_seed(tmp_path: Path) -> None:
-    with pytest.raises(GraphError, match="highway is trained, a seed does not"):
+    with pytest.raises(GraphError, match="highway has trained weights, not a seed's"):
         export("highway", tmp_path / "x.onnx")
 
 

@@ -88,7 +88,7 @@ def test_pose_round_trip() -> None:
 
 @pytest.mark.parametrize(("count", "length"), [(0, 8), (4, 0)])
 def test_no_frames_are_an_error(count: int, length: int) -> None:
-    with pytest.raises(FramesError, match="must be >= 1"):
+    with pytest.raises(FramesError, match="must be at least 1"):
         list(frames(VAD_TINY, count, seed=0, scene_length=length))
 
 

@@ -173,7 +173,7 @@ def test_the_card_says_where_its_training_is_told() -> None:
 
 
 def test_a_card_without_a_checkpoint_says_so(weights: Path) -> None:
-    with pytest.raises(GraphError, match="highway: its card knows no checkpoint"):
+    with pytest.raises(GraphError, match="highway: its card names no checkpoint"):
         checkpoint("highway", weights)
 
 

@@ -28,7 +28,7 @@ CLASSES = {
 
 
 def agents(scene: Scene, future: Sequence[Scene | None]) -> dict[str, npt.NDArray[Any]]:
-    """Arrays of the actors at one instant, see the package.
+    """Return the arrays of the actors at one instant, see the package.
 
     Args:
         scene: Now.
@@ -57,14 +57,14 @@ def agents(scene: Scene, future: Sequence[Scene | None]) -> dict[str, npt.NDArra
 
 
 def _centres(actors: Sequence[Actor], ego: Ego) -> Floats:
-    """[N, 2] centres in the ego frame."""
+    """Return [N, 2] centres in the ego frame."""
     x = np.array([actor.x for actor in actors])
     y = np.array([actor.y for actor in actors])
     return in_ego_frame(x, y, ego)
 
 
 def _nearest(scene: Scene) -> list[Actor]:
-    """At most `AGENTS` actors within `REACH_M`, the nearest first."""
+    """Return at most `AGENTS` actors within `REACH_M`, the nearest first."""
     centres = _centres(scene.actors, scene.ego)
     (back, front), (right, left) = REACH_M
     x, y = centres[:, 0], centres[:, 1]

@@ -1,4 +1,4 @@
-"""Driving the routes of a collection, several at a time."""
+"""Collects episodes: drives the routes of a collection, several at a time."""
 
 import io
 from collections.abc import Callable, Iterable, Iterator
@@ -70,7 +70,7 @@ def collect(
             killed.
     """
     if workers < 1:
-        raise EvaluationError(f"collect: {workers} workers; it takes at least one")
+        raise EvaluationError(f"collect: {workers} workers: at least one is needed")
     _check_student(what, student)
     tasks = tasks_of(what)
     claim(folder, what)
@@ -96,7 +96,7 @@ def _check_student(what: Collection, student: Path | None) -> None:
         )
     if policy.needs_images and policy.image_size != what.image_size:
         raise EvaluationError(
-            f"student {student}: sees images of {policy.image_size}, the "
+            f"student {student}: takes images of {policy.image_size}, the "
             f"collection's are {what.image_size}"
         )
 

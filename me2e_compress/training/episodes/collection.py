@@ -58,19 +58,19 @@ class Collection:
         if not 0.0 <= self.expert_share <= 1.0:
             raise EvaluationError(
                 f"collection: expert_share is {self.expert_share}, it must be "
-                "within 0 and 1"
+                "between 0 and 1"
             )
         if (self.student is None) != (self.expert_share == 1.0):
             who = "no student" if self.student is None else "a student"
             raise EvaluationError(
-                f"collection: expert_share is {self.expert_share} with {who}; it is "
-                "1 without a student and less with one"
+                f"collection: expert_share is {self.expert_share} with {who}; it must "
+                "be 1 without a student and less with one"
             )
 
 
 @dataclass(frozen=True)
 class Task:
-    """One route of a collection, not staged yet.
+    """One route of a collection, not built yet.
 
     Args:
         scenario: Its type.
@@ -83,12 +83,12 @@ class Task:
     name: str
 
     def route(self) -> Route:
-        """Stage it."""
+        """Propose the route."""
         return propose(self.scenario, self.seed, self.name)
 
 
 def tasks_of(what: Collection) -> tuple[Task, ...]:
-    """All routes of a collection, variant by variant.
+    """Return all routes of a collection, variant by variant.
 
     Raises:
         EvaluationError: One of them is a route that ships: those are for judging.
@@ -101,7 +101,8 @@ def tasks_of(what: Collection) -> tuple[Task, ...]:
             if (scenario, seed) in shipped:
                 raise EvaluationError(
                     f"collection: seed {what.seed} gives route "
-                    f"{shipped[scenario, seed]}, which is for evaluation; take another"
+                    f"{shipped[scenario, seed]}, which is for evaluation; choose "
+                    "another"
                 )
             tasks.append(Task(scenario, seed, f"{scenario}_{what.seed}_{variant:03d}"))
     return tuple(tasks)
@@ -111,7 +112,7 @@ def claim(folder: Path, what: Collection) -> None:
     """Make a folder that of a collection, or check that it is.
 
     Raises:
-        EvaluationError: It is another one's, holds something else, or cannot be
+        EvaluationError: It belongs to another one, holds something else, or cannot be
             written.
     """
     wanted = json.loads(json.dumps({"format": FORMAT, **asdict(what)}))
@@ -133,5 +134,5 @@ def claim(folder: Path, what: Collection) -> None:
         if found.get(key) != wanted.get(key):
             raise EvaluationError(
                 f"{folder}: holds another collection: its {key} is {found.get(key)}, "
-                f"this one's {wanted.get(key)}; take another folder"
+                f"this one's {wanted.get(key)}; choose another folder"
             )

@@ -45,7 +45,9 @@ STATES = {
 
 
 def signals(frame: LabelledFrame, ego_s_m: float) -> npt.NDArray[np.float32]:
-    """float32 [4, 8]: kind, state, x, y, cosine, sine, metres to the line, served.
+    """Return float32 [4, 8], a row for each signal around the ego.
+
+    Columns: kind, state, x, y, cosine, sine, metres to the line, served.
 
     Signals on the route come first, then the nearest. Kind and state are -1 where
     there is none, the metres NaN where the route does not meet the line.
@@ -90,7 +92,7 @@ def arrays_of(
     every: int,
     image_size: tuple[int, int],
 ) -> Arrays:
-    """Arrays of every ``every``-th frame, see the package.
+    """Return the arrays of every ``every``-th frame, see the package.
 
     Args:
         world: That was driven in.
@@ -124,7 +126,7 @@ def arrays_of(
 
 
 def _state(frame: LabelledFrame) -> Arrays:
-    """Ego and label."""
+    """Return the ego's state and the expert's label."""
     ego = frame.scene.ego
     return {
         "time_us": np.array(frame.scene.time_us, np.int64),
@@ -137,7 +139,7 @@ def _state(frame: LabelledFrame) -> Arrays:
 
 
 def _route(frame: LabelledFrame, path: RoutePath, top: Floats) -> Arrays:
-    """The route ahead, what the expert would do alone on it, and its signals."""
+    """Return the route ahead, the expert's plan without actors, and the signals."""
     scene, ego = frame.scene, frame.scene.ego
     s, lateral = path.project(ego.x, ego.y, frame.memory.at_m)
     alone = decide(
@@ -160,7 +162,7 @@ def _route(frame: LabelledFrame, path: RoutePath, top: Floats) -> Arrays:
 
 
 def _rests(frames: Sequence[LabelledFrame]) -> Iterator[float]:
-    """Seconds since the ego last stood, at every frame."""
+    """Yield the seconds since the ego last stood, at every frame."""
     stood_us: int | None = None
     for frame in frames:
         now = frame.scene.time_us

@@ -38,11 +38,11 @@ def decode(content: Bytes, cameras: int = 6) -> Bytes:
         cameras: K.
 
     Raises:
-        EvaluationError: It is no JPEG.
+        EvaluationError: It is not a JPEG.
     """
     stacked = cv2.imdecode(content, cv2.IMREAD_COLOR)
     if stacked is None:
-        raise EvaluationError(f"a picture of {len(content)} bytes is no JPEG")
+        raise EvaluationError(f"a picture of {len(content)} bytes is not a JPEG")
     rgb = np.asarray(cv2.cvtColor(stacked, cv2.COLOR_BGR2RGB), np.uint8)
     return rgb.reshape(cameras, -1, *rgb.shape[1:])
 

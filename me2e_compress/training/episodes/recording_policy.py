@@ -1,4 +1,7 @@
-"""A policy that remembers every frame and what the expert would do there."""
+"""A policy that records every frame with the expert's decision, and perturbs plans.
+
+Noise on the driven plan makes the data show how to return to the route.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -31,7 +34,7 @@ PAUSE_S = (0.9, 4.8)
 DRIFT_M = 1.5
 """Largest sideways shift of the last waypoint."""
 DRIFT_TRAVEL_M = 6.0
-"""A plan that goes less far than this drifts less: who stands does not creep."""
+"""A plan that goes less far than this drifts less: a stop does not creep."""
 TURN_RAD = float(np.deg2rad(8.0))
 SPEED = (0.5, 1.3)
 GROWTH = (1.0 + np.arange(PLAN_SHAPE[0])) / PLAN_SHAPE[0]
@@ -39,12 +42,12 @@ GROWTH = (1.0 + np.arange(PLAN_SHAPE[0])) / PLAN_SHAPE[0]
 
 @dataclass(frozen=True)
 class PlanNoise:
-    """What is done to a plan.
+    """A change of a plan.
 
     Attributes:
         drift_m: Metres to the left at the last waypoint, growing with time.
         turn_rad: How far the plan is turned to the left.
-        speed: What its length is multiplied by.
+        speed: Factor on its length.
     """
 
     drift_m: float = 0.0
@@ -53,7 +56,7 @@ class PlanNoise:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, strength: float) -> Self:
-        """Drift, turn or change of speed, each as likely, uniform in its range."""
+        """Draw a drift, a turn or a change of speed, each as likely, uniformly."""
         kind, side = rng.integers(3), rng.uniform(-1.0, 1.0)
         if kind == 0:
             return cls(drift_m=strength * DRIFT_M * side)
@@ -109,7 +112,7 @@ class Perturbation:
         self._burst = next(self._coming)
 
     def apply(self, plan: Plan, time_us: int) -> Plan:
-        """Return what is driven at a time; times must not decrease."""
+        """Return the plan that is driven at a time; times must not decrease."""
         while time_us >= self._burst.end_us:
             self._burst = next(self._coming)
         if self.strength == 0.0 or time_us < self._burst.begin_us:
@@ -128,9 +131,9 @@ class LabelledFrame:
     Attributes:
         scene: What there was.
         phases: The signals on the route.
-        command: What the navigator said.
+        command: The navigation command.
         memory: Of the expert, before its decision.
-        decision: Of the expert, whoever drove.
+        decision: Of the expert, even if the student drove.
     """
 
     scene: Scene
@@ -144,8 +147,8 @@ class LabelledFrame:
 class RecordingPolicy:
     """The expert decides at every frame; it or the student drives, with noise.
 
-    A student is asked at every frame, also while the expert drives, so that its
-    recurrent state never has a gap.
+    The student plans at every frame, also while the expert drives, so that its
+    recurrent state has no gaps.
 
     Args:
         seed: Of noise and turns, together with the id of the route.

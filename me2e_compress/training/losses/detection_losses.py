@@ -18,11 +18,11 @@ SHARPNESS = 2.0
 
 
 def focal_loss(logits: Tensor, peaks: Tensor, halo: Tensor) -> Tensor:
-    """Mean loss a peak.
+    """Return the penalty-reduced focal loss, mean over the peaks.
 
     Args:
         logits: [...].
-        peaks: [...] 1 where somebody is, else 0.
+        peaks: [...] 1 at an object, else 0.
         halo: [...] in [0, 1]: how far a cell beside a peak is forgiven.
     """
     probability = logits.sigmoid()
@@ -33,16 +33,16 @@ def focal_loss(logits: Tensor, peaks: Tensor, halo: Tensor) -> Tensor:
 
 
 AGENT_HALO = 0.7
-"""How far the eight cells around an agent's are forgiven."""
+"""How far the eight cells around an agent are forgiven."""
 SPEED_STEP_MPS = 2.0
 """An error of the velocity counts in steps of this, beside metres of the place: over
 the 3 s of a plan, 2 m/s are more than a car's length."""
 NEAR_M = 4.0
-"""A query this far from an agent cannot be its."""
+"""A query this far from an agent is not matched with it."""
 
 
 def match(tracks: Tracks, wanted: Labels) -> tuple[Tensor, Tensor]:
-    """Give every agent its nearest query.
+    """Match every agent with its nearest query.
 
     Returns:
         (int64 [B, Q] agent of each query, bool [B, Q] whether it has one).
@@ -66,7 +66,7 @@ def match(tracks: Tracks, wanted: Labels) -> tuple[Tensor, Tensor]:
 def track_losses(
     tracks: Tracks, wanted: Labels, area: BevArea, owner: Tensor, mine: Tensor
 ) -> dict[str, Tensor]:
-    """Detection map, presence, boxes, classes."""
+    """Return the losses of detection map, presence, boxes and classes."""
     peaks = torch.zeros(tracks.heat.shape)
     peaks = peaks.scatter_add(1, wanted.cells, wanted.there.float()).clamp(max=1)
     grid = peaks.unflatten(1, (1, area.rows, area.columns))
@@ -107,7 +107,7 @@ def track_losses(
 def motion_losses(
     futures: Futures, wanted: Labels, owner: Tensor, mine: Tensor
 ) -> dict[str, Tensor]:
-    """The best mode learns, and is to be the likeliest."""
+    """Return the losses of the futures: the best mode learns, and is the likeliest."""
     known = _pick(wanted.travel_known.float(), owner)[mine]
     aims = _pick(wanted.travel.flatten(2), owner)[mine].unflatten(-1, (-1, 2))
     said, logits = futures.travel[mine], futures.logits[mine]
@@ -156,7 +156,7 @@ class LampHead(nn.Module):
     def forward(
         self, features: Tensor, lidar2img: Tensor, wanted: Labels
     ) -> dict[str, Tensor]:
-        """Focal loss against the projected signals.
+        """Return the focal loss against the projected signals.
 
         Args:
             features: [B * 6, C, h, w].
@@ -170,7 +170,7 @@ class LampHead(nn.Module):
 
 
 def _peaks(lidar2img: Tensor, lamps: Tensor, shape: torch.Size) -> Tensor:
-    """1 in the cells where a signal is: [B * 6, 5, h, w]."""
+    """Return [B * 6, 5, h, w], 1 in the cells where a signal is."""
     _, _, rows, columns = shape
     kind, state = lamps[..., 0].long(), lamps[..., 1].long()
     channel = torch.where(kind == 0, state, kind + 2)

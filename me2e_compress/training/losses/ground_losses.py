@@ -21,7 +21,7 @@ RARE = 4.0
 
 
 def map_losses(road: RoadMap, wanted: Labels) -> dict[str, Tensor]:
-    """The commanded route, its attributes, the raster, the signals."""
+    """Return the losses of route, attributes, raster and signals."""
     rows = torch.arange(len(wanted.command))
     near = torch.linspace(NEAR_WEIGHT, FAR_WEIGHT, wanted.path.shape[1])[:, None]
     path = wanted.path
@@ -51,12 +51,12 @@ def map_losses(road: RoadMap, wanted: Labels) -> dict[str, Tensor]:
 
 
 def _soft(error: Tensor) -> Tensor:
-    """Metres, growing slowly beyond `FAR_M`, lest junctions drown lanes."""
+    """Compress errors beyond `FAR_M`, lest junctions outweigh lanes."""
     return FAR_M * torch.log1p(error / FAR_M)
 
 
 def _turned(headings: Tensor, path: Tensor) -> Tensor:
-    """Mean angle (rad) between a route [B, P] and the chords of a path [B, P, 2]."""
+    """Return the mean angle (rad) between a route [B, P] and a path [B, P, 2]."""
     chords = path[:, 1:] - path[:, :-1]
     wanted = torch.atan2(chords[..., 1], chords[..., 0])
     said = (headings[:, 1:] + headings[:, :-1]) / 2
@@ -65,7 +65,7 @@ def _turned(headings: Tensor, path: Tensor) -> Tensor:
 
 
 def occ_losses(occupancy: Tensor, wanted: Labels) -> dict[str, Tensor]:
-    """Cross-entropy of the steps that are known."""
+    """Return the cross-entropy of the steps that are known."""
     weight = 1 + (RARE - 1) * wanted.occupancy
     error = functional.binary_cross_entropy_with_logits(
         occupancy, wanted.occupancy, weight, reduction="none"

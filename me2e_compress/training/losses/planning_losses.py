@@ -17,14 +17,14 @@ from me2e_compress.zoo.highway.costs import (
 from me2e_compress.zoo.highway.interfaces import Candidates
 
 NEAR_STEPS = (3.0, 2.0, 1.5, 1.0, 0.75, 0.75)
-"""Weights of the waypoints: the controller acts on the first two."""
+"""Weights of the waypoints: the controller uses the first two."""
 ASIDE = 2.0
 """A metre to the side counts as two along the route."""
 SOFT_M = 0.2
-"""How much farther than the best a candidate may be and still count."""
+"""How much farther than the best candidate another one may be and still count."""
 DOOMED = 0.5
-"""An overlap of the expert's plan with somebody, in its first two seconds, above which
-it is no example: it gave up, or the driver had brought it where nothing helps."""
+"""An expert's plan that overlaps an agent by more than this in its first two seconds is
+not learned from: the expert gave up, or the driver had left it no way out."""
 DOOMED_INSTANTS = 8
 """Of a quarter of a second each."""
 STILL_M = 0.05
@@ -36,7 +36,7 @@ DECISIVE = 2.0
 def plan_losses(
     candidates: Candidates, wanted: Labels, area: BevArea
 ) -> dict[str, Tensor]:
-    """Choice, the distance of the right candidate, and what the choice would hit.
+    """Return the losses of choice, refinement, place and safety of the plan.
 
     Args:
         candidates: of the planner.
@@ -69,10 +69,10 @@ def plan_losses(
 
 @torch.no_grad()
 def true_harm(candidates: Candidates, wanted: Labels, area: BevArea) -> Tensor:
-    """[B, K] what each candidate would have met (rules as targets: Hydra-MDP, 2024).
+    """Return [B, K], what each candidate would have hit (Hydra-MDP, 2024).
 
-    Overlap with where everybody really was, ground that is no road, lines of lights
-    that are not green.
+    Rules as targets: overlap with where the agents really were, ground that is not
+    road, lines of lights that are not green.
 
     Args:
         candidates: of the planner.
@@ -91,7 +91,7 @@ def true_harm(candidates: Candidates, wanted: Labels, area: BevArea) -> Tensor:
 
 @torch.no_grad()
 def doomed(wanted: Labels) -> Tensor:
-    """[B] whether the expert's own plan meets somebody soon."""
+    """Return [B]: whether the expert's own plan hits an agent soon."""
     plan = wanted.plan
     step = torch.diff(plan, dim=1, prepend=torch.zeros_like(plan[:, :1]))
     heading = torch.atan2(step[..., 1], step[..., 0])
@@ -102,7 +102,7 @@ def doomed(wanted: Labels) -> Tensor:
 
 
 def _overlap(plans: Tensor, headings: Tensor, wanted: Labels) -> Tensor:
-    """[B, K, 12] with where everybody really was, every quarter of a second."""
+    """Return [B, K, 12], overlap with where the agents really were, every 0.25 s."""
     agents = wanted.agents
     columns = [1, 2, 5, 6, 3, 4, 7, 8]
     drift = agents[:, :, None, 7:9] * STEP_S * torch.arange(1, 1 + STEPS)[:, None]
@@ -118,6 +118,6 @@ def _overlap(plans: Tensor, headings: Tensor, wanted: Labels) -> Tensor:
 
 
 def displacement(plans: Tensor, wanted: Labels) -> Tensor:
-    """[B] mean distance of plans [B, 6, 2] from the expert's, metres."""
+    """Return [B], mean distance of plans [B, 6, 2] from the expert's, metres."""
     away: Tensor = (plans - wanted.plan).norm(dim=-1)
     return away.mean(-1)

@@ -1,4 +1,4 @@
-"""Camera features to a bird's-eye view that remembers."""
+"""Camera features to a bird's-eye view with a recurrent memory."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from me2e_compress.zoo.highway.blocks import Residual, conv_block, mlp, sample
 from me2e_compress.zoo.highway.config import CAMERAS, HighwayConfig
 
 NEAREST_M = 0.3
-"""Nearer to the image plane than this a point is not seen."""
+"""A point nearer to the image plane than this is not seen."""
 VIEWS = 2
 """Neighbouring views overlap: no cell of the ground is in more than two of six."""
 REACH = 0.2
@@ -94,7 +94,7 @@ class SpatialCrossAttention(nn.Module):
         return pixels, camera, inside.gather(1, pick)
 
     def forward(self, query: Tensor, features: Tensor, lidar2img: Tensor) -> Tensor:
-        """Look the cells up.
+        """Attend from the cells to the images.
 
         Args:
             query: [1, N, C].
@@ -170,7 +170,7 @@ class BevEncoder(nn.Module):
         elapsed_s: Tensor,
         prev_bev: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """One frame.
+        """Encode one frame.
 
         Args:
             features: [B * 6, C, H, W].
@@ -190,11 +190,11 @@ class BevEncoder(nn.Module):
         return bev, self.tokens(bev), kept
 
     def tokens(self, bev: Tensor) -> Tensor:
-        """[B, C, rows, columns] to keys and values [B, N, C] that know their place."""
+        """Turn [B, C, rows, columns] into tokens [B, N, C] with a learned position."""
         return bev.flatten(2).transpose(1, 2) + self.place
 
     def look(self, features: Tensor, lidar2img: Tensor) -> Tensor:
-        """What the cameras say of every cell: [B, C, rows, columns]."""
+        """Read the cameras for every cell: [B, C, rows, columns]."""
         cells = self.cross(self.norms[0](self.queries), features, lidar2img)
         cells = self.queries + cells
         cells = cells + self.ffn(self.norms[1](cells))
@@ -203,7 +203,7 @@ class BevEncoder(nn.Module):
         return seen
 
     def recall(self, prev_bev: Tensor, motion: EgoMotion) -> Tensor:
-        """The memory [B, N, C + 2] as seen from here: [B, C + 2, rows, columns]."""
+        """Warp the memory [B, N, C + 2] to here: [B, C + 2, rows, columns]."""
         cos, sin = motion.turn.cos()[:, None], motion.turn.sin()[:, None]
         x, y = self.centres[None, :, 0], self.centres[None, :, 1]
         there = torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
@@ -238,7 +238,7 @@ class BevEncoder(nn.Module):
         return torch.cat([now, mean, known], 1), kept.flatten(2).transpose(1, 2)
 
     def fuse(self, joined: Tensor) -> Tensor:
-        """[B, 2 C + 2, rows, columns] to [B, C, rows, columns]."""
+        """Map [B, 2 C + 2, rows, columns] to [B, C, rows, columns]."""
         bev: Tensor = self.spatial(self.temporal(joined))
         return bev
 

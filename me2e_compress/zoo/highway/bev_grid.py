@@ -1,4 +1,4 @@
-"""Where cells are, and routes made of curvature."""
+"""Places of the cells, and routes built from headings."""
 
 import torch
 from torch import Tensor
@@ -7,14 +7,14 @@ from me2e_compress.zoo.highway.config import PATH_STEP_M, BevArea
 
 
 def cell_centres(area: BevArea) -> Tensor:
-    """[rows * columns, 2] x and y of every cell, metres in the ego frame."""
+    """Return [rows * columns, 2], x and y of every cell, metres, ego frame."""
     x = area.front_m - area.cell_m * (torch.arange(area.rows) + 0.5)
     y = area.left_m - area.cell_m * (torch.arange(area.columns) + 0.5)
     return torch.stack(torch.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
 
 
 def grid_of(points: Tensor, area: BevArea) -> Tensor:
-    """Points [..., 2] of the ego frame as (column, row) in [-1, 1]."""
+    """Convert ego-frame points [..., 2] to (column, row) in [-1, 1]."""
     height = area.cell_m * area.rows
     width = area.cell_m * area.columns
     across = (area.left_m - points[..., 1]) * (2 / width) - 1
@@ -23,7 +23,7 @@ def grid_of(points: Tensor, area: BevArea) -> Tensor:
 
 
 def route_points(lateral: Tensor, headings: Tensor) -> Tensor:
-    """Points of a route, `PATH_STEP_M` apart, from where the ego is beside it.
+    """Return the points of a route, `PATH_STEP_M` apart, from beside the ego on.
 
     Args:
         lateral: [...] metres that the ego is left of the route.

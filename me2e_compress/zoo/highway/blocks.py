@@ -9,7 +9,7 @@ from torch.nn import functional
 
 
 def conv_block(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Module:
-    """Convolution, batch normalisation, ReLU."""
+    """Build convolution, batch normalisation, ReLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False),
         nn.BatchNorm2d(outputs),
@@ -30,7 +30,7 @@ class Residual(nn.Module):
         self.shortcut = nn.Identity() if same else nn.Conv2d(inputs, outputs, 1, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, inputs, H, W] to [B, outputs, H / stride, W / stride]."""
+        """Map [B, inputs, H, W] to [B, outputs, H / stride, W / stride]."""
         return functional.relu(self.second(self.first(x)) + self.shortcut(x))
 
 
@@ -46,7 +46,7 @@ class MultiHeadAttention(nn.Module):
         self.output = nn.Linear(channels, channels)
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """[B, Q, C], [B, K, C], [B, K, C] to [B, Q, C]."""
+        """Map [B, Q, C], [B, K, C], [B, K, C] to [B, Q, C]."""
         q, k, v = (
             project(x).unflatten(-1, (self.heads, self.depth)).transpose(1, 2)
             for project, x in (
@@ -76,7 +76,7 @@ class DecoderLayer(nn.Module):
         )
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """[B, Q, C] looks at [B, K, C]."""
+        """Attend from [B, Q, C] to [B, K, C]."""
         if self.self_attn is not None:
             own = self.norms[0](query)
             query = query + self.self_attn(own, own, own)
@@ -86,7 +86,7 @@ class DecoderLayer(nn.Module):
 
 
 def mlp(*widths: int) -> nn.Sequential:
-    """Linear layers with ReLU between them."""
+    """Build linear layers with ReLU between them."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
@@ -94,7 +94,7 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def sample(features: Tensor, grid: Tensor) -> Tensor:
-    """Bilinear look-up, zero outside: [B, C, H, W] at [B, I, J, 2] in [-1, 1]."""
+    """Sample bilinearly, zero outside: [B, C, H, W] at [B, I, J, 2] in [-1, 1]."""
     return functional.grid_sample(
         features.float(), grid.float(), padding_mode="zeros", align_corners=False
     )

@@ -1,4 +1,4 @@
-"""What a candidate plan costs, computed from what the modules say."""
+"""Costs of a candidate plan, computed from the outputs of the modules."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from me2e_compress.zoo.highway.config import BevArea
 DISCS_M = (-1.5, 0.0, 1.5)
 """The ego as three discs along its axis."""
 RADIUS_M = 1.25
-"""Of each: they cover 2 m of width, and a little air."""
+"""Of each: they cover 2 m of width and a small margin."""
 SOFT_M = 0.25
 """How gradually a gap becomes an overlap."""
 NEAR_M = 2.0
@@ -20,7 +20,7 @@ FRONT_M = 2.5
 
 
 def discs_of(places: Tensor, headings: Tensor) -> Tensor:
-    """Centres [B, K, T, 3, 2] of the ego's discs at places [B, K, T, 2]."""
+    """Return centres [B, K, T, 3, 2] of the ego's discs at places [B, K, T, 2]."""
     axis = torch.stack([headings.cos(), headings.sin()], -1)
     return torch.stack([places + axis * shift for shift in DISCS_M], -2)
 
@@ -32,14 +32,14 @@ def between(steps: Tensor) -> Tensor:
 
 
 def between_travel(travel: Tensor) -> Tensor:
-    """[B, A, M, 6, 2] to every quarter of a second: [B, A, M, 12, 2]."""
+    """Refine [B, A, M, 6, 2] to every quarter of a second: [B, A, M, 12, 2]."""
     shape = travel.shape[:3]
     finer: Tensor = between(travel.flatten(0, 2)).unflatten(0, shape)
     return finer
 
 
 def swept(plans: Tensor, headings: Tensor) -> Tensor:
-    """The ego's discs [B, K, 2 T, 3, 2] every quarter of a second.
+    """Return the ego's discs [B, K, 2 T, 3, 2] every quarter of a second.
 
     Args:
         plans: [B, K, T, 2].
@@ -53,7 +53,7 @@ def swept(plans: Tensor, headings: Tensor) -> Tensor:
 def agent_costs(
     discs: Tensor, boxes: Tensor, score: Tensor, travel: Tensor, modes: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Overlap with, and nearness to, everybody's predicted box.
+    """Return overlap with, and nearness to, the predicted boxes of all agents.
 
     Args:
         discs: [B, K, 2 T, 3, 2].
@@ -84,7 +84,7 @@ def agent_costs(
 
 
 def occupied(discs: Tensor, occupancy: Tensor, area: BevArea) -> Tensor:
-    """Probability that the ground under the ego is taken.
+    """Return the probability that the ground under the ego is occupied.
 
     Args:
         discs: [B, K, T, 3, 2].
@@ -102,7 +102,7 @@ def occupied(discs: Tensor, occupancy: Tensor, area: BevArea) -> Tensor:
 
 
 def ground(discs: Tensor, raster: Tensor, area: BevArea) -> Tensor:
-    """What is under the ego.
+    """Return what is under the ego.
 
     Args:
         discs: [B, K, T, 3, 2].
@@ -118,7 +118,7 @@ def ground(discs: Tensor, raster: Tensor, area: BevArea) -> Tensor:
 
 
 def beyond_lines(arc_m: Tensor, gap_m: Tensor) -> Tensor:
-    """How far the front bumper is past each line, softly: [B, K, T, S] in [0, 1].
+    """Return how far the front is past each line: soft [B, K, T, S] in [0, 1].
 
     Args:
         arc_m: [B, K, T] of the ego's centre.

@@ -1,4 +1,4 @@
-"""What the planner reads, and what it answers."""
+"""What the planner reads, and what it returns."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from me2e_compress.zoo.highway.motion import Futures
 from me2e_compress.zoo.highway.track import Tracks
 
 SPEED_SCALE_MPS = 10.0
-"""The ego's speed is told in these units, about 1 in size."""
+"""The ego's speed is given in these units, about 1 in size."""
 EGO_FEATURES = 2
 """Speed over 10 m/s, and how lately it stood. Acceleration and yaw rate are left out:
 an imitator that sees them goes on with what it does, and never begins to brake (causal
@@ -20,18 +20,18 @@ confusion: de Haan et al., 2019; seen here in the first driver)."""
 
 @dataclass
 class EgoState:
-    """What the ego does.
+    """State of the ego.
 
     Attributes:
         can_bus: [B, 18], see the policy contract.
-        stood: [B] 1 while it stands, then forgotten.
+        stood: [B] 1 while it stands, then decaying.
     """
 
     can_bus: Tensor
     stood: Tensor
 
     def features(self) -> Tensor:
-        """[B, 2], each about 1 in size: see `EGO_FEATURES`."""
+        """Return [B, 2], each about 1 in size: see `EGO_FEATURES`."""
         return torch.stack([self.can_bus[:, 7] / SPEED_SCALE_MPS, self.stood], -1)
 
 
@@ -95,7 +95,7 @@ class Candidates:
     costs: Tensor
 
     def best(self) -> Tensor:
-        """The plan with the highest score: [B, 6, 2]."""
+        """Return the plan with the highest score: [B, 6, 2]."""
         first = self.logits.argmax(1)[:, None, None, None]
         return self.plans.gather(1, first.expand(-1, -1, STEPS, 2)).squeeze(1)
 
@@ -109,7 +109,7 @@ def gather(
     modes: Tensor,
     occupancy: Tensor,
 ) -> PlannerInput:
-    """Lay out what the planner reads.
+    """Collect what the planner reads.
 
     Args:
         tracks: of the track module.

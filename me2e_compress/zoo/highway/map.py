@@ -1,4 +1,4 @@
-"""What the road is like: routes for every command, the ground, signals."""
+"""The road: routes for every command, the ground, signals."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ GAP_SCALE_M = 10.0
 
 @dataclass
 class RoadMap:
-    """What the map module hands on.
+    """Outputs of the map module.
 
     Attributes:
         query: [B, 6 * P, C] a token for every point of every route.
@@ -80,12 +80,12 @@ class Choice(nn.Module):
     """The route of the command, as a module: exported nodes have its scope."""
 
     def forward(self, road: RoadMap, command: Tensor) -> MapRoute:
-        """Pick for int64 [B] commands."""
+        """Pick the routes of int64 [B] commands."""
         return route_of(road, command)
 
 
 def route_of(road: RoadMap, command: Tensor) -> MapRoute:
-    """The route of each command, int64 [B]."""
+    """Return the route of each command, int64 [B]."""
 
     def picked(values: Tensor) -> Tensor:
         where = command.view(-1, *(1 for _ in values.shape[1:]))
@@ -162,12 +162,12 @@ class Map(nn.Module):
         )
 
     def _bends(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """[B, 6 P, 2] to offsets [B, 6] and turns [B, 6, P] from point to point."""
+        """Split [B, 6 P, 2] into offsets [B, 6] and turns between points [B, 6, P]."""
         raw = raw.float().unflatten(1, (COMMANDS, self.points))
         return raw[:, :, 0, 1] * WIDTH_SCALE_M, raw[..., 0] * (2 * BEND)
 
     def _at(self, bev: Tensor, paths: Tensor) -> Tensor:
-        """Features [B, 6 P, C] at points [B, 6, P, 2]."""
+        """Return features [B, 6 P, C] at points [B, 6, P, 2]."""
         found = sample(bev, grid_of(paths, self.area))
         return found.flatten(2).transpose(1, 2)
 

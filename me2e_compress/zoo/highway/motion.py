@@ -1,4 +1,4 @@
-"""Where everybody will be."""
+"""Futures of the agents."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from me2e_compress.zoo.highway.track import Tracks
 
 @dataclass
 class Futures:
-    """What the motion module hands on.
+    """Outputs of the motion module.
 
     Attributes:
         query: [B, A, C].
@@ -28,7 +28,7 @@ class Futures:
 
 
 class Motion(nn.Module):
-    """Agents in several modes look at each other and at the routes (VAD)."""
+    """Agents in several modes attend to each other and to the routes (VAD)."""
 
     times: Tensor
 

@@ -1,4 +1,4 @@
-"""The plan: candidates along the commanded route, scored by what they would meet."""
+"""The planner: candidates along the commanded route, scored by what they would hit."""
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +33,7 @@ from me2e_compress.zoo.highway.map import GAP_SCALE_M
 
 
 def hats(arc_m: Tensor, points: int) -> Tensor:
-    """Weights [..., P] that interpolate linearly between the points of a route."""
+    """Return [..., P] weights that interpolate linearly between a route's points."""
     knots = torch.arange(points, device=arc_m.device, dtype=arc_m.dtype)
     return (1 - (arc_m[..., None] / PATH_STEP_M - knots).abs()).clamp(min=0)
 
@@ -41,7 +41,7 @@ def hats(arc_m: Tensor, points: int) -> Tensor:
 def along(
     arc_m: Tensor, offset_m: Tensor, path: Tensor, headings: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Places beside a route.
+    """Return places beside a route.
 
     Args:
         arc_m: [B, K, T] metres along it, 0 to its length.
@@ -73,7 +73,7 @@ COSTS = STEPS * (2 * 2 + 1 + RASTER_CHANNELS + SIGNAL_KINDS + LIMITS)
 
 
 BESIDE_M = 4.0
-"""A lane beside the route, or more: no worse."""
+"""An offset of a lane or more is no worse than this."""
 CAUTION = 4.0
 """What a certain collision costs before training, in units of the logits."""
 
@@ -81,12 +81,12 @@ CAUTION = 4.0
 class Planner(nn.Module):
     """Anchored candidates (VADv2's vocabulary, in the frame of the route) and costs.
 
-    An anchor is a departure from going on as now: metres more or less along the route,
-    metres to the left.
+    An anchor is a departure from coasting: metres more or less along the route, metres
+    to the left.
 
     The collision cost of a candidate is computed from predicted boxes, their futures
-    and the predicted occupancy, the way it leaves the road from the predicted map: so
-    that no module can be left out unnoticed.
+    and the predicted occupancy, leaving the road from the predicted map: so no module
+    can be left out unnoticed.
     """
 
     anchors: Tensor
@@ -121,8 +121,8 @@ class Planner(nn.Module):
         """Decide: the best plan [B, 6, 2].
 
         Args:
-            world: what the modules say.
-            ego: what the ego does.
+            world: outputs of the other modules.
+            ego: state of the ego.
             command: int64 [B].
         """
         return self.consider(world, ego.features(), command).best()
@@ -131,16 +131,18 @@ class Planner(nn.Module):
         """Make the candidates and score them.
 
         Args:
-            world: what the modules say.
+            world: outputs of the other modules.
             ego: [B, 2], see `EGO_FEATURES`.
             command: int64 [B].
         """
+        # candidates: anchors, refined by what they attend to
         anchors = self._anchors(ego)
         query = self._query(world, ego, command)
         moves = anchors + self.refine(query).float().unflatten(-1, (STEPS, 2))
         arc = moves[..., 0].clamp(0, self.end_m)
         offset = world.lateral[:, None, None] + moves[..., 1]
         plans, headings = along(arc, offset, world.path, world.headings)
+        # scores: learned from the costs, less a penalty for plain harm
         with torch.no_grad():
             costs, harm = self._costs(world, plans, headings, arc, offset)
         logits = self.score(torch.cat([query.float(), costs], -1)).squeeze(-1)
@@ -149,14 +151,14 @@ class Planner(nn.Module):
         return Candidates(plans, moves, anchors, headings, logits, costs)
 
     def _anchors(self, ego: Tensor) -> Tensor:
-        """[B, K, 6, 2]: going on at this speed, plus the anchors, never backwards."""
+        """Return [B, K, 6, 2]: coasting plus the anchors, never backwards."""
         coasting = ego[:, 0, None, None] * (SPEED_SCALE_MPS * self.times)
         arc = (coasting + self.anchors[..., 0]).clamp(min=0)
         aside = self.anchors[..., 1].expand_as(arc)
         return torch.stack([arc, aside], -1)
 
     def _query(self, world: PlannerInput, ego: Tensor, command: Tensor) -> Tensor:
-        """[B, K, C]: each anchor looks at agents, route, signals and occupancy."""
+        """Return [B, K, C]: anchors that attend to agents, road and occupancy."""
         pick = command[:, None] == torch.arange(COMMANDS, device=command.device)
         aside = torch.stack([world.lateral, *(world.headings[:, i] for i in BENDS)], -1)
         told = self.ego(torch.cat([ego, pick.to(ego.dtype), aside.to(ego.dtype)], -1))
@@ -179,7 +181,7 @@ class Planner(nn.Module):
         arc: Tensor,
         offset: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Everything [B, K, F], and what is plain harm [B, K, 4]."""
+        """Return all costs [B, K, F], and those that are plain harm [B, K, 4]."""
         overlap, near = agent_costs(
             swept(plans, headings),
             world.boxes,
@@ -212,7 +214,7 @@ class Planner(nn.Module):
         return torch.cat(costs, -1), harm
 
     def _lines(self, world: PlannerInput, arc: Tensor) -> Tensor:
-        """[B, K, 6, 3] beyond the line of a closed light, a stop, a give-way sign."""
+        """Return [B, K, 6, 3]: past the line of closed lights, stop, give-way signs."""
         there = world.signals[..., 0].sigmoid()
         closed = 1 - world.signals[:, 0, 2:].softmax(-1)[:, 2]
         asked = torch.cat([(there[:, 0] * closed)[:, None], there[:, 1:]], 1)
@@ -220,7 +222,7 @@ class Planner(nn.Module):
         return beyond_lines(arc, gap) * asked[:, None, None]
 
     def _limits(self, world: PlannerInput, arc: Tensor, offset: Tensor) -> Tensor:
-        """[B, K, 6, 5] how far beyond each of `LIMITS`."""
+        """Return [B, K, 6, 5], how far beyond each of `LIMITS`."""
         weights = hats(arc, world.path.shape[1]).flatten(1, 2)
         here = torch.matmul(weights, world.attributes).unflatten(1, arc.shape[1:])
         before = torch.cat([torch.zeros_like(arc[..., :1]), arc[..., :-1]], -1)

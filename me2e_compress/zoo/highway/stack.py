@@ -29,14 +29,14 @@ class Backbone(nn.Module):
         )
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """[B, 3, H, W] to features of strides 4, 8 and 16."""
+        """Map [B, 3, H, W] to features of strides 4, 8 and 16."""
         fine = self.stage1(self.stem(images))
         middle = self.stage2(fine)
         return fine, middle, self.stage3(middle)
 
 
 class Neck(nn.Module):
-    """Brings the strides together (Lin et al., 2017, without the smoothing)."""
+    """Combines the strides (Lin et al., 2017, without the smoothing)."""
 
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Neck(nn.Module):
         self.grow = nn.Upsample(scale_factor=2, mode="nearest")
 
     def forward(self, features: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Features to [B, C, H / 4, W / 4] and [B, C, H / 8, W / 8]."""
+        """Map features to [B, C, H / 4, W / 4] and [B, C, H / 8, W / 8]."""
         fine, middle, coarse = (
             lateral(x) for lateral, x in zip(self.laterals, features, strict=True)
         )
@@ -56,7 +56,7 @@ class Neck(nn.Module):
 
 
 class Occ(nn.Module):
-    """Occupancy 0.5 to 3 s from now; never of now, which boxes already say."""
+    """Occupancy 0.5 to 3 s from now; not of now, which the boxes give."""
 
     def __init__(self, config: HighwayConfig) -> None:
         super().__init__()
@@ -70,19 +70,19 @@ class Occ(nn.Module):
         )
 
     def forward(self, bev: Tensor) -> Tensor:
-        """[B, C, rows, columns] to logits [B, 6, 2 * rows, 2 * columns]."""
+        """Map [B, C, rows, columns] to logits [B, 6, 2 * rows, 2 * columns]."""
         taken: Tensor = self.body(bev).float()
         return taken
 
 
 STANDING_MPS = 0.1
 STOOD_S = 5.0
-"""Time constant with which standing is forgotten."""
+"""Time constant with which the memory of standing decays."""
 
 
 @dataclass
-class Seen:
-    """Everything the modules say of one frame.
+class ModuleOutputs:
+    """Outputs of all modules for one frame.
 
     Attributes:
         tracks: of the track module.
@@ -108,18 +108,18 @@ class Highway(nn.Module):
         self.track, self.map = Track(config), Map(config)
         self.motion, self.occ = Motion(config), Occ(config)
         self.planner = Planner(config)
-        # no weights: their names say whose part of the world they make
+        # no weights: their names tell which module a part of the world belongs to
         self.map_route, self.map_raster = Choice(), nn.Sigmoid()
         self.motion_modes, self.occ_taken = nn.Softmax(-1), nn.Sigmoid()
 
     def look(self, img: Tensor) -> tuple[Tensor, Tensor]:
-        """Images [B, 6, 3, H, W] to features [B * 6, C, h, w] of strides 4 and 8."""
+        """Map images [B, 6, 3, H, W] to features [B * 6, C, h, w], strides 4 and 8."""
         fine, middle = self.neck(self.backbone(img.flatten(0, 1)))
         return fine, middle
 
     def understand(
         self, bev: Tensor, tokens: Tensor, images: Tensor, hints: Tensor | None = None
-    ) -> Seen:
+    ) -> ModuleOutputs:
         """Run the task modules.
 
         Args:
@@ -130,13 +130,13 @@ class Highway(nn.Module):
         """
         tracks = self.track(bev, tokens, hints)
         road = self.map(bev, tokens, images)
-        return Seen(tracks, road, self.motion(tracks, road), self.occ(bev))
+        return ModuleOutputs(tracks, road, self.motion(tracks, road), self.occ(bev))
 
-    def world(self, seen: Seen, command: Tensor) -> PlannerInput:
+    def world(self, seen: ModuleOutputs, command: Tensor) -> PlannerInput:
         """Gather what the planner reads; the command, int64 [B], picks the route.
 
         Every part is made in a scope of the exported graph that begins with the name
-        of its module: who takes a module away takes all of it, outputs too.
+        of its module, so that ablating a module removes all of it, outputs too.
         """
         road, futures = seen.road, seen.futures
         return gather(
@@ -159,7 +159,7 @@ class Highway(nn.Module):
         prev_bev: Tensor,
         prev_memory: Tensor,
     ) -> tuple[Tensor, ...]:
-        """One decision, as it is exported.
+        """Compute one decision, as it is exported.
 
         Args:
             img: [1, 6, 3, H, W], normalised.
@@ -197,7 +197,7 @@ class Highway(nn.Module):
 
 
 def stood_lately(speed: Tensor, before: Tensor, elapsed_s: Tensor) -> Tensor:
-    """[B] 1 while the ego stands, then forgotten with `STOOD_S`."""
+    """Return [B], 1 while the ego stands, then decaying with `STOOD_S`."""
     faded = before * torch.exp(-elapsed_s / STOOD_S)
     standing = (speed.abs() < STANDING_MPS).to(speed.dtype)
     return torch.maximum(faded, standing)

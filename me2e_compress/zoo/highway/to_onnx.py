@@ -29,5 +29,5 @@ def write(model: Highway, path: Path) -> Path:
 
 
 def parameters(model: Highway) -> int:
-    """How many numbers were trained."""
+    """Return how many parameters were trained."""
     return sum(p.numel() for p in model.parameters())

@@ -1,4 +1,4 @@
-"""Who is there: peaks of a detection map become queries, queries become boxes."""
+"""Detection: peaks of a detection map become queries, queries become boxes."""
 
 from dataclasses import dataclass
 
@@ -21,13 +21,13 @@ undecided spends the first steps on that (Lin et al., RetinaNet, 2017, section 4
 
 @dataclass
 class Tracks:
-    """What the track module hands on.
+    """Outputs of the track module.
 
     Attributes:
         query: [B, A, C].
         boxes: [B, A, 8] x, y, length, width, cos, sin, vx, vy: metres and m/s, in the
             axes of the ego.
-        score: [B, A] probability that somebody is there.
+        score: [B, A] probability that an agent is there.
         classes: [B, A, 4] logits.
         heat: [B, N] logits of the detection map.
         cells: [B, A] the cell that each query came from.
@@ -70,7 +70,7 @@ class Track(nn.Module):
         Args:
             bev: [B, C, rows, columns].
             tokens: [B, N, C], the same with the place of each cell.
-            hints: [B, N], added to the peaks: in training, where somebody is.
+            hints: [B, N], added to the peaks: in training, where agents are.
         """
         heat = self.heat(bev)
         strength = heat.float().sigmoid()
@@ -101,5 +101,5 @@ class Track(nn.Module):
 
 
 def _pick(rows: Tensor, index: Tensor) -> Tensor:
-    """[B, N, C] at [B, A] to [B, A, C]."""
+    """Gather [B, N, C] at [B, A] to [B, A, C]."""
     return rows.gather(1, index[..., None].expand(-1, -1, rows.shape[-1]))

@@ -77,7 +77,7 @@ class MultiheadAttention(nn.Module):
         key_pos: Tensor,
         ignore: Tensor | None = None,
     ) -> Tensor:
-        """[B, Q, 256] and keys, which are the values too, to [B, Q, 256]."""
+        """Map [B, Q, 256] and keys, which are the values too, to [B, Q, 256]."""
         attended: Tensor = self.attn(query + query_pos, key + key_pos, key, ignore)
         return query + attended
 
@@ -93,7 +93,7 @@ class FeedForward(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """[..., 256] -> [..., 256]."""
+        """Map [..., 256] to [..., 256]."""
         out: Tensor = x + self.layers(x)
         return out
 
@@ -105,7 +105,7 @@ def deformable_attention(
     weights: Tensor,
     sampling: Sampling,
 ) -> Tensor:
-    """Weighted sum of samples of one feature level (Zhu et al. 2021, equation 2).
+    """Sum samples of one feature level, weighted (Zhu et al. 2021, equation 2).
 
     Args:
         value: [B, h * w, heads, 32].
@@ -128,7 +128,7 @@ def deformable_attention(
 
 
 class DecoderAttention(nn.Module):
-    """Queries read the BEV around their reference points."""
+    """Queries attend to the BEV around their reference points."""
 
     points = 4
 

@@ -31,7 +31,7 @@ class Bottleneck(nn.Module):
             )
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, C, H, W] -> [N, 4 * width, H / stride, W / stride]."""
+        """Map [N, C, H, W] to [N, 4 * width, H / stride, W / stride]."""
         shortcut = x if self.downsample is None else self.downsample(x)
         x = self.relu(self.bn1(self.conv1(x)))
         x = self.relu(self.bn2(self.conv2(x)))
@@ -58,7 +58,7 @@ class ResNet50(nn.Module):
             self.add_module(f"layer{number}", stage)
 
     def forward(self, images: Tensor) -> Tensor:
-        """[N, 3, H, W] -> [N, 2048, H / 32, W / 32]."""
+        """Map [N, 3, H, W] to [N, 2048, H / 32, W / 32]."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(images))))
         for number in range(1, len(STAGES) + 1):
             x = self.get_submodule(f"layer{number}")(x)
@@ -74,7 +74,7 @@ class ConvModule(nn.Module):
         self.conv = nn.Conv2d(channels, out, kernel, padding=kernel // 2)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, C, H, W] -> [N, out, H, W]."""
+        """Map [N, C, H, W] to [N, out, H, W]."""
         out: Tensor = self.conv(x)
         return out
 
@@ -88,6 +88,6 @@ class FeaturePyramid(nn.Module):
         self.fpn_convs = nn.ModuleList([ConvModule(EMBED, EMBED, 3)])
 
     def forward(self, features: Tensor) -> Tensor:
-        """[N, 2048, h, w] -> [N, 256, h, w]."""
+        """Map [N, 2048, h, w] to [N, 256, h, w]."""
         out: Tensor = self.fpn_convs[0](self.lateral_convs[0](features))
         return out

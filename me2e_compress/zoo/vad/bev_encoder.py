@@ -18,7 +18,7 @@ from me2e_compress.zoo.vad.reference_points import pillars, project
 
 
 class TemporalSelfAttention(nn.Module):
-    """BEV queries read the previous BEV and the present queries."""
+    """BEV queries attend to the previous BEV and the present queries."""
 
     points = 4
     queue = 2
@@ -105,7 +105,7 @@ ONE = torch.tensor(1.0)
 
 
 class SpatialCrossAttention(nn.Module):
-    """BEV queries read the cameras in which their pillar is visible."""
+    """BEV queries attend to the cameras in which their pillar is visible."""
 
     def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ class SpatialCrossAttention(nn.Module):
     def forward(
         self, query: Tensor, tokens: Tensor, at: Tensor, visible: Tensor
     ) -> Tensor:
-        """As `CameraAttention`, averaged over the cameras that see the cell.
+        """Attend as `CameraAttention`, averaged over the cameras that see the cell.
 
         Args:
             query: [1, cells, 256].
@@ -153,7 +153,7 @@ class EncoderLayer(nn.Module):
         pillars_at: Tensor,
         visible: Tensor,
     ) -> Tensor:
-        """[1, cells, 256] -> [1, cells, 256]."""
+        """Map [1, cells, 256] to [1, cells, 256]."""
         query = self.norms[0](self.attentions[0](query, pos, queue, cells_at))
         query = self.norms[1](self.attentions[1](query, tokens, pillars_at, visible))
         out: Tensor = self.norms[2](self.ffns[0](query))

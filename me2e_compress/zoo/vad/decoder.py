@@ -16,12 +16,12 @@ write a Python number as float64."""
 
 
 def inverse_sigmoid(x: Tensor) -> Tensor:
-    """Logit of x in 0..1, kept away from both ends by `EPSILON`."""
+    """Return the logit of x in 0..1, kept away from 0 and 1 by `EPSILON`."""
     return torch.log(torch.maximum(x, EPSILON) / torch.maximum(1 - x, EPSILON))
 
 
 class DecoderLayer(nn.Module):
-    """Queries read each other, then the BEV, then think."""
+    """Self-attention, cross-attention to the BEV, feed-forward."""
 
     def __init__(self, sampling: Sampling) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class DecoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
 
     def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
-        """[1, Q, 256] -> [1, Q, 256]; ``at`` are reference points [1, Q, 2]."""
+        """Map [1, Q, 256] to [1, Q, 256]; ``at`` are reference points [1, Q, 2]."""
         query = self.norms[0](self.attentions[0](query, query, pos, pos))
         query = self.norms[1](self.attentions[1](query, pos, bev, at))
         out: Tensor = self.norms[2](self.ffns[0](query))
@@ -100,7 +100,7 @@ class InteractionLayer(nn.Module):
         key_pos: Tensor,
         ignore: Tensor | None,
     ) -> Tensor:
-        """[B, Q, 256] and keys [B or 1, K, 256] to [B, Q, 256]."""
+        """Map [B, Q, 256] and keys [B or 1, K, 256] to [B, Q, 256]."""
         attended = self.attentions[0](query, key, query_pos, key_pos, ignore)
         query = self.norms[0](attended)
         out: Tensor = self.norms[1](self.ffns[0](query))
@@ -108,7 +108,7 @@ class InteractionLayer(nn.Module):
 
 
 class Interaction(nn.Module):
-    """How one kind of query reads another: a single `InteractionLayer`."""
+    """Cross-attention of one kind of query to another: a single `InteractionLayer`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -122,6 +122,6 @@ class Interaction(nn.Module):
         key_pos: Tensor,
         ignore: Tensor | None = None,
     ) -> Tensor:
-        """As the layer."""
+        """Apply the layer."""
         out: Tensor = self.layers[0](query, key, query_pos, key_pos, ignore)
         return out

@@ -1,12 +1,12 @@
-"""Weights from a seed, shaped so that the untrained network sees.
+"""Weights from a seed, shaped so that the untrained network reacts to its input.
 
 A network drawn at random forgets its input on the way: activations of different images
 share a large common part, averages over hundreds of keys cancel, and the plan hardly
 moves when a camera changes. So statistics of the backbone and of the neck are taken
-from rendered frames, residual branches that bring news are louder than what they are
-added to, and the weights of a linear layer sum to zero, which cancels the common part
-that a ReLU leaves. No two tensors are equal and none is constant, as in a trained
-model: an exporter merges equal ones.
+from rendered frames, residual branches that carry information are stronger than what
+they are added to, and the weights of a linear layer sum to zero, which cancels the
+common part that a ReLU leaves. No two tensors are equal and none is constant, as in a
+trained model: an exporter merges equal ones.
 """
 
 import math
@@ -41,9 +41,9 @@ GAINS = (
     (r"ego_fut_decoder\.4", 1.0),
 )
 """Standard deviation of an output for a unit input, by a pattern in the name: the first
-that matches; 1.4 (ReLU, He et al. 2015) where none does. Found by trial: the tests say
-what they must achieve. Loud regressions would move reference points by whole cells at
-the least noise, so theirs are small."""
+that matches; 1.4 (ReLU, He et al. 2015) where none does. Found by trial: the tests
+state what they must achieve. Strong regressions would move reference points by whole
+cells at the least noise, so theirs are small."""
 
 DEFAULT_GAIN = math.sqrt(2)
 EMBEDDING_STD = 0.3
@@ -91,9 +91,10 @@ def _draw(
 
 
 def _smooth(kernels: Tensor) -> Tensor:
-    """Blur the kernels, at the same spread: [out, in, k, k].
+    """Blur the kernels, at the same standard deviation: [out, in, k, k].
 
-    White kernels hear pixel noise louder than shapes; trained ones are smooth.
+    White-noise kernels respond to pixel noise more than to shapes; trained ones are
+    smooth.
     """
     blurred = kernels
     for _ in range(kernels.shape[-1] // 3):
@@ -102,7 +103,7 @@ def _smooth(kernels: Tensor) -> Tensor:
 
 
 def _spread(bias: Tensor) -> Tensor:
-    """Deformable DETR's offsets: a direction a head, a step further a point."""
+    """Return deformable DETR's offsets: a direction a head, a step more a point."""
     angles = torch.arange(ATTENTION_HEADS) * (2 * math.pi / ATTENTION_HEADS)
     directions = torch.stack([angles.cos(), angles.sin()], -1)
     directions = directions / directions.abs().amax(-1, keepdim=True)
@@ -147,7 +148,7 @@ def _convolutions(module: nn.Module) -> Iterator[nn.Conv2d]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """The order of a sum, and so its last bits, must not hang on the machine's load."""
+    """Run on one thread, so that sums do not depend on the machine's load."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

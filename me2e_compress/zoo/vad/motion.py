@@ -1,4 +1,4 @@
-"""The first floor of the head: where the agents will go."""
+"""The motion part of the head: where the agents will go."""
 
 from typing import NamedTuple
 
@@ -44,7 +44,7 @@ class PointMlp(nn.Module):
         self.norm = nn.LayerNorm(out)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[..., width] -> [..., out]."""
+        """Map [..., width] to [..., out]."""
         return torch.relu(self.norm(self.linear(x)))
 
 
@@ -58,7 +58,7 @@ class LaneNet(nn.Module):
             self.layer_seq.add_module(f"lmlp_{layer}", PointMlp(EMBED, EMBED // 2))
 
     def forward(self, points: Tensor) -> Tensor:
-        """[1, V, P, 256] -> [1, V, 256]."""
+        """Map [1, V, P, 256] to [1, V, 256]."""
         for layer in self.layer_seq:
             own = layer(points)
             shared = own.amax(2, keepdim=True).expand_as(own)
@@ -67,7 +67,7 @@ class LaneNet(nn.Module):
 
 
 def nearest_points(points: Tensor) -> Tensor:
-    """The point of each vector nearest to the origin: [1, V, P, 2] -> [1, V, 2].
+    """Return the point of each vector nearest to the origin: [1, V, 2].
 
     As in the original, the points are normalised, so their origin is a corner of
     the grid and not the ego vehicle.
@@ -77,7 +77,7 @@ def nearest_points(points: Tensor) -> Tensor:
 
 
 class MotionHead(PerceptionHead):
-    """Agents of six modes read each other and the map."""
+    """Agents of six modes attend to each other and to the map."""
 
     def __init__(self, heads: Heads, sampling: Sampling) -> None:
         super().__init__(heads, sampling)
@@ -91,7 +91,7 @@ class MotionHead(PerceptionHead):
         self.traj_cls_branches = nn.ModuleList([classifier(1, 2 * EMBED)])
 
     def lanes(self, vectors: Map) -> tuple[Tensor, Tensor]:
-        """One query [1, 100, 256] and one position [1, 100, 2] a map vector."""
+        """Return one query [1, 100, 256] and one position [1, 100, 2] a map vector."""
         with region("map"):
             return self.lane_encoder(vectors.queries), nearest_points(
                 vectors.points[-1]
@@ -126,11 +126,11 @@ class MotionHead(PerceptionHead):
         vectors: Map,
         lanes: tuple[Tensor, Tensor],
     ) -> Tensor:
-        """Let each agent-mode read the likely map vectors near it.
+        """Let each agent-mode attend to the likely map vectors near it.
 
         The original gathers the vectors that pass; here all of them stay, and those
         that do not pass are masked, which gives the same attention at fixed shapes.
-        One empty vector is always there to be read.
+        One empty vector can always be attended to.
         """
         lane_query, lane_at = lanes
         unlikely = vectors.scores[-1].sigmoid().amax(-1) <= MAP_SCORE
@@ -149,5 +149,5 @@ class MotionHead(PerceptionHead):
 
 
 def _append_zero(x: Tensor) -> Tensor:
-    """Zeros (or false) for one more entry of axis 1."""
+    """Append zeros (or false) as one more entry of axis 1."""
     return torch.cat([x, torch.zeros_like(x[:, :1])], 1)

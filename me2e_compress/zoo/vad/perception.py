@@ -1,4 +1,4 @@
-"""The ground floor of the head: queries, boxes and map vectors."""
+"""The perception part of the head: queries, boxes and map vectors."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from me2e_compress.zoo.vad.transformer import PerceptionTransformer
 
 
 class Agents(NamedTuple):
-    """What detection says, the last layer's queries and positions apart."""
+    """Outputs of detection, with queries and positions of the last layer."""
 
     scores: Tensor  # [3, 1, 300, classes], logits
     boxes: Tensor  # [3, 1, 300, 10], metres
@@ -33,7 +33,7 @@ class Agents(NamedTuple):
 
 
 class Map(NamedTuple):
-    """What the map decoder says, the last layer's queries and points apart."""
+    """Outputs of the map decoder, with queries and points of the last layer."""
 
     scores: Tensor  # [3, 1, 100, classes], logits
     boxes: Tensor  # [3, 1, 100, 4], cx cy w h, 0..1
@@ -42,7 +42,7 @@ class Map(NamedTuple):
 
 
 def classifier(classes: int, width: int = EMBED) -> nn.Sequential:
-    """Two normalised layers and the logits."""
+    """Build two normalised layers and the logits."""
     return nn.Sequential(
         nn.Linear(width, width),
         nn.LayerNorm(width),
@@ -55,7 +55,7 @@ def classifier(classes: int, width: int = EMBED) -> nn.Sequential:
 
 
 def regressor(outputs: int, width: int = EMBED) -> nn.Sequential:
-    """Two layers and the values."""
+    """Build two layers and the values."""
     return nn.Sequential(
         nn.Linear(width, width),
         nn.ReLU(),
@@ -66,7 +66,7 @@ def regressor(outputs: int, width: int = EMBED) -> nn.Sequential:
 
 
 class PerceptionHead(nn.Module):
-    """Queries, the perception transformer, and what is read from it."""
+    """Queries, the perception transformer, and the branches that read it."""
 
     def __init__(self, heads: Heads, sampling: Sampling) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class PerceptionHead(nn.Module):
     def perceive(
         self, features: Tensor, lidar2img: Tensor, can_bus: Tensor, prev_bev: Tensor
     ) -> tuple[Tensor, Agents, Map]:
-        """Camera features [cameras, 256, h, w] to BEV [1, cells, 256], boxes, map."""
+        """Map camera features [cameras, 256, h, w] to BEV, boxes and map vectors."""
         with region("bev_encoder"):
             cells = self.bev_embedding.weight.unsqueeze(0), self.positional_encoding()
         with region("map"):
@@ -140,7 +140,7 @@ def _repeat(make: Callable[[int], nn.Module], outputs: int) -> nn.ModuleList:
 
 
 def _box(raw: Tensor, at: Tensor) -> Tensor:
-    """Raw regression and refined centre (0..1) to a box in metres."""
+    """Convert raw regression and refined centre (0..1) to a box in metres."""
     x0, y0, z0, x1, y1, z1 = PC_RANGE
     x = at[..., 0:1] * (x1 - x0) + x0
     y = at[..., 1:2] * (y1 - y0) + y0
@@ -149,6 +149,6 @@ def _box(raw: Tensor, at: Tensor) -> Tensor:
 
 
 def _enclosing(points: Tensor) -> Tensor:
-    """Box (cx, cy, w, h) around the points of every vector."""
+    """Return the box (cx, cy, w, h) around the points of every vector."""
     low, high = points.amin(2), points.amax(2)
     return torch.cat([(low + high) / 2, high - low], -1)

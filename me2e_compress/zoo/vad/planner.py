@@ -1,4 +1,4 @@
-"""The top floor of the head: where the ego vehicle will go."""
+"""The planning part of the head: where the ego vehicle will go."""
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, 
 
 
 class PlanningHead(MotionHead):
-    """The whole head: the ego query reads the agents, then the map."""
+    """The whole head: the ego query attends to the agents, then to the map."""
 
     def __init__(self, heads: Heads, sampling: Sampling) -> None:
         super().__init__(heads, sampling)
@@ -34,7 +34,7 @@ class PlanningHead(MotionHead):
     def forward(
         self, features: Tensor, lidar2img: Tensor, can_bus: Tensor, prev_bev: Tensor
     ) -> Outputs:
-        """Camera features [cameras, 256, h, w] to everything the stack says."""
+        """Map camera features [cameras, 256, h, w] to all outputs of the stack."""
         bev, agents, vectors = self.perceive(features, lidar2img, can_bus, prev_bev)
         lanes = self.lanes(vectors)
         motion = self.forecast(agents, vectors, lanes)

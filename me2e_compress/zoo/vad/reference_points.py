@@ -1,4 +1,4 @@
-"""Where things are: pillars in the images, the previous BEV under the present one."""
+"""Reference points: pillars in the images, the previous BEV under the present one."""
 
 import math
 
@@ -14,7 +14,7 @@ number as float64."""
 
 
 def pillars(hw: tuple[int, int], pc_range: tuple[float, ...], heights: int) -> Tensor:
-    """Points above the cell centres: [heights, cells, 4, 1], x y z 1 in metres."""
+    """Return points above the cell centres: [heights, cells, 4, 1], x y z 1, metres."""
     low, high = torch.tensor(pc_range[:3]), torch.tensor(pc_range[3:])
     counts = (heights, hw[0], hw[1])
     z, y, x = torch.meshgrid(
@@ -48,7 +48,7 @@ def project(
 
 
 def ego_shift(can_bus: Tensor) -> Tensor:
-    """Translation since the last frame as a part of the BEV grid, [1, 2] (x, y).
+    """Return the last frame's translation as a part of the BEV grid, [1, 2] (x, y).
 
     The original takes length t and angle of the translation (dx, dy) and then
     y = t cos(ego - angle), x = t sin(ego - angle). Expanding the differences needs
@@ -66,7 +66,7 @@ def ego_shift(can_bus: Tensor) -> Tensor:
 
 
 def cell_positions() -> Tensor:
-    """Pixel centres of the BEV relative to the centre of rotation: [cells, 2]."""
+    """Return [cells, 2], the BEV's pixel centres relative to the rotation centre."""
     rows, columns = torch.meshgrid(
         torch.arange(BEV_HW[0]) + 0.5, torch.arange(BEV_HW[1]) + 0.5, indexing="ij"
     )

@@ -1,4 +1,4 @@
-"""Reading a feature map at fractional positions."""
+"""Sampling of a feature map at fractional positions."""
 
 import functools
 from typing import Literal
@@ -22,7 +22,7 @@ def sample(
         image: [N, C, H, W] float32.
         grid: [N, Q, P, 2] float32, x then y, -1 and 1 are the outer edges.
         sampling: ``operator`` uses grid_sample (ONNX opset 16 and later), ``gather``
-            says the same in operators of opset 13.
+            writes the same in operators of opset 13.
         mode: How values between pixels are made.
 
     Returns:

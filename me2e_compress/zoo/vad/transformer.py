@@ -88,7 +88,7 @@ class PerceptionTransformer(nn.Module):
             prev_bev: [cells, 1, 256].
 
         Returns:
-            BEV [1, cells, 256] and what `Decoder` says of agents and of map points.
+            BEV [1, cells, 256] and what `Decoder` returns for agents and map points.
         """
         with region("bev_encoder"):
             bev = self.bev(features, *cells, lidar2img, can_bus, prev_bev)
