@@ -1,4 +1,4 @@
-"""Driving comfort: the share of seconds a passenger would not mind."""
+"""Driving comfort: the share of seconds with every variable in its range."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""How one driver differs from another on the same routes."""
+"""Paired differences of two drivers on the same routes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Driving score: how far the ego came, times what its infractions cost."""
+"""Driving score: completion of the route, times the penalties of infractions."""
 
 import math
 from dataclasses import dataclass

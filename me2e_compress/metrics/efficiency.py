@@ -1,4 +1,4 @@
-"""Driving efficiency: how fast the ego is, measured against the traffic around it."""
+"""Driving efficiency: the ego's speed over that of the traffic around it."""
 
 from collections.abc import Iterator
 from statistics import fmean

@@ -1,4 +1,4 @@
-"""What a drive leaves behind."""
+"""An episode: the record of one route, driven to its end."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -82,7 +82,7 @@ class Episode:
         route_length_m: Metres.
         completion_percent: How much of the route was passed, 0 to 100.
         ending: Why it was over.
-        failure: What the policy did wrong, if that ended the route.
+        failure: How the policy failed, if that ended the route.
         infractions: In order of time.
         frames: Every 50 ms.
         decisions: Every inference.
@@ -111,7 +111,7 @@ class Episode:
 
     @property
     def succeeded(self) -> bool:
-        """The whole route without an infraction (a low speed is none)."""
+        """Whether the whole route was driven without infraction (low speed is none)."""
         return self.completion_percent >= 100.0 and all(
             infraction.kind is InfractionKind.MIN_SPEED
             for infraction in self.infractions

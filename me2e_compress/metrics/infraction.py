@@ -1,4 +1,4 @@
-"""What a driver can do wrong, in the words of the CARLA leaderboard."""
+"""Infractions, by the keys of the CARLA leaderboard, and what they cost."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -59,7 +59,7 @@ GIVE_WAY is ours.
 @with_config(ConfigDict(allow_inf_nan=False, extra="forbid"))
 @dataclass(frozen=True, slots=True)
 class Infraction:
-    """One thing that went wrong.
+    """One infraction.
 
     Attributes:
         kind: Which rule was broken.
@@ -80,7 +80,7 @@ class Infraction:
 
     @property
     def factor(self) -> float:
-        """What the driving score is multiplied by."""
+        """The factor on the driving score."""
         if self.kind is InfractionKind.OUTSIDE_ROUTE_LANES:
             return 1.0 - (self.percent or 0.0) / 100.0
         return PENALTY[self.kind]

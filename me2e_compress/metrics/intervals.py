@@ -1,4 +1,4 @@
-"""How sure a mean over routes is: 95 % confidence intervals."""
+"""Confidence intervals (95 %) of means and rates over routes."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""A number that travels with its unit, or the reason why there is none."""
+"""A value with its unit, or the reason why it was not measured."""
 
 import math
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ class Estimate:
 
     Attributes:
         measure: The mean, or None with the reason.
-        low: Lower end of the 95 % interval; None where n is too small for one.
-        high: Upper end of it.
+        low: Lower bound of the 95 % interval; None where n is too small for one.
+        high: Upper bound.
         n: How many routes the mean was taken over.
     """
 

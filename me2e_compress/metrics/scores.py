@@ -53,7 +53,7 @@ class Scores:
 
     @property
     def partial(self) -> bool:
-        """Whether routes are missing; the means leave them out, they are no zeros."""
+        """Whether routes are missing; the means leave them out, not as zeros."""
         return self.routes < self.expected
 
     def to_json(self) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def train(
         while running is not None and not running.join(POLL_S):
             on_step(group.steps_done(), what.steps)
     except ProcessException as error:
-        raise TrainingError(f"{folder}: training failed: {_told(error)}") from error
+        raise TrainingError(f"{folder}: training failed: {_cause(error)}") from error
     on_step(what.steps, what.steps)
     return last
 
@@ -87,7 +87,7 @@ def _process(rank: int, task: StageTask, group: ProcessGroup) -> None:
     TrainingProcess(rank, group, task).run()
 
 
-def _told(error: ProcessException) -> str:
+def _cause(error: ProcessException) -> str:
     """Return the last line of a process's traceback, without our errors' names."""
     last = str(error).strip().splitlines()[-1]
     kind, _, words = last.partition(": ")

@@ -135,8 +135,9 @@ class TrainingProcess:
         mine = torch.zeros_like(anchors)
         if self.rank == 0:
             mine = torch.from_numpy(anchors_of(episodes.departures(), len(anchors)))
-        everybody = self.group.average(self.rank, mine.flatten())
-        anchors.copy_(everybody.view_as(anchors) * self.task.what.workers)
+        average = self.group.average(self.rank, mine.flatten())
+        # only the first process has anchors: the sum, not the mean
+        anchors.copy_(average.view_as(anchors) * self.task.what.workers)
 
     def _learning(self) -> list[torch.nn.Parameter]:
         names = self.task.what.modules

@@ -101,7 +101,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         super().act()
 
     def step(self, dt: float) -> None:
-        """Move everybody; crashes are asked for with `touching`."""
+        """Move all vehicles; `touching` finds crashes."""
         for vehicle in self.vehicles:
             vehicle.step(dt)
 
