@@ -32,9 +32,10 @@ def test_modules_are_told_in_the_order_of_the_map() -> None:
     assert list(told()) == names
 
 
-@pytest.mark.parametrize(
-    "path", sorted(set(re.findall(r"`(zoo/[\w/]+(?:\.py|/))`", PAGE.read_text())))
-)
+FILES = r"`((?:zoo|training)/[\w/]+(?:\.py|/))`"
+
+
+@pytest.mark.parametrize("path", sorted(set(re.findall(FILES, PAGE.read_text()))))
 def test_a_file_it_names_is_there(path: str) -> None:
     assert (ROOT / "me2e_compress" / path).exists()
 
