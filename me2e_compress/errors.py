@@ -17,6 +17,22 @@
 Every message says what was found, what there is, and names the culprit, on one line.
 """
 
+__all__ = [
+    "EvaluationError",
+    "FramesError",
+    "GraphError",
+    "Me2eError",
+    "MissingExtraError",
+    "MissingPackageError",
+    "ModuleMapError",
+    "PassError",
+    "PreconditionError",
+    "RecipeError",
+    "StudyError",
+    "TrainingError",
+    "VerificationError",
+]
+
 
 class Me2eError(Exception):
     """Base class: the command line prints these on one line, without a traceback."""

@@ -36,6 +36,19 @@ import numpy.typing as npt
 
 from me2e_compress.metrics.episode import Episode
 
+__all__ = [
+    "CAN_BUS_SIZE",
+    "PLAN_SHAPE",
+    "PLAN_STEP_US",
+    "Evaluator",
+    "Observation",
+    "Plan",
+    "Policy",
+    "RouteInfo",
+    "SceneView",
+    "WorldView",
+]
+
 Plan = npt.NDArray[np.floating]
 """Six waypoints [6, 2], one every 0.5 s: metres in the ego frame of the observation, x
 forward, y left; the first is where the ego is to be 0.5 s later."""

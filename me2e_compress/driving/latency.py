@@ -19,6 +19,18 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
+__all__ = [
+    "LATENCY_SOURCES",
+    "Charge",
+    "FixedLatency",
+    "FrameRate",
+    "LatencySource",
+    "MeasuredLatency",
+    "NoLatency",
+    "TraceLatency",
+    "parse_latency",
+]
+
 Charge = Callable[[int], int]
 """From the microseconds a decision took here to those it takes on the vehicle."""
 

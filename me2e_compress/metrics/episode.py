@@ -9,6 +9,14 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 
 from me2e_compress.metrics.infraction import COLLISIONS, Infraction, InfractionKind
 
+__all__ = [
+    "FRAME_US",
+    "EgoFrame",
+    "Ending",
+    "Episode",
+    "InferenceRecord",
+]
+
 FRAME_US = 50_000
 """Microseconds between two frames: the simulators of the benchmarks run at 20 Hz."""
 

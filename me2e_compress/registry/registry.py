@@ -108,6 +108,8 @@ class Registry(Generic[T]):
             where = ".".join(str(part) for part in first["loc"]) or "options"
             if first["type"] == "missing":
                 raise self.error(f"{name} needs the option {where}") from error
+            if first["type"] == "value_error":  # the item's own words
+                raise self.error(f"{name}: {first['ctx']['error']}") from error
             raise self.error(f"{name}: {where}: {first['msg']}") from error
         return made
 

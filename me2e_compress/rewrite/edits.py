@@ -163,7 +163,11 @@ def _idle(graph: ir.Graph) -> list[ir.Value]:
 
 
 def sweep(model: ir.Model) -> None:
-    """Drop the nodes, weights and functions that nothing reads any more."""
+    """Drop the nodes, weights and functions that nothing reads any more.
+
+    It also takes trailing empty inputs and default attributes off the nodes that stay,
+    which would then have to name the pass: inside a pass use :func:`remove_dead`.
+    """
     common.RemoveUnusedNodesPass()(model)
     common.RemoveUnusedFunctionsPass()(model)  # type: ignore[no-untyped-call]
 

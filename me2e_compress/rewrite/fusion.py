@@ -12,6 +12,7 @@ from me2e_compress.graph import graphs_of, input_at, is_standard, opset_of, prov
 from me2e_compress.graph.nodes import Array, is_read, sole_reader
 from me2e_compress.rewrite.edits import (
     add_constant,
+    fresh_name,
     put,
     remove_dead,
     replace_value,
@@ -90,6 +91,25 @@ class Kit:
         put(last, op_type, inputs, by=self.by, sources=sources, attributes=attributes)
         for node in reversed(behind[:-1]):
             self.graph.remove(node, safe=True)
+
+    def add(
+        self,
+        op_type: str,
+        inputs: Sequence[ir.Value | None],
+        attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
+    ) -> ir.Value:
+        """Insert one more standard operator before what takes the match's place.
+
+        Returns:
+            What it computes; its type and shape are inferred after the pass.
+        """
+        root = self.match.root
+        name = fresh_name(f"{root.outputs[0].name}_{op_type}", self.names)
+        node = ir.node(op_type, inputs, attributes, name=name)
+        node.outputs[0].name = name
+        provenance.inherit(node, self.match.nodes, by=self.by)
+        self.graph.insert_before(root, node)
+        return node.outputs[0]
 
     def absorb(self, *changed: ir.Node) -> None:
         """Remove the last node; the first of the changed ones makes its output.

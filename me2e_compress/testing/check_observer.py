@@ -71,8 +71,12 @@ def _check_bounds(name: str, seen: Statistics, lows: Bounds, highs: Bounds) -> N
             )
         if not np.isfinite(bounds).all():
             raise VerificationError(f"{name}: a bound is not finite")
-    if (lows > highs).any():
-        raise VerificationError(f"{name}: a low bound is above the high one")
+    for tensor, low, high in zip(seen.tensors, lows, highs, strict=True):
+        if low > high:
+            raise VerificationError(
+                f"{name}: tensor {tensor!r}: the low bound {low:g} is above the high"
+                f" one {high:g}"
+            )
     if (lows < seen.lows.min(axis=0)).any() or (highs > seen.highs.max(axis=0)).any():
         raise VerificationError(
             f"{name}: a range reaches beyond what was seen, where steps are wasted"

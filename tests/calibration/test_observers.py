@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer, scale_of
-from me2e_compress.calibration.observers.base import MaxMin, MovingAverage
+from me2e_compress.calibration.observers.base import MaxMin, MovingAverage, within
 from me2e_compress.calibration.observers.histogram import (
     Entropy,
     MeanSquaredError,
@@ -196,3 +196,15 @@ def test_a_number_goes_to_the_observer_that_it_is_written_behind(
     install(monkeypatch, tmp_path, "an-rms", "me2e_compress.observers", entry)
 
     assert OBSERVERS.parse("rms:4") == RootMeanSquare(4.0)
+
+
+def test_a_range_shrinks_to_what_was_seen_where_the_reach_lies_inside() -> None:
+    """A tensor that never comes near zero: half of its largest is below its least."""
+    measured = np.array([[[3.0, 4.0, 12.0], [-4.0, -3.0, 12.0]]], np.float32)
+    seen = Statistics("", "", ("above", "below"), (0,), measured)
+
+    low, high = within(seen, np.array([2.0, 2.0], np.float32))
+
+    assert (low <= high).all()
+    assert low.tolist() == [3.0, -4.0]
+    assert high.tolist() == [3.0, -4.0]

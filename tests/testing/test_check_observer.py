@@ -134,7 +134,7 @@ class Wasteful(Plain):
         (Drifting(), "gives two ranges for one tensor"),
         (Beyond(), "reaches beyond what was seen"),
         (Shared(), "depends on the other tensors"),
-        (Twisted(), "a low bound is above the high one"),
+        (Twisted(), "the low bound .* is above the high one"),
         (Doubles(), r"a bound is float64 \[5\], it must be float32 \[5\]"),
         (Short(), r"a bound is float32 \[4\], it must be float32 \[5\]"),
         (Endless(), "a bound is not finite"),

@@ -72,9 +72,14 @@ def check_option(name: str, option: str, value: float, largest: float) -> None:
 
 
 def within(seen: Statistics, reach: Bounds) -> tuple[Bounds, Bounds]:
-    """Cut the extremes of every tensor off at plus and minus its reach."""
+    """Clip the extremes of every tensor at plus and minus its reach.
+
+    Where all that was seen lies beyond the reach, the range shrinks to the nearest
+    value that was seen.
+    """
     lows, highs = seen.lows.min(axis=0), seen.highs.max(axis=0)
-    return np.maximum(lows, -reach), np.minimum(highs, reach)
+    low, high = np.maximum(lows, -reach), np.minimum(highs, reach)
+    return np.minimum(low, highs), np.maximum(high, lows)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,12 @@ from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S
 from me2e_compress.workflows import evaluate as workflow
 
 Policy = Annotated[
-    str, typer.Argument(help="M.onnx, highway, expert, blind or blind:MPS")
+    str, typer.Argument(help="M.onnx, highway, expert, blind:MPS, or see list")
 ]
 Output = Annotated[Path, typer.Option("-o", "--output", help="the results folder")]
-Latency = Annotated[str, typer.Option(help="none, fps:F, trace:FILE or measured")]
+Latency = Annotated[
+    str, typer.Option(help="none, fps:F, trace:FILE, measured, or see list")
+]
 Scale = Annotated[float, typer.Option(help="of a trace or a measurement")]
 InOrder = Annotated[bool, typer.Option(help="replay a trace in its order")]
 Step = Annotated[float, typer.Option(help="step of the world")]
