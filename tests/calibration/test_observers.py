@@ -206,5 +206,5 @@ def test_a_range_shrinks_to_what_was_seen_where_the_reach_lies_inside() -> None:
     low, high = within(seen, np.array([2.0, 2.0], np.float32))
 
     assert (low <= high).all()
-    assert low.tolist() == [3.0, -4.0]
-    assert high.tolist() == [3.0, -4.0]
+    assert low.tolist() == [3.0, -3.0]
+    assert high.tolist() == [3.0, -3.0]

@@ -1,0 +1,64 @@
+"""The public names are those of ``public_names.txt``: none comes or goes unseen.
+
+After a change that is meant: ``python -m tests.docs.test_public_names``.
+"""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+LIST = Path(__file__).with_name("public_names.txt")
+ROOMS = (
+    "me2e_compress",
+    "me2e_compress.calibration.observers",
+    "me2e_compress.driving.contract",
+    "me2e_compress.driving.latency",
+    "me2e_compress.driving.policies",
+    "me2e_compress.errors",
+    "me2e_compress.evaluators",
+    "me2e_compress.graph",
+    "me2e_compress.manager",
+    "me2e_compress.metrics.episode",
+    "me2e_compress.modules",
+    "me2e_compress.passes",
+    "me2e_compress.quantization.plan",
+    "me2e_compress.quantization.rules",
+    "me2e_compress.recipe",
+    "me2e_compress.registry",
+    "me2e_compress.rewrite",
+    "me2e_compress.sensitivity",
+    "me2e_compress.study",
+    "me2e_compress.targets",
+    "me2e_compress.testing",
+)
+
+
+def public_names(room: str) -> list[str]:
+    return sorted(importlib.import_module(room).__all__)
+
+
+def held() -> dict[str, list[str]]:
+    lines = LIST.read_text(encoding="utf-8").splitlines()
+    found = dict[str, list[str]]()
+    for line in lines:
+        room, _, name = line.partition(": ")
+        found.setdefault(room, []).append(name)
+    return found
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_the_public_names_of_a_room_are_those_of_the_list(room: str) -> None:
+    assert public_names(room) == held()[room]
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_public_name_is_there(room: str) -> None:
+    module = importlib.import_module(room)
+    missing = [name for name in public_names(room) if not hasattr(module, name)]
+    assert missing == []
+
+
+if __name__ == "__main__":
+    lines = [f"{room}: {name}\n" for room in ROOMS for name in public_names(room)]
+    LIST.write_text("".join(lines), encoding="utf-8")
