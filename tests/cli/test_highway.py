@@ -13,6 +13,7 @@ def test_exact_passes_need_no_frames(command: Command, tmp_path: Path) -> None:
 
     report = json.loads((tmp_path / "exact.report.json").read_bytes())
     (check,) = report["verifications"]
-    assert check["inputs"] == "synthetic"
-    assert set(check["unsteady"]) <= {"plan", "route"}
+    assert check["inputs"] == "recorded"
+    assert check["unsteady"] == []
+    assert check["errors"]["plan"] < 1e-5
     assert check["errors"]["occupancy"] < 1e-5
