@@ -165,10 +165,10 @@ def _idle(graph: ir.Graph) -> list[ir.Value]:
 def sweep(model: ir.Model) -> None:
     """Drop the nodes, weights and functions that nothing reads any more.
 
-    It also takes trailing empty inputs and default attributes off the nodes that stay,
-    which would then have to name the pass: inside a pass use :func:`remove_dead`.
+    Nodes that stay are left as they are, default attributes and empty inputs too: a
+    changed node would have to name the pass.
     """
-    common.RemoveUnusedNodesPass()(model)
+    remove_dead(model.graph)
     common.RemoveUnusedFunctionsPass()(model)  # type: ignore[no-untyped-call]
 
 

@@ -75,3 +75,12 @@ def test_the_driver_that_ships_is_judged_on_its_own_frames(
     assert check["inputs"] == "recorded"
     assert "plan" not in check["unsteady"]
     assert check["errors"]["plan"] < 1e-5
+
+
+def test_a_module_of_the_driver_that_ships_can_be_dropped(
+    command: Command, tmp_path: Path
+) -> None:
+    """Its graph spells defaults out, which no pass may tidy up on the way."""
+    passes = ("--passes", "ablate-modules{drop=[occ], drop_outputs=true}")
+    output = ("--verify-frames", 0, "-o", tmp_path / "out.onnx")
+    assert command("compress", "highway", *passes, *output) == 0
