@@ -62,7 +62,7 @@ class PassManager:
             PassError: a pass broke.
             VerificationError: a pass broke the contract or changed the outputs.
         """
-        with _collector_paused():
+        with collector_paused():
             return self._run(model.clone(), context, progress or _silent)
 
     def _run(self, model: ir.Model, context: Context, progress: Progress) -> Report:
@@ -89,7 +89,7 @@ class PassManager:
 
 
 @contextlib.contextmanager
-def _collector_paused() -> Iterator[None]:
+def collector_paused() -> Iterator[None]:
     """Let Python's cycle collector rest: it would walk a million live nodes in vain.
 
     A quarter of the time of a run goes into that otherwise. What a pass leaves behind

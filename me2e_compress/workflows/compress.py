@@ -11,6 +11,7 @@ from me2e_compress import recipe as recipes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import RecipeError
 from me2e_compress.manager import PassManager, Report
+from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of, save_plan
@@ -150,25 +151,26 @@ def compress(
     read = [file for each in passes for file in each.files()]
     named = recipe if isinstance(recipe, str | Path) else None
     check_output(_written(output), (source, named, frames, options.module_map, *read))
-    loaded = graph.load(source)
-    modules = load_map(options.module_map, loaded)
-    recording = None
-    if frames is not None:
-        recording = CalibrationSet(Path(frames))
-        recording.check(loaded)
-    samples = None if recording is not None else sample_frames(source)
-    manager = PassManager(
-        passes,
-        options.verify_frames,
-        output.parent,
-        None if samples is None else CalibrationSet(samples),
-    )
-    report = manager.run(
-        loaded,
-        Context(modules, recording, options.seed),
-        partial(listener.on_progress, "passes"),
-    )
-    return _write(report, source, output)
+    with collector_paused():
+        loaded = graph.load(source)
+        modules = load_map(options.module_map, loaded)
+        recording = None
+        if frames is not None:
+            recording = CalibrationSet(Path(frames))
+            recording.check(loaded)
+        samples = None if recording is not None else sample_frames(source)
+        manager = PassManager(
+            passes,
+            options.verify_frames,
+            output.parent,
+            None if samples is None else CalibrationSet(samples),
+        )
+        report = manager.run(
+            loaded,
+            Context(modules, recording, options.seed),
+            partial(listener.on_progress, "passes"),
+        )
+        return _write(report, source, output)
 
 
 def _written(output: Path) -> tuple[Path, ...]:
