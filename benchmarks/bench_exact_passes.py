@@ -120,7 +120,7 @@ def onnxslim(job: Job) -> Work:
 
 def work_alone(tool: str, job: Job) -> None:
     """Run one tool here and print what it took as the last line, in JSON."""
-    prepare = dict(zip(TOOLS, (ours, verified, onnxsim, onnxslim), strict=True))[tool]
+    prepare = (ours, verified, onnxsim, onnxslim)[TOOLS.index(tool)]
     work = prepare(job)
     startup, wall = time.process_time(), time.perf_counter()
     with contextlib.redirect_stderr(io.StringIO()):

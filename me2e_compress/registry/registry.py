@@ -71,15 +71,15 @@ class Registry(Generic[T]):
                 a frozen dataclass of that name.
             MissingExtraError: what it needs is not installed.
         """
-        claims = self._claims(name)
-        if not claims:
+        claim, *rivals = self._claims(name) or (None,)
+        if claim is None:
             raise self._unknown(name)
-        if len(claims) > 1:
+        if rivals:
             packages = " and ".join(self.sources(name))
             raise self.error(
                 f"{self.kind} {name!r} is claimed by {packages}: uninstall one of them"
             )
-        return self._load(claims[0])
+        return self._load(claim)
 
     def usable(self) -> tuple[str, ...]:
         """List the names whose classes can be imported."""
@@ -108,8 +108,8 @@ class Registry(Generic[T]):
             where = ".".join(str(part) for part in first["loc"]) or "options"
             if first["type"] == "missing":
                 raise self.error(f"{name} needs the option {where}") from error
-            if first["type"] == "value_error":  # the item's own words
-                raise self.error(f"{name}: {first['ctx']['error']}") from error
+            if own := first.get("ctx", {}).get("error"):  # the item's own words
+                raise self.error(f"{name}: {own}") from error
             raise self.error(f"{name}: {where}: {first['msg']}") from error
         return made
 

@@ -1,5 +1,5 @@
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -91,7 +91,8 @@ class Doubles(Plain):
 
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
         lows, highs = super().ranges(seen)
-        return lows, highs.astype(np.float64)
+        wide: Any = highs.astype(np.float64)
+        return lows, wide
 
 
 @dataclass(frozen=True)
