@@ -1,9 +1,8 @@
-import time
-
 import onnx_ir as ir
 import pytest
 
 from me2e_compress.targets.onnxruntime.region import never_negative
+from tests.calls import calls
 
 
 def nested(first: str, depth: int) -> ir.Value:
@@ -20,9 +19,9 @@ def nested(first: str, depth: int) -> ir.Value:
 def test_what_many_ways_lead_to_is_looked_at_once(first: str, found: bool) -> None:
     value = nested(first, 2000)
 
-    before = time.process_time()
+    # one look at each way would be 2 ** 2000 calls
+    assert calls(lambda: never_negative(value)) < 100 * 2000
     assert never_negative(value) is found
-    assert time.process_time() - before < 1
 
 
 def test_one_negative_branch_is_enough() -> None:
