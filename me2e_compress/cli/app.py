@@ -1,78 +1,176 @@
-"""All commands together."""
+"""All commands together; the code of each is imported when it is named."""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
-from me2e_compress.cli.commands.calibrate import calibrate
-from me2e_compress.cli.commands.compare import compare
-from me2e_compress.cli.commands.compress import compress
-from me2e_compress.cli.commands.demo import demo
-from me2e_compress.cli.commands.doctor import doctor
-from me2e_compress.cli.commands.export import export
-from me2e_compress.cli.commands.frames import frames
-from me2e_compress.cli.commands.inspect import inspect
-from me2e_compress.cli.commands.lint import lint
-from me2e_compress.cli.commands.list import list_entries
-from me2e_compress.cli.commands.plan import plan
-from me2e_compress.cli.commands.profile import profile
-from me2e_compress.cli.commands.search import search
-from me2e_compress.cli.commands.sensitivity import sensitivity
 from me2e_compress.errors import MissingExtraError
-from me2e_compress.workflows.extras import ROAD, ZOO, are_there
+from me2e_compress.workflows.extras import missing_extra
 
-CLOSED_LOOP = ("evaluate", "routes", "score", "study")
-"""Commands that drive or score."""
 
-app = typer.Typer(
-    name="me2e-compress",
-    help="Make modular end-to-end driving models small, and prove that they drive.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+@dataclass(frozen=True)
+class CommandEntry:
+    """What is known of a command before its code is imported.
+
+    Attributes:
+        name: As it is called; also of its file and its function.
+        help: The first line of its docstring.
+        extra: Of the package, which it takes; empty for none.
+        function: Where it is not called like the command.
+    """
+
+    name: str
+    help: str
+    extra: str = ""
+    function: str = ""
+
+    def line(self) -> str:
+        """Return what the list of commands says of it."""
+        lacking = missing_extra(self.extra)
+        return f"Needs the extra {lacking}." if lacking else self.help
+
+    def load(self) -> Any:
+        """Import the command, as Click knows it; without its extra it says so."""
+        alone = _app()
+        if missing_extra(self.extra):
+            anything = {"allow_extra_args": True, "ignore_unknown_options": True}
+            alone.command(self.name, context_settings=anything, help=self.line())(
+                self._advise
+            )
+        else:
+            home = importlib.import_module(f"me2e_compress.cli.commands.{self.name}")
+            alone.command(self.name)(getattr(home, self.function or self.name))
+        return typer.main.get_command(alone)
+
+    def _advise(self) -> None:
+        raise MissingExtraError(f"what {self.name} needs", self.extra)
+
+
+_ENTRIES = (
+    CommandEntry(
+        "demo",
+        "Run the main job on what ships: compress, verify, compare, drive, report.",
+    ),
+    CommandEntry(
+        "doctor", "Show what this machine can do, and what to install for the rest."
+    ),
+    CommandEntry(
+        "export",
+        "Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver.",
+    ),
+    CommandEntry(
+        "inspect",
+        "Show what a graph holds: interface, and nodes, parameters, MACs by module.",
+    ),
+    CommandEntry(
+        "frames", "Write calibration frames, coherent in time, seen by six cameras."
+    ),
+    CommandEntry(
+        "calibrate",
+        "Measure the ranges of every tensor that any scheme, rule set or target needs.",
+    ),
+    CommandEntry(
+        "plan",
+        "Show which nodes become int8, which stay float, by which rule, and why.",
+    ),
+    CommandEntry(
+        "compress",
+        "Apply passes to a graph, check each, and write the smaller graph and a"
+        " report.",
+    ),
+    CommandEntry(
+        "lint",
+        "Check a graph for the program that will run it; 1 if it would be refused.",
+    ),
+    CommandEntry(
+        "compare",
+        "Run two graphs over frames: SQNR of every output, plan displacement in"
+        " metres.",
+    ),
+    CommandEntry(
+        "profile",
+        "Measure a model alone and warm, and write its latencies as a trace.",
+    ),
+    CommandEntry(
+        "sensitivity",
+        "Measure what int8 costs per module and node, and write a recipe within a"
+        " limit.",
+    ),
+    CommandEntry(
+        "search",
+        "Find the modules whose int8 meets a budget and costs the plan least.",
+    ),
+    CommandEntry(
+        "list",
+        "Show what can be named: ours, and what other packages add by entry point.",
+        function="list_entries",
+    ),
+    CommandEntry(
+        "evaluate",
+        "Drive a policy over routes of highway-env; run it again to go on.",
+        "highway",
+    ),
+    CommandEntry(
+        "routes",
+        "Make a fresh set of admitted routes, or examine an existing set again.",
+        "highway",
+    ),
+    CommandEntry(
+        "score",
+        "Print driving score, success rate, efficiency, comfort and abilities.",
+        "highway",
+    ),
+    CommandEntry(
+        "study",
+        "Drive variants under conditions and compare them; run it again to go on.",
+        "highway",
+    ),
+    CommandEntry(
+        "train",
+        "Train the driver from nothing: collect, learn, drive, learn again (hours).",
+        "zoo,highway",
+    ),
 )
-for command in (
-    demo, doctor, export, inspect, frames, calibrate, plan, compress, lint, compare,
-    profile, sensitivity, search,
-):  # fmt: skip
-    app.command()(command)
-app.command("list")(list_entries)
+
+COMMANDS = {entry.name: entry for entry in _ENTRIES}
+"""In the order in which ``--help`` lists them."""
 
 
-def add_closed_loop(app: typer.Typer) -> None:
-    """Add the commands that drive or score: the extra ``highway`` brings them."""
-    if not are_there(ROAD):
-        for name in CLOSED_LOOP:
-            _advise_on(app, name, "highway")
-        return
-    from me2e_compress.cli.commands.evaluate import evaluate
-    from me2e_compress.cli.commands.routes import routes
-    from me2e_compress.cli.commands.score import score
-    from me2e_compress.cli.commands.study import study
+class LazyGroup(TyperGroup):
+    """Commands that are names and lines of help until one of them is called."""
 
-    for command in (evaluate, routes, score, study):
-        app.command()(command)
+    def resolve_command(
+        self, ctx: Any, args: list[str]
+    ) -> tuple[str | None, Any, list[str]]:
+        """Import the command that the first word names."""
+        name, known, rest = super().resolve_command(ctx, args)
+        return name, known if name is None else COMMANDS[name].load(), rest
 
 
-def add_training(app: typer.Typer) -> None:
-    """Add the command that trains: it takes the extras ``zoo`` and ``highway``."""
-    if not are_there((*ROAD, *ZOO)):
-        _advise_on(app, "train", "zoo,highway")
-        return
-    from me2e_compress.cli.commands.train import train
-
-    app.command()(train)
+def build_app() -> typer.Typer:
+    """Build the application: every command as a name and a line of help."""
+    made = _app()
+    for entry in COMMANDS.values():
+        made.command(entry.name, help=entry.line())(_not_imported)
+    return made
 
 
-def _advise_on(app: typer.Typer, name: str, extra: str) -> None:
-    """Add a command that does nothing but say what to install."""
-
-    def advise(context: typer.Context) -> None:
-        raise MissingExtraError(f"what {context.info_name} needs", extra)
-
-    anything = {"allow_extra_args": True, "ignore_unknown_options": True}
-    app.command(name, context_settings=anything, help=f"Needs the extra {extra}.")(
-        advise
+def _app() -> typer.Typer:
+    return typer.Typer(
+        cls=LazyGroup,
+        name="me2e-compress",
+        help="Make modular end-to-end driving models small, and prove that they drive.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
     )
 
 
-add_closed_loop(app)
-add_training(app)
+def _not_imported() -> None:
+    """Stand for a command in the list of commands."""
+
+
+app = build_app()

@@ -4,15 +4,20 @@ from importlib import util
 
 from me2e_compress.errors import MissingExtraError
 
-ROAD = ("highway_env", "cv2", "jinja2", "matplotlib", "scipy")
-"""Packages of the extra ``highway``."""
-ZOO = ("torch",)
-"""Packages of the extra ``zoo``."""
+PACKAGES = {
+    "highway": ("highway_env", "cv2", "jinja2", "matplotlib", "scipy"),
+    "zoo": ("torch",),
+}
+"""What each extra brings, as it is imported."""
 
 
-def are_there(packages: tuple[str, ...]) -> bool:
-    """Return whether all packages are installed."""
-    return all(util.find_spec(name) is not None for name in packages)
+def missing_extra(extras: str) -> str:
+    """Return the extras, parted by commas, if a package of them is not installed.
+
+    Empty, if all are.
+    """
+    needed = [name for extra in extras.split(",") for name in PACKAGES.get(extra, ())]
+    return "" if all(map(util.find_spec, needed)) else extras
 
 
 def need_closed_loop(what: str) -> None:
@@ -21,5 +26,5 @@ def need_closed_loop(what: str) -> None:
     Raises:
         MissingExtraError: it is not, and ``what`` needs it.
     """
-    if not are_there(ROAD):
+    if missing_extra("highway"):
         raise MissingExtraError(what, "highway")

@@ -4,13 +4,12 @@ from pathlib import Path
 
 import onnx_ir as ir
 import pytest
-import typer.main
 
 from me2e_compress import graph
-from me2e_compress.cli.app import app
+from me2e_compress.cli.app import COMMANDS
 from tests.cli.conftest import Command, strict
 
-NAMES = sorted(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+NAMES = sorted(COMMANDS)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -19,6 +18,12 @@ def test_every_command_explains_itself(
 ) -> None:
     assert command(name, "--help") == 0
     assert name in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_list_of_commands_says_what_the_command_says(name: str) -> None:
+    full = COMMANDS[name].load().help
+    assert COMMANDS[name].help == full.partition("\n")[0]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from me2e_compress.cli.app import add_training
+from me2e_compress.cli.app import build_app
 from me2e_compress.errors import MissingExtraError
 from me2e_compress.training.course import claim
 from me2e_compress.training.curriculum import FULL
@@ -60,11 +59,10 @@ def test_without_an_extra_it_says_what_to_install(
     monkeypatch.setattr(
         "importlib.util.find_spec", lambda name: None if name == missing else object()
     )
-    app = typer.Typer()
-    app.command("other")(lambda: None)  # with one command Typer asks for no name
-    add_training(app)
 
-    found = CliRunner().invoke(app, ["train", "highway", "--small", "-o", "out"])
+    found = CliRunner().invoke(
+        build_app(), ["train", "highway", "--small", "-o", "out"]
+    )
 
     assert isinstance(found.exception, MissingExtraError)
     assert str(found.exception).endswith("pip install 'me2e-compress[zoo,highway]'")

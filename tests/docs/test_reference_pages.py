@@ -8,9 +8,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import typer
 
-from me2e_compress.cli.app import app
+from me2e_compress.cli.app import COMMANDS
 from me2e_compress.errors import GraphError
 from tests.docs.conftest import run
 from tests.docs.pages import PAGES, WRITING, Block, blocks
@@ -69,7 +68,7 @@ def test_a_command_of_the_documents_is_one(line: str) -> None:
     """Its options exist and its values are of their types; nothing is run."""
     words = shlex.split(re.split(r"\s{3,}", line)[0], comments=True)[1:]
     name, *rest = words
-    command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
+    command = COMMANDS[name].load()
     if rest and "..." not in line and "…" not in line:
         with contextlib.suppress(GraphError):  # the model is not there
             command.make_context(name, rest)
