@@ -100,6 +100,20 @@ __all__ = [
     "write_study",
 ]
 
+_MODULES = (
+    "errors",
+    "evaluators",
+    "graph",
+    "modules",
+    "passes",
+    "recipe",
+    "registry",
+    "rewrite",
+    "targets",
+    "testing",
+)
+"""Packages and modules whose names are public; they load when they are asked for."""
+
 _ROOMS = {
     "calibration.dataset": ("CalibrationSet",),
     "errors": ("Me2eError",),
@@ -132,7 +146,7 @@ _HOMES = {name: room for room, names in _ROOMS.items() for name in names}
 
 def __getattr__(name: str) -> object:
     """Load a public name when it is asked for: a worker pays only for what it uses."""
-    if name in ("graph", "recipe"):
+    if name in _MODULES:
         return importlib.import_module(f"me2e_compress.{name}")
     if name in _HOMES:
         return getattr(importlib.import_module(f"me2e_compress.{_HOMES[name]}"), name)
@@ -140,5 +154,6 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """List the public names, for completion."""
-    return __all__
+    """List the public names and what is loaded, for completion."""
+    dunders = (name for name in globals() if name.startswith("__"))
+    return sorted({*__all__, *_MODULES, *dunders})

@@ -16,6 +16,14 @@ def test_every_public_name_is_there(name: str) -> None:
     assert getattr(me2e_compress, name) is not None
 
 
+def test_completion_offers_every_public_name_and_room() -> None:
+    offered = dir(me2e_compress)
+
+    assert set(me2e_compress.__all__) <= set(offered)
+    assert {"passes", "errors", "testing", "__doc__", "__file__"} <= set(offered)
+    assert all(getattr(me2e_compress, name) is not None for name in offered if name)
+
+
 @pytest.mark.parametrize("name", PASSES.names())
 def test_every_pass_shows_before_and_after(name: str) -> None:
     text = PASSES.get(name).__doc__ or ""

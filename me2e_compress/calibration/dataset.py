@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
@@ -60,7 +61,7 @@ def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
 __all__ = ["CalibrationSet", "Frame", "synthetic"]
 
 
-class CalibrationSet:
+class CalibrationSet(Displayed):
     """A recording on disk, read frame by frame.
 
     Args:
@@ -70,7 +71,8 @@ class CalibrationSet:
         FramesError: no such folder, no frames, or scenes.json is missing or wrong.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: str | Path) -> None:
+        folder = Path(folder)
         if not folder.is_dir():
             raise FramesError(f"{folder}: no such folder")
         self.folder = folder
@@ -78,6 +80,20 @@ class CalibrationSet:
         if not self.files:
             raise FramesError(f"{folder}: holds no .npz frames")
         self.scenes = _scenes(folder / "scenes.json", len(self.files))
+
+    @property
+    def headline(self) -> str:
+        """Folder, frames, scenes."""
+        return f"{self.folder}: {len(self)} frames in {len(self.scenes)} scenes"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a row an input: what the first frame holds of it."""
+        arrays = self[0].arrays
+        rows = [
+            (name, str(each.dtype), str(list(each.shape)))
+            for name, each in arrays.items()
+        ]
+        return (table("The first frame", ("input", "type", "shape"), rows, words=3),)
 
     def __len__(self) -> int:
         """Count the frames."""

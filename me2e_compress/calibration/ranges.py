@@ -9,6 +9,7 @@ import pydantic
 
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import Statistics
+from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_json
 
@@ -24,8 +25,8 @@ IMPORTED = "imported"
 """Method of ranges that another tool measured; on which frames, is not known."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Ranges:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Ranges(Displayed):
     """The range of every calibrated tensor.
 
     Attributes:
@@ -65,6 +66,19 @@ class Ranges:
             seen.source,
             _outliers(seen),
         )
+
+    @property
+    def headline(self) -> str:
+        """Tensors, method, frames."""
+        return f"{len(self.tensors)} tensors, {self.method}, {self.frames} frames"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a row a tensor: its bounds."""
+        rows = [
+            (name, f"{low:.4g}", f"{high:.4g}")
+            for name, (low, high) in self.tensors.items()
+        ]
+        return (table("Ranges", ("tensor", "low", "high"), rows),)
 
     @property
     def dead(self) -> tuple[str, ...]:

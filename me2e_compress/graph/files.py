@@ -21,7 +21,7 @@ _PLAIN_INITIALIZERS_SINCE_IR = 4
 """The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)."""
 
 
-def load(path: Path) -> ir.Model:
+def load(path: str | Path) -> ir.Model:
     """Read an ONNX file; external weights stay on disk and are mapped when read.
 
     Initializers that the exporter also listed as inputs
@@ -32,6 +32,7 @@ def load(path: Path) -> ir.Model:
         GraphError: no such file, not an ONNX model, cut short, or its data file is
             missing or shorter than the model says.
     """
+    path = Path(path)
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     try:
@@ -48,7 +49,7 @@ def load(path: Path) -> ir.Model:
     return model
 
 
-def save(model: ir.Model, path: Path, *, external: bool | None = None) -> None:
+def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> None:
     """Write an ONNX file, all or nothing.
 
     Args:
@@ -61,6 +62,7 @@ def save(model: ir.Model, path: Path, *, external: bool | None = None) -> None:
         GraphError: the folder does not exist, or a data file of the model itself
             stands where this one would go.
     """
+    path = Path(path)
     if not path.parent.is_dir():
         raise GraphError(f"{path}: no such folder {path.parent}")
     stored = list(_external(model))

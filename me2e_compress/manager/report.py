@@ -3,11 +3,20 @@
 import dataclasses
 import importlib.metadata
 import platform
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.display import (
+    AT_LEAST,
+    Displayed,
+    Table,
+    giga,
+    megabytes,
+    table,
+)
 from me2e_compress.graph import Size
 
 _PACKAGES = ("me2e-compress", "onnx", "onnx-ir", "onnxruntime", "numpy")
@@ -61,8 +70,8 @@ class Verification:
     unsteady: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
-class Report:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Report(Displayed):
     """The compressed model and how it came to be.
 
     Attributes:
@@ -76,6 +85,18 @@ class Report:
     pipeline: str
     steps: tuple[Step, ...]
     verifications: tuple[Verification, ...]
+
+    @property
+    def headline(self) -> str:
+        """Count the passes, and the nodes before and after."""
+        if not self.steps:
+            return "no passes"
+        first, last = self.steps[0].before, self.steps[-1].after
+        return f"{len(self.steps)} passes, {first.nodes} → {last.nodes} nodes"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return pass by pass what changed, and how exact passes were checked."""
+        return steps_table(self.steps), verification_table(self.verifications)
 
     def record(self, source: Path, output: Path) -> dict[str, object]:
         """Give everything but the weights, ready for JSON.
@@ -103,3 +124,54 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[package] = "not installed as a package"
     return found
+
+
+def steps_table(steps: Sequence[Step]) -> Table:
+    """Show pass by pass what changed and what it cost, and what the passes say."""
+    notes = [f"{step.name}: {note}" for step in steps for note in step.notes]
+    if any(step.after.unknown_macs_nodes for step in steps):
+        notes.append(AT_LEAST)
+    return table(
+        "Pass by pass",
+        ("pass", "changes", "nodes", "weights MB", "GMACs", "CPU s"),
+        [
+            (
+                step.name,
+                str(step.changes),
+                f"{step.before.nodes} → {step.after.nodes}",
+                f"{megabytes(step.before.weight_bytes)} →"
+                f" {megabytes(step.after.weight_bytes)}",
+                giga(step.after.macs, step.after.unknown_macs_nodes),
+                f"{step.seconds:.2f}",
+            )
+            for step in steps
+        ],
+        "\n".join(notes),
+    )
+
+
+def verification_table(verifications: Iterable[Verification]) -> Table:
+    """Show how far exact passes moved the outputs."""
+    rows, unsteady = list[tuple[str, ...]](), False
+    for check in verifications:
+        names = ", ".join(check.passes)
+        if check.skipped is not None:
+            rows.append((names, f"not measured: {check.skipped}", "", "", ""))
+            continue
+        judged = [name for name in check.errors if name not in check.unsteady]
+        for worst in sorted(judged, key=lambda name: -check.errors[name])[:1]:
+            error, allowed = check.errors[worst], check.tolerances[worst]
+            rows.append((names, check.inputs, worst, f"{error:.1e}", f"{allowed:.0e}"))
+        if check.unsteady:
+            listed, unsteady = ", ".join(check.unsteady), True
+            rows.append((names, check.inputs, listed, "not judged", ""))
+    return table(
+        "Exact passes, checked by running both graphs",
+        ("passes", "inputs", "worst output", "max|a-b|/max|a|", "allowed"),
+        rows,
+        "not judged: on these inputs rounding alone moves the output as far; "
+        "recorded frames (--frames) tell more"
+        if unsteady
+        else "",
+        words=3,
+    )

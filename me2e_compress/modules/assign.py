@@ -7,6 +7,7 @@ from typing import Literal
 
 import onnx_ir as ir
 
+from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.modules.module_map import ModuleMap
 from me2e_compress.modules.paths import parameter_path, scope_of
@@ -25,8 +26,8 @@ class Placement:
     rule: Rule
 
 
-@dataclasses.dataclass(frozen=True)
-class Assignment:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Assignment(Displayed):
     """The module of every node of a graph, nodes in subgraphs included.
 
     Attributes:
@@ -36,6 +37,18 @@ class Assignment:
 
     modules: ModuleMap
     placements: Mapping[ir.Node, Placement]
+
+    @property
+    def headline(self) -> str:
+        """Count the nodes, by rule."""
+        counts = ", ".join(f"{count} by {rule}" for rule, count in self.rules().items())
+        return f"map {self.modules.name}, {len(self.placements)} nodes: {counts}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a row a module: its nodes."""
+        nodes = Counter(place.module for place in self.placements.values())
+        rows = [(name, str(nodes[name])) for name in self.modules.names()]
+        return (table("Nodes by module", ("module", "nodes"), rows),)
 
     def module_of(self, node: ir.Node) -> str:
         """Return the module of a node of the graph that was assigned."""

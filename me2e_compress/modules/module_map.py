@@ -10,10 +10,14 @@ from typing import Literal, Self
 
 import pydantic
 
+from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.modules.paths import PathGlob, is_malformed
 
 Role = Literal["feature", "prediction"]
+
+WHOLE = "whole"
+"""Name of the map of a graph that is no stack; see `ModuleMap.whole`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +54,8 @@ class Module:
     substitutes: tuple[Substitute, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
-class ModuleMap:
+@dataclasses.dataclass(frozen=True, repr=False)
+class ModuleMap(Displayed):
     """The modules of a stack and the names they go by.
 
     One list of patterns a module, matched alike against parameter names
@@ -74,6 +78,8 @@ class ModuleMap:
     @classmethod
     def load(cls, source: str | Path) -> Self:
         """Read a preset by its name, or a user's TOML file.
+
+        ``whole`` is the map of a graph that is no stack: one module.
 
         ```toml
         strip = ["model"]                     # may be left out
@@ -98,10 +104,12 @@ class ModuleMap:
             except UnicodeDecodeError as error:
                 raise ModuleMapError(f"{path}: not TOML ({error})") from error
             return cls.parse(text, path.stem, str(path))
+        if str(source) == WHOLE:
+            return cls.whole()
         if str(source) not in presets():
             raise ModuleMapError(
-                f"{source}: no such module map; presets are {', '.join(presets())},"
-                " anything else must be a .toml file"
+                f"{source}: no such module map; presets are"
+                f" {', '.join((*presets(), WHOLE))}, anything else must be a .toml file"
             )
         text = _folder().joinpath(f"{source}.toml").read_text("utf-8")
         return cls.parse(text, str(source), f"preset {source}")
@@ -127,7 +135,20 @@ class ModuleMap:
     @classmethod
     def whole(cls) -> Self:
         """Return the map of a graph that is no ME2E stack: one module, ``model``."""
-        return cls("whole", (Module("model", "feature", (), ("**",)),))
+        return cls(WHOLE, (Module("model", "feature", (), ("**",)),))
+
+    @property
+    def headline(self) -> str:
+        """Name the map and its modules."""
+        return f"{self.name}: {', '.join(self.names())}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a row a module: its role and the names it goes by."""
+        rows = [
+            (each.name, each.role, ", ".join(each.patterns + each.optional))
+            for each in self.modules
+        ]
+        return (table("Modules", ("module", "role", "patterns"), rows, words=3),)
 
     def names(self, role: Role | None = None) -> tuple[str, ...]:
         """List the modules, all or those of a role, in the order of the file."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 Array: TypeAlias = npt.NDArray[np.generic]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Frame:
     """The inputs of one moment.
 
@@ -23,6 +23,12 @@ class Frame:
     index: int
     starts_scene: bool
     arrays: dict[str, Array]
+
+    def __repr__(self) -> str:
+        """Show index and shapes, not the pictures."""
+        shapes = (f"{name} {list(each.shape)}" for name, each in self.arrays.items())
+        starts = ", starts a scene" if self.starts_scene else ""
+        return f"<Frame: {self.index}{starts}; {', '.join(shapes)}>"
 
 
 class Frames(Protocol):

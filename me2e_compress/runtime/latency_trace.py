@@ -7,14 +7,15 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.atomic import write_json
 
 PERCENTILES = (50, 90, 99)
 
 
-@dataclass(frozen=True)
-class LatencyTrace:
+@dataclass(frozen=True, repr=False)
+class LatencyTrace(Displayed):
     """Latencies in the order in which they were measured.
 
     Attributes:
@@ -28,6 +29,20 @@ class LatencyTrace:
     machine: str
     samples_us: tuple[int, ...]
     frames: str | None = None
+
+    @property
+    def headline(self) -> str:
+        """Number of inferences, machine."""
+        return f"{len(self.samples_us)} inferences on {self.machine}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the percentiles in milliseconds."""
+        rows = [
+            *((f"p{p}", self.percentile_us(p)) for p in PERCENTILES),
+            ("max", self.max_us),
+        ]
+        shown = [(name, f"{taken_us / 1e3:.2f}") for name, taken_us in rows]
+        return (table(self.headline, ("latency", "ms"), shown),)
 
     def percentile_us(self, percent: float) -> int:
         """Return the smallest sample that so many percent do not exceed."""

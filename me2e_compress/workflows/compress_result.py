@@ -1,18 +1,11 @@
 """What a compression made: the graph, the report and their tables."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
-from me2e_compress.manager import Report, Step, Verification
-from me2e_compress.workflows.result import (
-    AT_LEAST,
-    Result,
-    Table,
-    giga,
-    megabytes,
-    table,
-)
+from me2e_compress.manager import Report
+from me2e_compress.workflows.result import Result, Table, megabytes
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -52,8 +45,7 @@ class CompressResult(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Return pass by pass what changed, and how exact passes were checked."""
-        report = self.report
-        return steps_table(report.steps), verification_table(report.verifications)
+        return self.report.tables()
 
     def records(self) -> list[dict[str, object]]:
         """Return a row a pass."""
@@ -78,54 +70,3 @@ class CompressResult(Result):
 def beside(output: Path, what: str) -> Path:
     """Name the file that lies beside a compressed graph: ``plan`` or ``report``."""
     return output.with_name(f"{output.stem}.{what}.json")
-
-
-def steps_table(steps: Sequence[Step]) -> Table:
-    """Show pass by pass what changed and what it cost, and what the passes say."""
-    notes = [f"{step.name}: {note}" for step in steps for note in step.notes]
-    if any(step.after.unknown_macs_nodes for step in steps):
-        notes.append(AT_LEAST)
-    return table(
-        "Pass by pass",
-        ("pass", "changes", "nodes", "weights MB", "GMACs", "CPU s"),
-        [
-            (
-                step.name,
-                str(step.changes),
-                f"{step.before.nodes} → {step.after.nodes}",
-                f"{megabytes(step.before.weight_bytes)} →"
-                f" {megabytes(step.after.weight_bytes)}",
-                giga(step.after.macs, step.after.unknown_macs_nodes),
-                f"{step.seconds:.2f}",
-            )
-            for step in steps
-        ],
-        "\n".join(notes),
-    )
-
-
-def verification_table(verifications: Iterable[Verification]) -> Table:
-    """Show how far exact passes moved the outputs."""
-    rows, unsteady = list[tuple[str, ...]](), False
-    for check in verifications:
-        names = ", ".join(check.passes)
-        if check.skipped is not None:
-            rows.append((names, f"not measured: {check.skipped}", "", "", ""))
-            continue
-        judged = [name for name in check.errors if name not in check.unsteady]
-        for worst in sorted(judged, key=lambda name: -check.errors[name])[:1]:
-            error, allowed = check.errors[worst], check.tolerances[worst]
-            rows.append((names, check.inputs, worst, f"{error:.1e}", f"{allowed:.0e}"))
-        if check.unsteady:
-            listed, unsteady = ", ".join(check.unsteady), True
-            rows.append((names, check.inputs, listed, "not judged", ""))
-    return table(
-        "Exact passes, checked by running both graphs",
-        ("passes", "inputs", "worst output", "max|a-b|/max|a|", "allowed"),
-        rows,
-        "not judged: on these inputs rounding alone moves the output as far; "
-        "recorded frames (--frames) tell more"
-        if unsteady
-        else "",
-        words=3,
-    )

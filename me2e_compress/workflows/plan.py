@@ -61,13 +61,7 @@ class PlanResult(Result):
         """Count int8, by rule; or the differences."""
         if self.changes is not None:
             return f"{len(self.changes)} differences"
-        found, kept = self.plan, len(self.plan.kept_float)
-        counts = ", ".join(f"{rule} {count}" for rule, count in found.counts().items())
-        return (
-            f"scheme {found.scheme.name}, rules {found.rules}: {len(found.chosen)} of"
-            f" {len(found.decisions)} nodes int8; {counts}"
-            + (f"; {kept} of them stay float on their target" if kept else "")
-        )
+        return self.plan.headline
 
     def lines(self) -> tuple[str, ...]:
         """Return the differences, and the headline."""

@@ -4,12 +4,12 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.runtime.latency_trace import PERCENTILES, LatencyTrace
+from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.workflows.checks import check_count, check_output, model_path
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.workflows.result import Result, Table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,11 +51,7 @@ class ProfileResult(Result):
     @property
     def headline(self) -> str:
         """File, number of inferences, machine."""
-        count = len(self.trace.samples_us)
-        return (
-            f"{self.output or self.model.name}: {count} inferences on"
-            f" {self.trace.machine}"
-        )
+        return f"{self.output or self.model.name}: {self.trace.headline}"
 
     def lines(self) -> tuple[str, ...]:
         """Return none: the table's title is the headline."""
@@ -63,12 +59,10 @@ class ProfileResult(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds."""
-        rows = [
-            *((f"p{p}", self.trace.percentile_us(p)) for p in PERCENTILES),
-            ("max", self.trace.max_us),
-        ]
-        shown = [(name, f"{taken_us / 1e3:.2f}") for name, taken_us in rows]
-        return (table(self.headline, ("latency", "ms"), shown),)
+        return tuple(
+            dataclasses.replace(each, title=self.headline)
+            for each in self.trace.tables()
+        )
 
     def records(self) -> list[dict[str, object]]:
         """Return a row an inference, in their order."""

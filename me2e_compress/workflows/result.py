@@ -1,131 +1,37 @@
 """Results that show themselves: on a terminal, in a notebook, to a program."""
 
 import abc
-import html
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from me2e_compress.display import (
+    AT_LEAST,
+    MOST_ROWS,
+    Cell,
+    Displayed,
+    Table,
+    giga,
+    megabytes,
+    number,
+    table,
+)
 from me2e_compress.errors import MissingPackageError
 
-AT_LEAST = "≥: nodes of unknown MACs, such as plugins, are not counted"
-"""What a table says of MACs that are a lower bound."""
-
-MOST_ROWS = 30
-"""Rows of a table in a notebook; the last line says how many more there are."""
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A number as it is shown.
-
-    Attributes:
-        text: The number, or words.
-        detail: Its interval, in smaller type; empty if it has none.
-        reason: Why there is no number; empty if there is one.
-    """
-
-    text: str
-    detail: str = ""
-    reason: str = ""
+__all__ = [
+    "AT_LEAST",
+    "MOST_ROWS",
+    "Cell",
+    "Result",
+    "Table",
+    "giga",
+    "megabytes",
+    "number",
+    "table",
+]
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of one thing each: the first columns are words, the others are numbers.
-
-    Attributes:
-        title: Heads it.
-        columns: With their units.
-        rows: As wide as the columns.
-        note: What a reader must know; a few sentences, or a few lines.
-        strong: Name of the row that the others are held against.
-        words: How many of the first columns are words.
-    """
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    note: str = ""
-    strong: str = ""
-    words: int = 1
-
-    def markdown(self) -> str:
-        """Write it as GitHub shows it, intervals in brackets."""
-        rule = "|---|" + "---:|" * (len(self.columns) - 1)
-        rows = [[_text(cell).replace("|", "\\|") for cell in row] for row in self.rows]
-        lines = [_line(self.columns), rule, *map(_line, rows)]
-        parts = [f"**{self.title}**", "\n".join(lines), *filter(None, [self.note])]
-        return "\n\n".join(parts) + "\n"
-
-    def html(self) -> str:
-        """Write a small table for a notebook, every name escaped."""
-        shown = [self._row("td", map(_text, row)) for row in self.rows[:MOST_ROWS]]
-        if more := len(self.rows) - len(shown):
-            shown.append(f'<tr><td colspan="{len(self.columns)}">{more} more</td></tr>')
-        note = "<br>".join(html.escape(line) for line in self.note.splitlines())
-        return (
-            f"<table><caption>{html.escape(self.title)}</caption>"
-            f"<thead>{self._row('th', self.columns)}</thead>"
-            f"<tbody>{''.join(shown)}</tbody></table>"
-            + (f"<p><small>{note}</small></p>" if note else "")
-        )
-
-    def _row(self, tag: str, cells: Iterable[str]) -> str:
-        row = "".join(
-            f'<{tag} style="text-align:{"left" if at < self.words else "right"}">'
-            f"{html.escape(text)}</{tag}>"
-            for at, text in enumerate(cells)
-        )
-        return f"<tr>{row}</tr>"
-
-
-def table(
-    title: str,
-    columns: Sequence[str],
-    rows: Iterable[Sequence[str]],
-    note: str = "",
-    words: int = 1,
-) -> Table:
-    """Build a table of plain texts."""
-    cells = tuple(tuple(map(Cell, row)) for row in rows)
-    return Table(title, tuple(columns), cells, note, words=words)
-
-
-def number(value: float | None, form: str = ",.0f") -> str:
-    """Write a number, or a dash for what was not measured."""
-    return "-" if value is None else format(value, form)
-
-
-def megabytes(count: float) -> str:
-    """Write bytes as MB (1e6)."""
-    return f"{count / 1e6:.2f}"
-
-
-def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
-    """Write MACs in billions, as a lower bound where those of some nodes are unknown.
-
-    Args:
-        macs: those that are known; None if none are.
-        unknown: of how many nodes they are not known.
-        form: of the number.
-    """
-    if macs is None:
-        return "-"
-    return ("≥ " if unknown else "") + format(macs / 1e9, form)
-
-
-class Result(abc.ABC):
+class Result(Displayed):
     """What a workflow found."""
-
-    @property
-    @abc.abstractmethod
-    def headline(self) -> str:
-        """The result in one line."""
-
-    @abc.abstractmethod
-    def tables(self) -> tuple[Table, ...]:
-        """Return what there is to read, as tables."""
 
     @abc.abstractmethod
     def records(self) -> list[dict[str, object]]:
@@ -134,10 +40,6 @@ class Result(abc.ABC):
     @abc.abstractmethod
     def to_json(self) -> object:
         """Return everything, as JSON data."""
-
-    def lines(self) -> tuple[str, ...]:
-        """Return what is said below the tables."""
-        return (self.headline,)
 
     def to_pandas(self) -> Any:
         """Build a ``pandas.DataFrame`` of the records.
@@ -151,15 +53,10 @@ class Result(abc.ABC):
             raise MissingPackageError("pandas") from error
         return pd.DataFrame(self.records())
 
-    def __repr__(self) -> str:
-        """Show the class and the one line."""
-        return f"<{type(self).__name__}: {self.headline}>"
-
     def _repr_html_(self) -> str:
         """Show the tables in a notebook; the records, where there are none."""
-        shown = self.tables() or _table_of(self.records())
-        below = "".join(f"<p>{html.escape(line)}</p>" for line in self.lines())
-        return "".join(each.html() for each in shown) + below
+        records = () if self.tables() else _table_of(self.records())
+        return "".join(each.html() for each in records) + super()._repr_html_()
 
 
 def _table_of(records: Sequence[Mapping[str, object]]) -> tuple[Table, ...]:
@@ -167,11 +64,3 @@ def _table_of(records: Sequence[Mapping[str, object]]) -> tuple[Table, ...]:
         return ()
     rows = [[str(value) for value in record.values()] for record in records]
     return (table("", list(records[0]), rows),)
-
-
-def _line(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _text(cell: Cell) -> str:
-    return f"{cell.text} ({cell.detail})" if cell.detail else cell.text

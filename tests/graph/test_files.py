@@ -29,6 +29,11 @@ def test_a_saved_graph_comes_back_as_it_was(tmp_path: Path) -> None:
     assert graph.digest(graph.load(tmp_path / "m.onnx")) == graph.digest(model)
 
 
+def test_a_path_may_be_text(tmp_path: Path) -> None:
+    graph.save(weighted(), f"{tmp_path}/m.onnx")
+    assert graph.node_count(graph.load(f"{tmp_path}/m.onnx")) == 1
+
+
 def test_external_weights_stay_on_disk(tmp_path: Path) -> None:
     graph.save(weighted(), tmp_path / "m.onnx", external=True)
     back = graph.load(tmp_path / "m.onnx")

@@ -122,3 +122,7 @@ def test_every_preset_reads() -> None:
         assert read.name == name
         assert read.names("feature")[0] == "backbone"
         assert read.required() == []
+
+
+def test_a_graph_of_no_stack_has_a_map_by_name_too() -> None:
+    assert ModuleMap.load("whole") == ModuleMap.whole()

@@ -9,6 +9,7 @@ from pathlib import Path
 import onnx_ir as ir
 import pydantic
 
+from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.scheme import QuantScheme
@@ -92,8 +93,8 @@ class KeptFloat:
     reason: str
 
 
-@dataclasses.dataclass(frozen=True)
-class QuantPlan:
+@dataclasses.dataclass(frozen=True, repr=False)
+class QuantPlan(Displayed):
     """Decisions for every node of a graph, in graph order; the same for all targets.
 
     Attributes:
@@ -126,6 +127,33 @@ class QuantPlan:
     def borderline(self) -> tuple[Decision, ...]:
         """The nodes whose decision was close."""
         return tuple(each for each in self.decisions if each.borderline)
+
+    @property
+    def headline(self) -> str:
+        """Count int8, by rule."""
+        counts = ", ".join(f"{rule} {count}" for rule, count in self.counts().items())
+        kept = len(self.kept_float)
+        return (
+            f"scheme {self.scheme.name}, rules {self.rules}: {len(self.chosen)} of"
+            f" {len(self.decisions)} nodes int8; {counts}"
+            + (f"; {kept} of them stay float on their target" if kept else "")
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return how many nodes of a module each rule decided; nodes as in `counts`."""
+        found = Counter(
+            (each.module, each.dtype, each.rule)
+            for each in self.decisions
+            if each.op in WEIGHTED or each.dtype == INT8
+        )
+        order = dict.fromkeys(module for module, _, _ in found)
+        rows = [
+            (*key, str(found[key]))
+            for module in order
+            for key in sorted(key for key in found if key[0] == module)
+        ]
+        columns = ("module", "", "rule", "nodes")
+        return (table("Decisions by module and rule", columns, rows, words=3),)
 
     def counts(self) -> dict[str, int]:
         """Count the decisions by rule, over the nodes that could be int8 at all."""

@@ -1,0 +1,89 @@
+"""Public objects show themselves: in one line, and as tables in a notebook."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.display import Displayed
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap, assign
+from me2e_compress.passes import PASSES, Context
+from me2e_compress.quantization.plan import QuantPlan, load_plan, save_plan
+from me2e_compress.quantization.plan.decision import Decision
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.latency_trace import LatencyTrace
+from tests.cli.conftest import write_frames
+from tests.conftest import DRIVER, DRIVER_MAP
+
+COUNT = 400
+"""Nodes, tensors or samples of an object: enough for a long repr."""
+
+
+def plan() -> QuantPlan:
+    made = (
+        Decision(f"n<{at}>", f"o{at}", "MatMul", "head", "int8", "layer", "it is", ())
+        for at in range(COUNT)
+    )
+    return QuantPlan(QuantScheme("full", ("head",)), tuple(made))
+
+
+def recording(folder: Path) -> CalibrationSet:
+    write_frames(folder / "frames", camera=np.zeros((1, 4), np.float32))
+    return CalibrationSet(str(folder / "frames"))
+
+
+MADE: Mapping[str, Callable[[Path], Displayed]] = {
+    "assignment": lambda folder: assign(
+        ir.from_onnx_text(DRIVER), ModuleMap.parse(DRIVER_MAP, "mine")
+    ),
+    "calibration set": recording,
+    "module map": lambda folder: ModuleMap.load("vad"),
+    "plan": lambda folder: plan(),
+    "ranges": lambda folder: Ranges(
+        {f"t{at}": (-1.0, 1.0) for at in range(COUNT)}, "max-min", 2, "m", "f"
+    ),
+    "report": lambda folder: PassManager((PASSES.parse("eliminate-redundant"),)).run(
+        ir.from_onnx_text(DRIVER), Context(ModuleMap.parse(DRIVER_MAP, "mine"))
+    ),
+    "trace": lambda folder: LatencyTrace("0", "a CPU", tuple(range(COUNT))),
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_a_public_object_is_one_short_line(tmp_path: Path, name: str) -> None:
+    shown = repr(MADE[name](tmp_path))
+
+    assert "\n" not in shown
+    assert len(shown) < 160
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_a_public_object_is_a_table_in_a_notebook(tmp_path: Path, name: str) -> None:
+    shown = MADE[name](tmp_path)._repr_html_()
+
+    assert "<table>" in shown
+    assert "<n<" not in shown
+
+
+def test_a_frame_does_not_show_its_pictures() -> None:
+    frame = Frame(3, True, {"img": np.zeros((6, 3, 48, 80), np.float32)})
+
+    assert repr(frame) == "<Frame: 3, starts a scene; img [6, 3, 48, 80]>"
+
+
+def test_a_plan_is_told_by_module_and_rule() -> None:
+    (shown,) = plan().tables()
+
+    assert [cell.text for cell in shown.rows[0]] == ["head", "int8", "layer", "400"]
+
+
+def test_a_plan_that_shows_itself_is_still_data(tmp_path: Path) -> None:
+    save_plan(plan(), tmp_path / "plan.json")
+
+    assert load_plan(tmp_path / "plan.json") == plan()
