@@ -6,9 +6,14 @@ itself in a notebook.
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING
 
 from me2e_compress.version import __version__
+
+# onnxruntime (1.31), as soon as it is loaded, would write a device id and a database
+# into the user's home and look its vendor's host up: its own function comes too late.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from me2e_compress import graph, recipe

@@ -74,6 +74,9 @@ def unsupported(model: ir.Model) -> str | None:
 
 
 _INT8_STAYS = "session.qdqisint8allowed"
+WRONG_FUSIONS = ("Pad_Fusion",)
+"""Optimizations of onnxruntime (1.31) that no session makes: this one folds a Pad of
+zeros into the MaxPool behind it, whose own padding is minus infinity."""
 LENT_BYTES = 1024
 """Smaller tensors are left in the graph: shape inference reads those."""
 
@@ -174,14 +177,22 @@ def _build(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSes
     From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
     ``output_dtype`` is not that of their zero point, and then refuses them.
     """
-    providers = ["CPUExecutionProvider"]
     try:
-        return ort.InferenceSession(source, options, providers=providers)
+        return _opened(source, options)
     except REFUSALS as error:
         refusal = error
     options.add_session_config_entry(_INT8_STAYS, "1")
     try:
-        return ort.InferenceSession(source, options, providers=providers)
+        return _opened(source, options)
     except REFUSALS:
         line = " ".join(str(refusal).split())
         raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
+
+
+def _opened(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
+    return ort.InferenceSession(
+        source,
+        options,
+        providers=["CPUExecutionProvider"],
+        disabled_optimizers=list(WRONG_FUSIONS),
+    )

@@ -63,6 +63,8 @@ def compare(
     candidate: str | Path,
     frames: str | Path,
     listener: Listener = SILENT,
+    *,
+    as_it_stands: bool = False,
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
@@ -71,6 +73,8 @@ def compare(
         candidate: the graph that is judged.
         frames: folder of recorded frames.
         listener: is called with progress and warnings.
+        as_it_stands: run the first graph without onnxruntime's optimizations: a graph
+            held against itself shows what those change.
 
     Raises:
         GraphError: no such model, or onnxruntime cannot run it.
@@ -87,5 +91,6 @@ def compare(
         listener.on_progress("frames", frame.index, total, "")
         return frame
 
-    left, right = (Session(path, release=True) for path in paths)
+    left = Session(paths[0], optimize=not as_it_stands, release=True)
+    right = Session(paths[1], release=True)
     return CompareResult(*paths, measure(left, right, map(reported, recording)))

@@ -7,6 +7,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
+from me2e_compress.runtime.session import Session
 from tests.cli.conftest import Command, strict
 
 NAMES = sorted(COMMANDS)
@@ -101,6 +102,25 @@ def test_a_graph_compared_with_itself_is_equal(
     assert [item["error"] for item in found["outputs"]] == [0.0]
     assert [item["sqnr_db"] for item in found["outputs"]] == [None]
     assert found["frames"] == 2
+
+
+def test_a_reference_runs_without_the_runtimes_optimizations(
+    command: Command, files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[bool] = []
+
+    class Noted(Session):
+        def __init__(
+            self, model: Path, *, optimize: bool = True, release: bool = False
+        ) -> None:
+            opened.append(optimize)
+            super().__init__(model, optimize=optimize, release=release)
+
+    monkeypatch.setattr("me2e_compress.workflows.compare.Session", Noted)
+    words = (files / "in.onnx", files / "in.onnx", files / "frames")
+
+    assert command("compare", *words, "--reference") == 0
+    assert opened == [False, True]
 
 
 def test_doctor_names_the_versions(

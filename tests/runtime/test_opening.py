@@ -127,3 +127,21 @@ def test_int8_activations_run_at_every_opset(opset: int) -> None:
 
     grid = np.round(x.astype(np.float64) / 0.05) * 0.05
     assert found == pytest.approx(grid @ (0.05 * w) + b, abs=0.02)
+
+
+PADDED_POOL = """
+<ir_version: 9, opset_import: ["" : 17]>
+pool (float[1,1,2,2] x) => (float[1,1,2,2] y)
+<int64[8] around = {0, 0, 1, 1, 0, 0, 1, 1}> {
+    q = Pad(x, around)
+    y = MaxPool<kernel_shape=[3,3]>(q)
+}
+"""
+
+
+def test_zeros_around_a_max_pool_stay_zeros() -> None:
+    below = {"x": np.full((1, 1, 2, 2), -1, np.float32)}
+
+    found = Session(ir.from_onnx_text(PADDED_POOL), threads=1).run(below)["y"]
+
+    assert not found.any()  # -1 where onnxruntime folds the Pad into the pool

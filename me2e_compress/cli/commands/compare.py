@@ -13,9 +13,17 @@ def compare(
     reference: Annotated[str, typer.Argument(help="the graph to be true to")],
     candidate: Annotated[str, typer.Argument(help="the graph that is judged")],
     frames: given.Recording,
+    as_it_stands: Annotated[
+        bool,
+        typer.Option(
+            "--reference", help="run the first without onnxruntime's optimizations"
+        ),
+    ] = False,
     as_json: given.Json = False,
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres."""
     with listening() as listener:
-        found = workflow.compare(reference, candidate, frames, listener)
+        found = workflow.compare(
+            reference, candidate, frames, listener, as_it_stands=as_it_stands
+        )
     show(found, as_json)

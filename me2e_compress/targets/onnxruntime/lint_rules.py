@@ -8,6 +8,7 @@ import onnx_ir as ir
 from me2e_compress.graph import (
     CONVOLUTIONS,
     WEIGHTED,
+    array_of,
     is_standard,
     nodes_of,
     opset_of,
@@ -23,6 +24,10 @@ from me2e_compress.targets.base import (
     warning,
 )
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
+
+_NEVER_NEGATIVE = frozenset(
+    {"Abs", "Exp", "HardSigmoid", "Relu", "Sigmoid", "Softmax", "Softplus", "Sqrt"}
+)
 
 
 def opset(model: ir.Model) -> Iterator[LintFinding]:
@@ -77,6 +82,37 @@ def unanswered(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
+def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
+    """Find a Pad of zeros before a MaxPool: onnxruntime 1.31 gets those wrong.
+
+    Its Pad fusion makes the zeros the pool's own padding, which is minus infinity; what
+    is never negative comes out the same. Our own sessions leave that fusion out.
+    """
+    for node in nodes_of(model):
+        pad = producer_of(node.inputs[0]) if node.op_type == "MaxPool" else None
+        if pad is None or not is_standard(pad) or not _pads_with_zeros(pad):
+            continue
+        before = producer_of(pad.inputs[0])
+        if before is None or before.op_type not in _NEVER_NEGATIVE:
+            yield error(
+                "padded-pool",
+                node,
+                f"reads the zeros of Pad {pad.name!r}: onnxruntime's Pad fusion makes "
+                "them minus infinity; open it with disabled_optimizers=['Pad_Fusion']",
+            )
+
+
+def _pads_with_zeros(pad: ir.Node) -> bool:
+    if pad.op_type != "Pad" or len(list(pad.outputs[0].consumers())) != 1:
+        return False
+    mode = pad.attributes.get("mode")
+    if mode is not None and mode.as_string() != "constant":
+        return False
+    filled = pad.inputs[2] if len(pad.inputs) > 2 else None
+    value = None if filled is None else array_of(filled)
+    return filled is None or (value is not None and not value.any())
+
+
 def _layers(model: ir.Model) -> Iterator[ir.Node]:
     for node in nodes_of(model):
         if is_standard(node) and node.op_type in WEIGHTED:
@@ -96,4 +132,5 @@ RULES: tuple[LintRule, ...] = (
     operators,
     signed_activations,
     unanswered,
+    padded_pools,
 )

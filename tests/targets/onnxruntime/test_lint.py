@@ -99,3 +99,28 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
     placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
 
     assert OnnxRuntime().lint(placed) == ()
+
+
+@pytest.mark.parametrize(
+    ("before", "pad", "found"),
+    [
+        ("Tanh", "", ["padded-pool"]),
+        ("Tanh", ", zero", ["padded-pool"]),
+        ("Tanh", ", one", []),
+        ("Relu", "", []),
+    ],
+)
+def test_pads_that_onnxruntime_folds_into_a_pool(
+    before: str, pad: str, found: list[str]
+) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[1,1,2,2] x) => (float[1,1,2,2] y)\n"
+        "<int64[8] p = {0,0,1,1,0,0,1,1}, float zero = {0.0}, float one = {1.0}>\n"
+        f"{{ a = {before}(x) [edge] b = Pad(a, p{pad})"
+        " [pool] y = MaxPool<kernel_shape=[3,3]>(b) }"
+    )
+    lint = OnnxRuntime().lint(model)
+
+    assert [each.rule for each in lint] == found
+    assert all("Pad 'edge'" in each.message for each in lint)
