@@ -4,7 +4,6 @@ import hashlib
 import mmap
 import os
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import onnx
@@ -13,6 +12,7 @@ import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.external import data_file, external_tensors, settle
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
@@ -20,9 +20,12 @@ INLINE_LIMIT_BYTES = 1_900_000_000
 _PLAIN_INITIALIZERS_SINCE_IR = 4
 """The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)."""
 
+_LOCATION = b"\n\x08location"
+"""How a protobuf message begins that names a file of external data."""
+
 
 def load(path: str | Path) -> ir.Model:
-    """Read an ONNX file; external weights stay on disk and are mapped when read.
+    """Read an ONNX file; large external weights stay on disk and are mapped when read.
 
     Initializers that the exporter also listed as inputs
     (``keep_initializers_as_inputs``) stop being inputs, which is valid from IR version
@@ -30,7 +33,7 @@ def load(path: str | Path) -> ir.Model:
 
     Raises:
         GraphError: no such file, not an ONNX model, cut short, or its data file is
-            missing or shorter than the model says.
+            missing, shorter than the model says or not in the model's folder.
     """
     path = Path(path)
     if not path.is_file():
@@ -43,7 +46,7 @@ def load(path: str | Path) -> ir.Model:
         raise GraphError(f"{path}: not a valid ONNX graph ({error})") from error
     if not model.opset_imports or not model.graph.outputs:
         raise GraphError(f"{path}: not an ONNX model (no opset, no outputs)")
-    _check_external(model, path)
+    settle(model, path)
     common.RemoveInitializersFromInputsPass()(model)
     model.ir_version = max(model.ir_version, _PLAIN_INITIALIZERS_SINCE_IR)
     return model
@@ -65,7 +68,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     path = Path(path)
     if not path.parent.is_dir():
         raise GraphError(f"{path}: no such folder {path.parent}")
-    stored = list(_external(model))
+    stored = list(external_tensors(model))
     data = path.with_name(path.name + ".data")
     if any(Path(tensor.path).resolve() == data.resolve() for tensor in stored):
         raise GraphError(f"{data}: holds the weights of the model that is being saved")
@@ -85,13 +88,12 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
 
 def is_external(model: ir.Model) -> bool:
     """Return whether some of the weights lie in a file of their own."""
-    return any(True for _ in _external(model))
+    return any(True for _ in external_tensors(model))
 
 
 def file_bytes(path: Path) -> int:
-    """Count the bytes of a model: the file and the weights beside it."""
-    data = path.with_name(path.name + ".data")
-    return path.stat().st_size + (data.stat().st_size if data.exists() else 0)
+    """Count the bytes of a model: the file and those with its weights."""
+    return sum(file.stat().st_size for file in (path, *_external_files(path)))
 
 
 def sha256_of(path: Path) -> str:
@@ -114,36 +116,11 @@ def _external_files(path: Path) -> list[Path]:
         mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
     ):
         # Parsing hundreds of MB takes as long as hashing them: look first.
-        if content.find(b"location") < 0:
+        if content.find(_LOCATION) < 0:
             return []
-    model = onnx.load(path, load_external_data=False)
-    found = [
-        path.parent / entry.value
-        for tensor in model.graph.initializer
-        for entry in tensor.external_data
-        if entry.key == "location"
-    ]
-    return list(dict.fromkeys(file for file in found if file != path))
-
-
-def _external(model: ir.Model) -> Iterator[ir.ExternalTensor]:
-    for graph in model.graphs():
-        for value in graph.initializers.values():
-            if isinstance(value.const_value, ir.ExternalTensor):
-                yield value.const_value
-
-
-def _check_external(model: ir.Model, path: Path) -> None:
-    for tensor in _external(model):
-        data = Path(tensor.path)
-        if not data.is_file():
-            raise GraphError(f"{path}: its weights file {data} is missing")
-        end = (tensor.offset or 0) + (tensor.length or 0)
-        if data.stat().st_size < end:
-            raise GraphError(
-                f"{path}: {data} is cut short: {tensor.name} ends at byte {end},"
-                f" the file at {data.stat().st_size}"
-            )
+    model = ir.load(path, format="protobuf")
+    found = [data_file(path, tensor) for tensor in external_tensors(model)]
+    return list(dict.fromkeys(found))
 
 
 def _inlined(model: ir.Model) -> ir.Model:

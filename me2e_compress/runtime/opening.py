@@ -91,15 +91,27 @@ _LENDABLE = frozenset(
 )  # fmt: skip
 
 
-def open_file(path: Path, options: ort.SessionOptions) -> ort.InferenceSession:
-    """Open an ONNX file.
+def open_file(
+    path: Path, options: ort.SessionOptions
+) -> tuple[ort.InferenceSession, Weights]:
+    """Open an ONNX file: as it stands or, where onnxruntime refuses that, as read here.
+
+    So a graph opens that is newer than onnxruntime, or whose shapes lie in a file of
+    weights.
+
+    Returns:
+        The session, and what must live as long.
 
     Raises:
         GraphError: no such file, or onnxruntime cannot run it.
     """
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
-    return _build(str(path), options)
+    try:
+        return _build(str(path), options), {}
+    except GraphError:
+        model = graph.load(path)
+    return open_graph(model, options)
 
 
 def open_graph(

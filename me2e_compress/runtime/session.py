@@ -102,7 +102,7 @@ class Session:
         if isinstance(model, ir.Model):
             self._ort, self._lent = open_graph(model, options)
         else:
-            self._ort = open_file(model, options)
+            self._ort, self._lent = open_file(model, options)
         self.inputs = _ports(self._ort.get_inputs())
         self.outputs = _ports(self._ort.get_outputs())
         self.metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
