@@ -227,7 +227,10 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
     int8 = macs_of_a_frame(model, int8_layers(model))
     with tempfile.TemporaryDirectory() as folder:
         rewritten = Path(folder) / "rewritten.onnx"
-        session = Session(path, threads=chosen.threads, rewritten=rewritten)
+        try:
+            session = Session(path, threads=chosen.threads, rewritten=rewritten)
+        except GraphError as error:
+            return {"refused": str(error)}
         kernels = Counter(node.op_type for node in graph.load(rewritten).graph)
     found = {}
     if chosen.file != FLOAT:

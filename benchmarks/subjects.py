@@ -3,6 +3,7 @@
 * ``resnet50``: a classifier, 224 x 224.
 * ``bev-head``: see :mod:`benchmarks.bev_head`.
 * ``vad-tiny``: the reference stack.
+* the models of :mod:`benchmarks.model_kinds`, which need the extra ``models``.
 
 The model in the folder is what ``quantize-int8`` sees: the exact passes are done.
 """
@@ -23,6 +24,11 @@ from me2e_compress.zoo.export import export
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
 
 SUBJECTS = ("resnet50", "bev-head", "vad-tiny")
+WHOLE = """
+[modules.network]
+role = "feature"
+optional = ["*"]
+"""
 SCENE = 4
 """Frames a scene, where frames follow each other."""
 
@@ -30,6 +36,8 @@ SCENE = 4
 def make(name: str, out: Path, frames: int) -> Subject:
     """Write a subject, unless it is there with as many frames."""
     subject = Subject(name, out / name)
+    if name not in SUBJECTS:
+        return _make_kind(subject)
     subject.folder.mkdir(parents=True, exist_ok=True)
     if not subject.model.is_file():
         _export(subject)
@@ -37,6 +45,18 @@ def make(name: str, out: Path, frames: int) -> Subject:
         if len(list(folder.glob("*.npz"))) < count:
             shutil.rmtree(folder, ignore_errors=True)
             _record(name, folder, count, seed)
+    return subject
+
+
+def _make_kind(subject: Subject) -> Subject:
+    """Write a model of another kind; one module holds all of it."""
+    from benchmarks import model_kinds
+
+    model_kinds.make(subject.name, subject.folder.parent)
+    subject.map.write_text(WHOLE, encoding="utf-8")
+    if not subject.model.is_file():
+        unchecked = CompressOptions(module_map=subject.map, verify_frames=0)
+        compress(subject.source, subject.model, "exact", options=unchecked)
     return subject
 
 
