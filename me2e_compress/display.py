@@ -38,6 +38,7 @@ class Table:
         note: What a reader must know; a few sentences, or a few lines.
         strong: Name of the row that the others are held against.
         words: How many of the first columns are words.
+        details: Lines for who wants to know more; ``-v`` shows them.
     """
 
     title: str
@@ -46,6 +47,7 @@ class Table:
     note: str = ""
     strong: str = ""
     words: int = 1
+    details: str = ""
 
     def markdown(self) -> str:
         """Write it as GitHub shows it, intervals in brackets."""
@@ -60,12 +62,13 @@ class Table:
         shown = [self._row("td", map(_text, row)) for row in self.rows[:MOST_ROWS]]
         if more := len(self.rows) - len(shown):
             shown.append(f'<tr><td colspan="{len(self.columns)}">{more} more</td></tr>')
-        note = "<br>".join(html.escape(line) for line in self.note.splitlines())
+        note, details = _broken(self.note), _broken(self.details)
         return (
             f"<table><caption>{html.escape(self.title)}</caption>"
             f"<thead>{self._row('th', self.columns)}</thead>"
             f"<tbody>{''.join(shown)}</tbody></table>"
             + (f"<p><small>{note}</small></p>" if note else "")
+            + (f"<details><small>{details}</small></details>" if details else "")
         )
 
     def _row(self, tag: str, cells: Iterable[str]) -> str:
@@ -83,10 +86,11 @@ def table(
     rows: Iterable[Sequence[str]],
     note: str = "",
     words: int = 1,
+    details: str = "",
 ) -> Table:
     """Build a table of plain texts."""
     cells = tuple(tuple(map(Cell, row)) for row in rows)
-    return Table(title, tuple(columns), cells, note, words=words)
+    return Table(title, tuple(columns), cells, note, words=words, details=details)
 
 
 def number(value: float | None, form: str = ",.0f") -> str:
@@ -124,6 +128,10 @@ class Displayed(abc.ABC):
     def tables(self) -> tuple[Table, ...]:
         """Return what there is to read, as tables."""
 
+    def details(self) -> tuple[Table, ...]:
+        """Return tables for who wants to know more, such as a row a node; ``-v``."""
+        return ()
+
     def lines(self) -> tuple[str, ...]:
         """Return what is said below the tables."""
         return (self.headline,)
@@ -136,6 +144,10 @@ class Displayed(abc.ABC):
         """Show the tables and the lines."""
         below = "".join(f"<p>{html.escape(line)}</p>" for line in self.lines())
         return "".join(each.html() for each in self.tables()) + below
+
+
+def _broken(lines: str) -> str:
+    return "<br>".join(html.escape(line) for line in lines.splitlines())
 
 
 def _line(cells: Iterable[str]) -> str:

@@ -13,9 +13,11 @@ def main() -> int:
 
     from me2e_compress.cli.app import app
     from me2e_compress.cli.console import errors
+    from me2e_compress.cli.verbosity import Verbosity, set_verbosity
 
+    set_verbosity(Verbosity.NORMAL)
     try:
-        app(standalone_mode=True)
+        app(standalone_mode=True, prog_name="me2e-compress")
     except (Me2eError, OSError) as error:
         line = " ".join(str(error).split())
         errors.print(f"me2e-compress: {escape(line)}", soft_wrap=True)

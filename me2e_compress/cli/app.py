@@ -2,12 +2,14 @@
 
 import importlib
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from me2e_compress.cli.verbosity import Verbosity, set_verbosity
 from me2e_compress.errors import MissingExtraError
+from me2e_compress.version import __version__
 from me2e_compress.workflows.extras import missing_extra
 
 
@@ -16,12 +18,14 @@ class CommandEntry:
     """What is known of a command before its code is imported.
 
     Attributes:
+        panel: Of ``--help``, under which it stands.
         name: As it is called; also of its file and its function.
         help: The first line of its docstring.
         extra: Of the package, which it takes; empty for none.
         function: Where it is not called like the command.
     """
 
+    panel: str
     name: str
     help: str
     extra: str = ""
@@ -49,86 +53,113 @@ class CommandEntry:
         raise MissingExtraError(f"what {self.name} needs", self.extra)
 
 
+START = "Start here"
+GRAPHS = "Graphs and frames"
+COMPRESS = "Compress"
+MEASURE = "Compare and measure"
+DRIVE = "Drive"
+
 _ENTRIES = (
     CommandEntry(
+        START,
         "demo",
         "Run the main job on what ships: compress, verify, compare, drive, report.",
     ),
     CommandEntry(
-        "doctor", "Show what this machine can do, and what to install for the rest."
+        START,
+        "doctor",
+        "Show what this machine can do, and what to install for the rest.",
     ),
     CommandEntry(
-        "export",
-        "Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver.",
-    ),
-    CommandEntry(
-        "inspect",
-        "Show what a graph holds: interface, and nodes, parameters, MACs by module.",
-    ),
-    CommandEntry(
-        "frames", "Write calibration frames, coherent in time, seen by six cameras."
-    ),
-    CommandEntry(
-        "calibrate",
-        "Measure the ranges of every tensor that any scheme, rule set or target needs.",
-    ),
-    CommandEntry(
-        "plan",
-        "Show which nodes become int8, which stay float, by which rule, and why.",
-    ),
-    CommandEntry(
-        "compress",
-        "Apply passes to a graph, check each, and write the smaller graph and a"
-        " report.",
-    ),
-    CommandEntry(
-        "lint",
-        "Check a graph for the program that will run it; 1 if it would be refused.",
-    ),
-    CommandEntry(
-        "compare",
-        "Run two graphs over frames: SQNR of every output, plan displacement in"
-        " metres.",
-    ),
-    CommandEntry(
-        "profile",
-        "Measure a model alone and warm, and write its latencies as a trace.",
-    ),
-    CommandEntry(
-        "sensitivity",
-        "Measure what int8 costs per module and node, and write a recipe within a"
-        " limit.",
-    ),
-    CommandEntry(
-        "search",
-        "Find the modules whose int8 meets a budget and costs the plan least.",
-    ),
-    CommandEntry(
+        START,
         "list",
         "Show what can be named: ours, and what other packages add by entry point.",
         function="list_entries",
     ),
     CommandEntry(
+        GRAPHS,
+        "export",
+        "Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver.",
+    ),
+    CommandEntry(
+        GRAPHS,
+        "inspect",
+        "Show what a graph holds: interface, and nodes, parameters, MACs by module.",
+    ),
+    CommandEntry(
+        GRAPHS,
+        "frames",
+        "Write calibration frames, coherent in time, seen by six cameras.",
+    ),
+    CommandEntry(
+        COMPRESS,
+        "plan",
+        "Show which nodes become int8, which stay float, by which rule, and why.",
+    ),
+    CommandEntry(
+        COMPRESS,
+        "calibrate",
+        "Measure the ranges of every tensor that any scheme, rule set or target needs.",
+    ),
+    CommandEntry(
+        COMPRESS,
+        "compress",
+        "Apply passes to a graph, check each, and write the smaller graph and a"
+        " report.",
+    ),
+    CommandEntry(
+        COMPRESS,
+        "lint",
+        "Check a graph for the program that will run it; 1 if it would be refused.",
+    ),
+    CommandEntry(
+        COMPRESS,
+        "sensitivity",
+        "Measure what int8 costs per module and node, and write a recipe within a"
+        " limit.",
+    ),
+    CommandEntry(
+        COMPRESS,
+        "search",
+        "Find the modules whose int8 meets a budget and costs the plan least.",
+    ),
+    CommandEntry(
+        MEASURE,
+        "compare",
+        "Run two graphs over frames: SQNR of every output, plan displacement in"
+        " metres.",
+    ),
+    CommandEntry(
+        MEASURE,
+        "profile",
+        "Measure a model alone and warm, and write its latencies as a trace.",
+    ),
+    CommandEntry(
+        DRIVE,
         "evaluate",
         "Drive a policy over routes of highway-env; run it again to go on.",
         "highway",
     ),
     CommandEntry(
-        "routes",
-        "Make a fresh set of admitted routes, or examine an existing set again.",
-        "highway",
-    ),
-    CommandEntry(
+        DRIVE,
         "score",
         "Print driving score, success rate, efficiency, comfort and abilities.",
         "highway",
     ),
     CommandEntry(
+        DRIVE,
         "study",
         "Drive variants under conditions and compare them; run it again to go on.",
         "highway",
     ),
     CommandEntry(
+        DRIVE,
+        "routes",
+        "Make a fresh set of admitted routes, or examine an existing set again.",
+        "highway",
+    ),
+    CommandEntry(
+        DRIVE,
         "train",
         "Train the driver from nothing: collect, learn, drive, learn again (hours).",
         "zoo,highway",
@@ -147,26 +178,83 @@ class LazyGroup(TyperGroup):
     ) -> tuple[str | None, Any, list[str]]:
         """Import the command that the first word names."""
         name, known, rest = super().resolve_command(ctx, args)
-        return name, known if name is None else COMMANDS[name].load(), rest
+        if name is None:
+            return name, known, rest
+        loaded = COMMANDS[name].load()
+        common = [each for each in self.params if each.name in COMMON]
+        loaded.params = [*loaded.params, *common]  # before and after the command's name
+        return name, loaded, rest
 
 
 def build_app() -> typer.Typer:
     """Build the application: every command as a name and a line of help."""
-    made = _app()
+    made = _app(add_completion=True)
+    made.callback(no_args_is_help=True)(_options)
     for entry in COMMANDS.values():
-        made.command(entry.name, help=entry.line())(_not_imported)
+        line, panel = entry.line(), entry.panel
+        made.command(entry.name, help=line, rich_help_panel=panel)(_not_imported)
     return made
 
 
-def _app() -> typer.Typer:
+def _app(*, add_completion: bool = False) -> typer.Typer:
     return typer.Typer(
         cls=LazyGroup,
         name="me2e-compress",
-        help="Make modular end-to-end driving models small, and prove that they drive.",
-        no_args_is_help=True,
-        add_completion=False,
+        add_completion=add_completion,
         pretty_exceptions_enable=False,
     )
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"me2e-compress {__version__}")
+        raise typer.Exit
+
+
+def _be_quiet(wanted: bool) -> None:
+    if wanted:
+        set_verbosity(Verbosity.QUIET)
+
+
+def _be_verbose(wanted: bool) -> None:
+    if wanted:
+        set_verbosity(Verbosity.VERBOSE)
+
+
+Version = Annotated[
+    bool,
+    typer.Option(
+        "--version", help="print the version", callback=_show_version, is_eager=True
+    ),
+]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "-q",
+        "--quiet",
+        help="only results and errors",
+        callback=_be_quiet,
+        expose_value=False,
+    ),
+]
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "-v",
+        "--verbose",
+        help="notes and node lists too",
+        callback=_be_verbose,
+        expose_value=False,
+    ),
+]
+COMMON = ("quiet", "verbose")
+"""Options that stand before or after the name of a command."""
+
+
+def _options(
+    version: Version = False, quiet: Quiet = False, verbose: Verbose = False
+) -> None:
+    """Make modular end-to-end driving models small, and prove that they drive."""
 
 
 def _not_imported() -> None:

@@ -11,11 +11,19 @@ from typing import Literal
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table as Shown
 from rich.text import Text
 
-from me2e_compress.workflows.listener import Listener
+from me2e_compress.cli.progress_lines import ProgressLines
+from me2e_compress.cli.verbosity import is_quiet, is_verbose
+from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Cell, Result, Table
 
 console = Console(record=True)
@@ -27,48 +35,70 @@ WIDE = 120
 
 @contextmanager
 def listening(*, stages: bool = False) -> Iterator[Listener]:
-    """Show progress in a bar on stderr, and warnings as lines there.
+    """Show progress on stderr, and warnings as lines there; neither if quiet.
+
+    On a terminal it is a bar with the time that is left, elsewhere a line now and then.
 
     Args:
         stages: where there is no terminal, print every new stage as a line.
     """
-    shown = ""
+    if is_quiet():
+        yield SILENT
+        return
+    if not errors.is_terminal:
+        yield Listener(ProgressLines(tell, stages=stages).on_progress, _warn)
+        return
     bar = Progress(
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(bar_width=20),
         TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[what]}"),
         TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
         console=errors,
         transient=True,
-        disable=not errors.is_terminal,  # a log wants no bar
     )
     with bar:
-        task = bar.add_task("", total=1, what="")
+        task, shown = bar.add_task("", total=1, what=""), ""
 
         def on_progress(stage: str, done: int, total: int, what: str) -> None:
             nonlocal shown
-            if stages and stage != shown and not errors.is_terminal:
-                errors.print(stage)
+            if stage != shown:
+                bar.reset(task)
             shown = stage
             bar.update(task, description=stage, completed=done, total=total, what=what)
 
-        yield Listener(on_progress, lambda line: tell(f"warning: {line}"))
+        yield Listener(on_progress, _warn)
+
+
+def _warn(line: str) -> None:
+    tell(f"warning: {line}")
 
 
 def tell(line: str) -> None:
-    """Print a line on stderr, as it stands."""
-    errors.print(escape(line), soft_wrap=True)
+    """Print a line on stderr, as it stands; nothing if quiet."""
+    if not is_quiet():
+        errors.print(escape(line), soft_wrap=True)
 
 
 def show(
     found: Result, as_json: bool = False, tables: Sequence[Table] | None = None
 ) -> None:
-    """Print a result: its tables and lines, or one JSON document."""
+    """Print a result: its tables and lines, or one JSON document.
+
+    Args:
+        found: the result.
+        as_json: print all of it, for programs.
+        tables: instead of its own.
+    """
     if as_json:
         print_json(found.to_json())
         return
     for each in found.tables() if tables is None else tables:
         print_table(each)
+    if is_verbose():
+        for each in found.details():
+            print_table(each)
     for line in found.lines():
         say(line)
 
@@ -97,6 +127,8 @@ def print_table(content: Table) -> None:
     console.print(made)
     if content.note:
         console.print(Text(content.note, "dim"))
+    if content.details and is_verbose():
+        console.print(Text(content.details, "dim"))
 
 
 def _is_wide() -> bool:

@@ -128,7 +128,8 @@ def versions() -> dict[str, str]:
 
 def steps_table(steps: Sequence[Step]) -> Table:
     """Show pass by pass what changed and what it cost, and what the passes say."""
-    notes = [f"{step.name}: {note}" for step in steps for note in step.notes]
+    said = [f"{step.name}: {note}" for step in steps for note in step.notes]
+    notes = [f"{len(said)} notes of the passes: -v"] if said else []
     if any(step.after.unknown_macs_nodes for step in steps):
         notes.append(AT_LEAST)
     return table(
@@ -147,6 +148,7 @@ def steps_table(steps: Sequence[Step]) -> Table:
             for step in steps
         ],
         "\n".join(notes),
+        details="\n".join(said),
     )
 
 

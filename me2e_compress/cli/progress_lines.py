@@ -1,0 +1,60 @@
+"""Progress where there is no terminal: a line now and then."""
+
+import time
+from collections.abc import Callable
+
+EVERY_S = 10.0
+"""Seconds between two lines."""
+
+
+class ProgressLines:
+    """Writes where a long run stands, seldom enough for a log.
+
+    A run of less than `EVERY_S` writes nothing.
+
+    Args:
+        write: is given each line.
+        stages: write every new stage too, at once.
+        clock: seconds that pass.
+    """
+
+    def __init__(
+        self,
+        write: Callable[[str], None],
+        *,
+        stages: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._write, self._stages, self._clock = write, stages, clock
+        self._stage = ""
+        self._begun = self._said = clock()
+
+    def on_progress(self, stage: str, done: int, total: int, what: str) -> None:
+        """Write a line, if it is time for one; as a listener is called."""
+        now = self._clock()
+        if stage != self._stage:
+            self._stage, self._begun = stage, now
+            if self._stages:
+                self._write(stage)
+                self._said = now
+        if now - self._said < EVERY_S:
+            return
+        self._said = now
+        left = _left(now - self._begun, done, total)
+        self._write(", ".join(filter(None, [f"{stage}: {done}/{total} {what}", left])))
+
+
+def _left(seconds: float, done: int, total: int) -> str:
+    """Say how long the rest takes at the pace so far; nothing where none is known."""
+    if not 0 < done < total:
+        return ""
+    return f"{duration(seconds / done * (total - done))} left"
+
+
+def duration(seconds: float) -> str:
+    """Write a time as people say it: ``40 s``, ``3 min``, ``2 h 5 min``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    hours, rest = divmod(minutes, 60)
+    return f"{minutes} min" if not hours else f"{hours} h {rest} min"
