@@ -13,12 +13,12 @@ folder of the recipe, one in a text to where you are.
 """
 
 import dataclasses
-import tomllib
 from collections.abc import Iterable
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
+from me2e_compress import documents
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes import PASSES, Pass
 
@@ -52,8 +52,8 @@ def load(name: str | Path) -> tuple[Pass, ...]:
             f"no recipe {name}: no such file; we ship {', '.join(shipped())}"
         )
     try:
-        content = tomllib.loads(source.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content = documents.from_toml(source.read_bytes())
+    except documents.MalformedError as error:
         raise RecipeError(f"{name} is not TOML: {error}") from error
     entries = content.get("pass")
     listed = entries if isinstance(entries, list) else []

@@ -7,7 +7,6 @@ frame of every scene.
 
 import hashlib
 import itertools
-import json
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
@@ -252,8 +252,8 @@ def _scenes(path: Path, count: int) -> tuple[int, ...]:
             f'{path}: missing; {{"scenes": [0]}} if the frames are one scene'
         )
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        content = documents.from_json(documents.content(path))
+    except documents.MalformedError as error:
         raise FramesError(f"{path}: not JSON ({error})") from error
     starts = content.get("scenes") if isinstance(content, dict) else None
     if not isinstance(starts, list) or not all(type(at) is int for at in starts):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from me2e_compress import documents
 from me2e_compress.calibration.dataset import load_arrays
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
@@ -56,7 +57,7 @@ class CalibrationCheckpoint:
             return CalibrationState()
         try:
             found = load_arrays(self.path, "a checkpoint")
-            key = json.loads(str(found.pop("key")))
+            key = documents.from_json(str(found.pop("key")))
             done = int(str(found.pop("done")))
         except (ValueError, KeyError) as error:
             raise FramesError(f"{self.path}: not a checkpoint ({error})") from error

@@ -46,7 +46,7 @@ def _names(node: ir.Node, key: str) -> tuple[str, ...]:
     text = node.metadata_props.get(key, "[]")
     try:
         names = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         names = None
     if not isinstance(names, list) or not all(type(name) is str for name in names):
         raise GraphError(

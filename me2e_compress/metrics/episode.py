@@ -3,9 +3,9 @@
 import dataclasses
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ConfigDict, TypeAdapter, with_config
+from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
 from me2e_compress.metrics.infraction import COLLISIONS, Infraction, InfractionKind
 
@@ -19,6 +19,11 @@ __all__ = [
 
 FRAME_US = 50_000
 """Microseconds between two frames: the simulators of the benchmarks run at 20 Hz."""
+
+LARGEST = 1e9
+"""The largest magnitude of a number on file: beyond, squares and sums overflow."""
+
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
 _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 
@@ -56,17 +61,17 @@ class EgoFrame:
     """
 
     time_us: int
-    x: float
-    y: float
-    heading: float
-    speed_mps: float
-    acceleration_mps2: float
-    lateral_acceleration_mps2: float
-    yaw_rate_radps: float
-    steering_rad: float
-    route_m: float
-    traffic_speed_mps: float | None
-    acceleration_norm_mps2: float | None = None
+    x: Number
+    y: Number
+    heading: Number
+    speed_mps: Number
+    acceleration_mps2: Number
+    lateral_acceleration_mps2: Number
+    yaw_rate_radps: Number
+    steering_rad: Number
+    route_m: Number
+    traffic_speed_mps: Number | None
+    acceleration_norm_mps2: Number | None = None
 
 
 @with_config(_STRICT)
@@ -102,15 +107,15 @@ class Episode:
     route: str
     scenario: str
     abilities: tuple[str, ...]
-    route_length_m: float
-    completion_percent: float
+    route_length_m: Annotated[float, Field(ge=0.0, le=LARGEST)]
+    completion_percent: Annotated[float, Field(ge=0.0, le=100.0)]
     ending: Ending
     failure: str | None
     infractions: tuple[Infraction, ...]
     frames: tuple[EgoFrame, ...]
     decisions: tuple[InferenceRecord, ...]
-    junction_m: float | None = None
-    speed_ratios_percent: tuple[float, ...] | None = None
+    junction_m: Number | None = None
+    speed_ratios_percent: tuple[Number, ...] | None = None
 
     @property
     def collided(self) -> bool:

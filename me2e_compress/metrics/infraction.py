@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Annotated
 
-from pydantic import ConfigDict, with_config
+from pydantic import ConfigDict, Field, with_config
 
 
 class InfractionKind(StrEnum):
@@ -76,7 +77,7 @@ class Infraction:
     x: float
     y: float
     detail: str
-    percent: float | None = None
+    percent: Annotated[float, Field(ge=0.0, le=100.0)] | None = None
 
     @property
     def factor(self) -> float:

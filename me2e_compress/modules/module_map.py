@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import tomllib
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Literal, Self
 
 import pydantic
 
+from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.modules.paths import PathGlob, is_malformed
@@ -99,11 +99,7 @@ class ModuleMap(Displayed):
         if path.suffix == ".toml":
             if not path.is_file():
                 raise ModuleMapError(f"{path}: no such file")
-            try:
-                text = path.read_text("utf-8")
-            except UnicodeDecodeError as error:
-                raise ModuleMapError(f"{path}: not TOML ({error})") from error
-            return cls.parse(text, path.stem, str(path))
+            return cls.parse(path.read_bytes(), path.stem, str(path))
         if str(source) == WHOLE:
             return cls.whole()
         if str(source) not in presets():
@@ -115,11 +111,11 @@ class ModuleMap(Displayed):
         return cls.parse(text, str(source), f"preset {source}")
 
     @classmethod
-    def parse(cls, text: str, name: str, origin: str = "map") -> Self:
+    def parse(cls, text: str | bytes, name: str, origin: str = "map") -> Self:
         """Read a map from TOML; ``origin`` is what an error message calls it."""
         try:
-            draft = _File.model_validate(tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
+            draft = _File.model_validate(documents.from_toml(text))
+        except documents.MalformedError as error:
             raise ModuleMapError(f"{origin}: not TOML ({error})") from error
         except pydantic.ValidationError as error:
             first = error.errors()[0]

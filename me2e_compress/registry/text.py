@@ -23,6 +23,10 @@ _INTEGER = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _FLOAT = re.compile(r"[+-]?[0-9]+(_[0-9]+)*(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 _LITERALS = {"true": True, "false": False, "null": None}
 _SHOWN = 40
+_DEEPEST = 32
+"""Lists in lists; the options of ours need one."""
+_DIGITS = 400
+"""The most characters of a number: the largest float64 has 309 digits."""
 
 
 class TextError(ValueError):
@@ -118,7 +122,7 @@ class _Reader:
     """A text and how far it is read."""
 
     def __init__(self, text: str) -> None:
-        self.text, self.at = text, 0
+        self.text, self.at, self.depth = text, 0, 0
 
     def item(self) -> ParsedItem:
         name = self.match(_NAME)
@@ -156,14 +160,18 @@ class _Reader:
             self.fail("a value is expected")
         if self.text.startswith("{", self.at):
             return word + self.braces()
+        if len(word) > _DIGITS and word[:9].strip("+-_").isdecimal():
+            self.fail(f"a number of more than {_DIGITS} digits")
         return _literal(word)
 
     def sequence(self) -> list[object]:
         values: list[object] = []
+        self.deeper()
         while not self.take("]"):
             if values and not self.take(","):
                 self.fail("a comma or ] is expected")
             values.append(self.value())
+        self.depth -= 1
         return values
 
     def string(self, quoted: str) -> str:
@@ -203,10 +211,17 @@ class _Reader:
         self.at = found.end()
         return found.group()
 
+    def deeper(self) -> None:
+        """Step into a list."""
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            self.fail("lists are nested too deeply")
+
     def fail(self, expected: str) -> NoReturn:
         rest = self.text[self.at :]
         where = f"from {rest[:_SHOWN]!r} on" if rest else "to the end"
-        raise TextError(f"cannot read {self.text!r} {where}: {expected}")
+        whole = self.text if len(self.text) <= 200 else f"{self.text[:200]}..."
+        raise TextError(f"cannot read {whole!r} {where}: {expected}")
 
 
 def _literal(word: str) -> object:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.atomic import write_json
@@ -86,9 +87,11 @@ class LatencyTrace(Displayed):
             EvaluationError: No such file, or not a trace with at least one sample.
         """
         try:
-            record = _Record.model_validate_json(path.read_bytes())
+            record = _Record.model_validate_json(documents.content(path))
         except OSError as error:
             raise EvaluationError(f"{path}: {error.strerror}") from error
+        except documents.MalformedError as error:
+            raise EvaluationError(f"{path}: not a latency trace: {error}") from error
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"])) or "the file"

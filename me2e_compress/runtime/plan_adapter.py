@@ -1,6 +1,5 @@
 """Read the planned waypoints off a model's outputs."""
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any, Self, TypeAlias
 
@@ -8,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pydantic
 
+from me2e_compress import documents
 from me2e_compress.errors import GraphError
 
 PLAN = "me2e.plan"
@@ -50,8 +50,8 @@ class PlanAdapter(pydantic.BaseModel):
         if text is None:
             return cls(output=DEFAULT_OUTPUT) if DEFAULT_OUTPUT in outputs else None
         try:
-            found = cls.model_validate(json.loads(text))
-        except (json.JSONDecodeError, pydantic.ValidationError) as error:
+            found = cls.model_validate(documents.from_json(text))
+        except (documents.MalformedError, pydantic.ValidationError) as error:
             first = str(error).splitlines()[0]
             raise GraphError(
                 f"metadata {PLAN} is not a plan adapter: {first}"

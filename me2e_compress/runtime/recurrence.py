@@ -1,11 +1,11 @@
 """Which outputs come back as inputs at the next frame."""
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 
 import onnx_ir as ir
 
+from me2e_compress import documents
 from me2e_compress.errors import GraphError
 
 RECURRENT = "me2e.recurrent"
@@ -83,8 +83,8 @@ def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
 
 def _parse(text: str) -> dict[str, str]:
     try:
-        pairs = json.loads(text)
-    except json.JSONDecodeError as error:
+        pairs = documents.from_json(text)
+    except documents.MalformedError as error:
         raise GraphError(f"metadata {RECURRENT} is not JSON: {error}") from error
     if not isinstance(pairs, dict) or not all(
         isinstance(answer, str) for answer in pairs.values()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
@@ -41,7 +42,7 @@ class Route:
 
     def __post_init__(self) -> None:
         """Check the id, the scenario and the ability."""
-        if not self.id or not all(c.isalnum() or c in "_-" for c in self.id):
+        if not is_route_id(self.id):
             raise EvaluationError(
                 f"route id {self.id!r}: only letters, digits, '_' and '-' are allowed"
             )
@@ -63,6 +64,11 @@ class Route:
         return SCENARIO_ABILITIES[self.scenario]
 
 
+def is_route_id(text: str) -> bool:
+    """Return whether a text can be the id of a route, and so the name of a file."""
+    return 0 < len(text) <= 200 and all(c.isalnum() or c in "_-" for c in text)
+
+
 _MANIFEST = TypeAdapter(list[Route])
 
 
@@ -73,9 +79,11 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
         EvaluationError: The file is missing, not a manifest, or repeats an id.
     """
     try:
-        routes = _MANIFEST.validate_json(path.read_bytes(), strict=True)
+        routes = _MANIFEST.validate_json(documents.content(path), strict=True)
     except OSError as error:
         raise EvaluationError(f"{path}: cannot be read: {error.strerror}") from error
+    except documents.MalformedError as error:
+        raise EvaluationError(f"{path}: not routes: {error}") from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"

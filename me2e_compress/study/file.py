@@ -1,11 +1,10 @@
 """A study as a TOML file."""
 
-import tomllib
 from pathlib import Path
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
-from me2e_compress import recipe
+from me2e_compress import documents, recipe
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -34,10 +33,10 @@ def load_study(path: str | Path, routes: str | None = None) -> Study:
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = documents.from_toml(documents.content(path))
     except OSError as error:
         raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except documents.MalformedError as error:
         raise StudyError(f"{path}: not TOML: {error}") from error
     try:
         table = _Study.model_validate(content)

@@ -54,6 +54,30 @@ def test_evaluate_and_score_say_the_same(
     assert set(scored["driving_score"]) >= {"value", "low", "high", "n"}
 
 
+def test_a_completion_beyond_the_whole_route_is_left_out(
+    run: Run, manifest: Path, tmp_path: Path
+) -> None:
+    results = tmp_path / "results"
+    run("evaluate", "blind", "--routes", manifest, "-o", results)
+    file = results / "routes" / "parked.json"
+    record = json.loads(file.read_text())
+    record["episode"]["completion_percent"] = 5000.0
+    file.write_text(json.dumps(record))
+
+    assert json.loads(run("score", results, "--json"))["routes"]["driven"] == 1
+
+
+def test_one_route_counts_once_whatever_its_file_is_called(
+    run: Run, manifest: Path, tmp_path: Path
+) -> None:
+    results = tmp_path / "results"
+    run("evaluate", "blind", "--routes", manifest, "-o", results)
+    copied = (results / "routes" / "crossing.json").read_bytes()
+    (results / "routes" / "parked.json").write_bytes(copied)
+
+    assert json.loads(run("score", results, "--json"))["routes"]["driven"] == 1
+
+
 def test_score_says_partial(run: Run, manifest: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     run("evaluate", "blind", "--routes", manifest, "-o", results)

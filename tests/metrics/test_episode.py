@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.metrics.episode import (
+    LARGEST,
     EgoFrame,
     Ending,
     Episode,
@@ -15,7 +16,8 @@ from me2e_compress.metrics.episode import (
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
 from tests.metrics.drives import cruise, drive, infraction
 
-numbers = st.floats(allow_nan=False, allow_infinity=False)
+numbers = st.floats(-LARGEST, LARGEST)
+percents = st.floats(0.0, 100.0)
 times = st.integers(0, 10**10)
 frame_rows = st.builds(
     EgoFrame,
@@ -31,15 +33,15 @@ infractions = st.builds(
     numbers,
     numbers,
     st.text(max_size=8),
-    st.none() | numbers,
+    st.none() | percents,
 )
 episodes = st.builds(
     Episode,
     st.text(max_size=8),
     st.text(max_size=8),
     st.lists(st.text(max_size=4), max_size=2).map(tuple),
-    numbers,
-    numbers,
+    st.floats(0.0, LARGEST),
+    percents,
     st.sampled_from(Ending),
     st.none() | st.text(max_size=8),
     st.lists(infractions, max_size=2).map(tuple),

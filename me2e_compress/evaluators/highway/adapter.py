@@ -1,7 +1,5 @@
 """How a model with its own names and layouts is adapted to the policy contract."""
 
-import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -11,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 
@@ -96,15 +95,15 @@ class Adapter(BaseModel):
             EvaluationError: No such file, not TOML, or an unknown key or value.
         """
         try:
-            return cls.model_validate(tomllib.loads(path.read_text("utf-8")))
+            return cls.model_validate(documents.from_toml(documents.content(path)))
         except OSError as error:
             raise EvaluationError(f"{path}: {error.strerror}") from error
+        except documents.MalformedError as error:
+            raise EvaluationError(f"{path}: not TOML: {error}") from error
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             raise EvaluationError(f"{path}: adapter {where}: {first['msg']}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise EvaluationError(f"{path}: not TOML: {error}") from error
 
     def normalization(self, metadata: Mapping[str, str]) -> ImageNormalization:
         """Return the adapter's normalisation, or else the model's own.
@@ -121,8 +120,8 @@ class Adapter(BaseModel):
                 f"the adapter no [image]"
             )
         try:
-            return ImageNormalization.model_validate(json.loads(text))
-        except (json.JSONDecodeError, ValidationError) as error:
+            return ImageNormalization.model_validate(documents.from_json(text))
+        except (documents.MalformedError, ValidationError) as error:
             line = " ".join(str(error).split())
             raise EvaluationError(f"metadata {IMAGE} is malformed: {line}") from error
 

@@ -8,15 +8,18 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
+from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.routes import Route, is_route_id
 from me2e_compress.version import __version__
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
+LARGEST_SET = 1_000_000
+"""Routes of a set that a manifest may claim."""
 
 
 def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
@@ -92,14 +95,16 @@ class ResultsFolder:
             EvaluationError: It is not a results folder.
         """
         try:
-            made_by = json.loads((path / MANIFEST).read_bytes())
-        except (OSError, ValueError) as error:
-            words = error.strerror if isinstance(error, OSError) else "not JSON"
+            made_by = documents.from_json(documents.content(path / MANIFEST))
+        except OSError as error:
             raise EvaluationError(
-                f"{path}: not a results folder: {MANIFEST}: {words}"
+                f"{path}: not a results folder: {MANIFEST}: {error.strerror}"
             ) from error
-        if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
-            raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
+        except documents.MalformedError as error:
+            raise EvaluationError(
+                f"{path}: not a results folder: {MANIFEST}: not JSON ({error})"
+            ) from error
+        _check_manifest(path, made_by)
         return cls(path, made_by)
 
     @property
@@ -115,7 +120,7 @@ class ResultsFolder:
 
     def episodes(self) -> dict[str, Episode]:
         """Read every route that was driven, in the order of the evaluation."""
-        found = {route: self._read(str(route)) for route in self.made_by["routes"]}
+        found = {route: self._read(route) for route in self.made_by["routes"]}
         return {route: one for route, one in found.items() if one is not None}
 
     def save(self, driven: Driven) -> None:
@@ -153,14 +158,17 @@ class ResultsFolder:
         if not path.exists():
             return None
         try:
-            record = json.loads(path.read_bytes())
+            record = documents.from_json(documents.content(path))
             if (
                 not isinstance(record, dict)
                 or record.get("fingerprint") != self._digest
             ):
                 raise ValueError("of another evaluation")
-            return Episode.from_json(record["episode"])
-        except (ValueError, KeyError, TypeError) as error:
+            episode = Episode.from_json(record["episode"])
+            if episode.route != route:
+                raise ValueError(f"it is of route {episode.route}")
+            return episode
+        except (OSError, ValueError, KeyError, TypeError) as error:
             self.corrupt[path] = " ".join(str(error).split())[:200]
             return None
 
@@ -172,6 +180,24 @@ def read_results(paths: Iterable[Path]) -> list[ResultsFolder]:
         EvaluationError: One of them is not a results folder.
     """
     return [ResultsFolder.open(path) for path in paths]
+
+
+def _check_manifest(path: Path, made_by: object) -> None:
+    """Check what is read of a manifest: routes, which are file names, and their set."""
+    if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
+        raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
+    routes = made_by["routes"]
+    for route in routes:
+        if not isinstance(route, str) or not is_route_id(route):
+            raise EvaluationError(f"{path}: {MANIFEST}: {_short(route)} is no route")
+    if len(set(routes)) < len(routes):
+        raise EvaluationError(f"{path}: {MANIFEST} names a route twice")
+    size = made_by.get("set_size", len(routes))
+    if type(size) is not int or not len(routes) <= size <= LARGEST_SET:
+        raise EvaluationError(
+            f"{path}: {MANIFEST}: set_size is {_short(size)}, it must be"
+            f" {len(routes)} or more"
+        )
 
 
 def _refuse_foreign(path: Path) -> None:

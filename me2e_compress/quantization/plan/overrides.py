@@ -20,7 +20,6 @@ that they stand for. Where two overrides match a node, the later counts.
 
 import dataclasses
 import fnmatch
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal, Self
@@ -28,6 +27,7 @@ from typing import Literal, Self
 import onnx_ir as ir
 import pydantic
 
+from me2e_compress import documents
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan.decision import FLOAT, INT8, Decision
@@ -110,18 +110,14 @@ class Overrides(_Strict):
         """
         if not path.is_file():
             raise RecipeError(f"{path}: no such file of overrides")
-        try:
-            text = path.read_text(encoding="utf-8")
-        except UnicodeDecodeError as error:
-            raise RecipeError(f"{path}: not TOML ({error})") from error
-        return cls.parse(text, str(path))
+        return cls.parse(path.read_bytes(), str(path))
 
     @classmethod
-    def parse(cls, text: str, origin: str = "overrides") -> Self:
+    def parse(cls, text: str | bytes, origin: str = "overrides") -> Self:
         """Read TOML; ``origin`` is what an error message calls it."""
         try:
-            return cls.model_validate(tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
+            return cls.model_validate(documents.from_toml(text))
+        except documents.MalformedError as error:
             raise RecipeError(f"{origin}: not TOML ({error})") from error
         except pydantic.ValidationError as error:
             first = error.errors()[0]

@@ -1,0 +1,112 @@
+"""JSON and TOML that someone else wrote: read whole, or refused in one line.
+
+What Python's parsers take or break on is refused here, once for all formats: nesting
+without end, numbers of thousands of digits, lone surrogates, keys of thousands of parts
+(tomllib takes memory by their square), and files that are no files.
+"""
+
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+LARGEST_BYTES = 256_000_000
+"""The largest text file that is read; a plan of 30,000 nodes has 15 MB."""
+
+KEY_PARTS = 64
+"""The most parts of a dotted TOML key."""
+
+_DECODER = json.JSONDecoder(parse_constant=lambda word: _refuse(word))
+_TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|[\w-]+|\.|[^\s.]')
+_LONE_SURROGATE = re.compile("[\ud800-\udfff]")
+
+
+class MalformedError(ValueError):
+    """A text is not what it should be; the message is one line, without the file."""
+
+
+def content(path: Path) -> bytes:
+    """Read a text file.
+
+    Raises:
+        OSError: it is not there, or may not be read.
+        MalformedError: it is a folder, a device or a pipe, or too large.
+    """
+    about = path.stat()
+    if not path.is_file():
+        raise MalformedError("not a regular file")
+    if about.st_size > LARGEST_BYTES:
+        raise MalformedError(f"{about.st_size:,} bytes are too many for a text file")
+    return path.read_bytes()
+
+
+def from_json(text: bytes | str) -> Any:
+    """Read a JSON document; NaN and infinities are refused.
+
+    Raises:
+        MalformedError: it is none.
+    """
+    try:
+        found = _DECODER.decode(_decoded(text))
+    except RecursionError as error:
+        raise MalformedError("nested too deeply") from error
+    except ValueError as error:
+        raise MalformedError(_line(error)) from error
+    _check_strings(found)
+    return found
+
+
+def from_toml(text: bytes | str) -> dict[str, Any]:
+    """Read a TOML document.
+
+    Raises:
+        MalformedError: it is none.
+    """
+    try:
+        decoded = _decoded(text)
+        _check_keys(decoded)
+        return tomllib.loads(decoded)
+    except RecursionError as error:
+        raise MalformedError("nested too deeply") from error
+    except ValueError as error:
+        raise MalformedError(_line(error)) from error
+
+
+def _decoded(text: bytes | str) -> str:
+    return text if isinstance(text, str) else text.decode("utf-8")
+
+
+def _line(error: ValueError) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _refuse(word: str) -> None:
+    raise ValueError(f"{word} is not a number")
+
+
+def _check_strings(value: object) -> None:
+    """Refuse half characters, which JSON's escapes can write and no file can hold."""
+    waiting = [value]
+    while waiting:
+        each = waiting.pop()
+        if isinstance(each, dict):
+            waiting += (*each.keys(), *each.values())
+        elif isinstance(each, list):
+            waiting += each
+        elif isinstance(each, str) and _LONE_SURROGATE.search(each):
+            raise MalformedError("a string holds half a surrogate pair")
+
+
+def _check_keys(text: str) -> None:
+    """Count the parts of dotted keys."""
+    parts, after_dot = 0, True
+    for token in _TOKEN.finditer(text):
+        word = token.group()
+        if word == ".":
+            after_dot = True
+            continue
+        parts = parts + 1 if after_dot else 1
+        after_dot = False
+        if parts > KEY_PARTS:
+            raise MalformedError(f"a key has more than {KEY_PARTS} parts")
