@@ -20,7 +20,7 @@ from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.recurrence import recurrent_inputs
+from me2e_compress.runtime.recurrence import not_fed_back, recurrent_inputs, sides
 
 _UNREADABLE = (
     OSError,
@@ -172,6 +172,7 @@ def _check_frame(frame: Frame, model: ir.Model, source: str) -> None:
         elif name not in optional:
             raise FramesError(
                 f"{source}: {name} is missing; there is {', '.join(frame.arrays)}"
+                f"{not_fed_back(name, *sides(model))}"
             )
     if unknown := [name for name in frame.arrays if name not in ports]:
         raise FramesError(

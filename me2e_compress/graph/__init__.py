@@ -31,6 +31,7 @@ from me2e_compress.graph.shapes import (
     infer_shapes,
     open_shape,
     rank_of,
+    refined,
     static_shape,
 )
 from me2e_compress.graph.summary import (
@@ -71,6 +72,7 @@ __all__ = [
     "opset_of",
     "producer_of",
     "rank_of",
+    "refined",
     "save",
     "sha256_of",
     "size",

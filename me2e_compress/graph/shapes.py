@@ -36,7 +36,9 @@ def infer_shapes(model: ir.Model) -> None:
 
     A node of an unknown domain stops nothing: what it gives keeps the shape that the
     file records, or none. A graph that ONNX cannot infer at all stays as it is, and
-    so do the interface and the order of the initializers in any case.
+    so do the inputs and the order of the initializers in any case. Of the outputs,
+    dimensions that the file leaves open become numbers: an exporter's symbol
+    (``Gathery_dim_0``) hides what is known, and shape arithmetic behind it would stay.
     """
     try:
         proto = onnx.shape_inference.infer_shapes(
@@ -63,10 +65,13 @@ def _adopt(
     for node, written in zip(graph, inferred.node, strict=True):
         for value in node.outputs:
             info = known.get(value.name or "")
-            if info is None or value in interface:
+            if info is None:
+                continue
+            shape = ir.serde.deserialize_type_proto_for_shape(info.type)
+            if value in interface:
+                value.shape = refined(value.shape, shape)
                 continue
             kind = ir.serde.deserialize_type_proto_for_type(info.type)
-            shape = ir.serde.deserialize_type_proto_for_shape(info.type)
             value.type = kind if kind is not None else value.type
             value.shape = shape if shape is not None else value.shape
         for body in written.attribute:
@@ -76,6 +81,16 @@ def _adopt(
                 bodies = node.attributes[body.name].as_graphs()
                 for inner, message in zip(bodies, body.graphs, strict=True):
                     _adopt(inner, message, interface)
+
+
+def refined(declared: ir.Shape | None, found: ir.Shape | None) -> ir.Shape | None:
+    """Return a declared shape, its open dimensions numbers where those are found."""
+    if declared is None or found is None or len(declared) != len(found):
+        return declared
+    pairs = list(zip(declared, found, strict=True))
+    if not any(isinstance(new, int) and not isinstance(old, int) for old, new in pairs):
+        return declared
+    return ir.Shape([new if isinstance(new, int) else old for old, new in pairs])
 
 
 def _without_weights(model: ir.Model) -> onnx.ModelProto:

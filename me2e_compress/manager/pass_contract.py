@@ -1,5 +1,7 @@
 """What must hold after every pass, whatever the pass is."""
 
+import dataclasses
+
 import onnx
 import onnx_ir as ir
 import onnx_ir.passes.common as common
@@ -76,8 +78,12 @@ def _check_provenance(current: Pass, before: ir.Model, after: ir.Model) -> None:
 
 
 def _check_interface(current: Pass, before: ir.Model, result: PassResult) -> None:
-    inputs, outputs = graph.interface(before)
-    kept = tuple(port for port in outputs if port.name not in result.removed_outputs)
+    inputs, _ = graph.interface(before)
+    kept = tuple(
+        port
+        for port in _refined_outputs(before, result.model)
+        if port.name not in result.removed_outputs
+    )
     after = graph.interface(result.model)
     for old, new in zip((inputs, kept), after, strict=True):
         if old != new:
@@ -87,6 +93,19 @@ def _check_interface(current: Pass, before: ir.Model, result: PassResult) -> Non
                 f"{current.name} changed the interface: {gone or old} became"
                 f" {come or new}"
             )
+
+
+def _refined_outputs(before: ir.Model, after: ir.Model) -> tuple[graph.Port, ...]:
+    """List the outputs before, open dimensions replaced by numbers found since."""
+    found = {value.name: value.shape for value in after.graph.outputs}
+    return tuple(
+        dataclasses.replace(
+            port, shape=str(graph.refined(value.shape, found.get(value.name)))
+        )
+        for port, value in zip(
+            graph.interface(before)[1], before.graph.outputs, strict=True
+        )
+    )
 
 
 def _check_order(name: str, body: ir.Graph) -> None:

@@ -136,10 +136,12 @@ class _Books:
             raise found
         # Commit: what the next pass is given has its shapes, and is hashed once.
         result = found.result
+        interface = graph.interface(result.model)
         if result.changes:
             graph.infer_shapes(result.model)
-        bodies = any(True for _ in result.model.graph.subgraphs())
-        self._digest = graph.digest(result.model) if bodies else found.digest
+        stale = any(True for _ in result.model.graph.subgraphs())
+        stale |= graph.interface(result.model) != interface  # an output has a shape now
+        self._digest = graph.digest(result.model) if stale else found.digest
         self._enter(current, result, process_time() - start)
         if current.exact:
             self._stretch.append((current, model))

@@ -9,9 +9,11 @@ from me2e_compress import documents
 from me2e_compress.errors import GraphError
 
 RECURRENT = "me2e.recurrent"
-"""Metadata key: JSON ``{input: output}``; ``{}`` where nothing is fed back."""
+"""Metadata key: JSON ``{input: output}``, null for an input that is not fed back;
+``{}`` where none is."""
 
-SUFFIX = "_out"
+SUFFIX, BEFORE, AFTER = "_out", "prev_", "next_"
+"""The naming rules: ``X`` is answered by ``X_out``, ``prev_X`` also by ``next_X``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,41 +36,96 @@ def recurrence(
 ) -> dict[str, str]:
     """Pair recurrent inputs with the outputs that answer them.
 
-    The metadata decides where it has ``me2e.recurrent``; without it, an input ``X``
-    belongs to the output ``X_out`` of the same element type and rank.
+    The metadata ``me2e.recurrent`` decides for the inputs and outputs it names, and for
+    all where it is empty. Any other input ``X`` belongs to the output ``X_out``, an
+    input ``prev_X`` also to ``next_X``, of the same element type and rank.
 
     Raises:
         GraphError: the metadata is not such a mapping, names an unknown port, or
             pairs ports of different types.
     """
     text = metadata.get(RECURRENT)
-    if text is None:
-        return {
-            name: name + SUFFIX
-            for name in inputs
-            if name + SUFFIX in outputs and _fits(inputs[name], outputs[name + SUFFIX])
-        }
-    pairs = _parse(text)
+    named = None if text is None else _parse(text)
+    if named == {}:
+        return {}
+    pairs = {source: to for source, to in (named or {}).items() if to is not None}
     for source, answer in pairs.items():
-        if source not in inputs or answer not in outputs:
-            raise GraphError(
-                f"metadata {RECURRENT} pairs {source} with {answer}; the graph has"
-                f" inputs {', '.join(inputs)} and outputs {', '.join(outputs)}"
-            )
-        if not _fits(inputs[source], outputs[answer]):
-            raise GraphError(
-                f"metadata {RECURRENT} feeds {answer} ({outputs[answer].type} of rank"
-                f" {len(outputs[answer].shape)}) back as {source}"
-                f" ({inputs[source].type} of rank {len(inputs[source].shape)})"
-            )
-    return pairs
+        _check(source, answer, inputs, outputs)
+    for source in inputs:
+        found = _answer(source, outputs)
+        if found is None or source in (named or {}) or found in pairs.values():
+            continue
+        if _fits(inputs[source], outputs[found]):
+            pairs[source] = found
+    return {source: pairs[source] for source in inputs if source in pairs}
+
+
+def not_fed_back(
+    name: str, inputs: Mapping[str, SessionPort], outputs: Mapping[str, SessionPort]
+) -> str:
+    """Say why an input that no frame holds is not fed back; nothing of a plain one."""
+    answer = _answer(name, outputs)
+    if answer is None and name.startswith(BEFORE):
+        after = AFTER + name.removeprefix(BEFORE)
+        return (
+            f"; nothing feeds it back: no output is called {name}{SUFFIX} or {after},"
+            f" and the metadata {RECURRENT} does not name it"
+        )
+    if answer is None or name not in inputs:
+        return ""
+    if _fits(inputs[name], outputs[answer]):
+        return f"; {answer} is not fed back to it: the metadata {RECURRENT} decides so"
+    return f"; nothing feeds it back: {_misfit(name, answer, inputs, outputs)}"
+
+
+def _answer(source: str, outputs: Mapping[str, SessionPort]) -> str | None:
+    """Return the output that the naming rules give an input."""
+    names = [source + SUFFIX]
+    if source.startswith(BEFORE):
+        names.append(AFTER + source.removeprefix(BEFORE))
+    return next((name for name in names if name in outputs), None)
+
+
+def _check(
+    source: str,
+    answer: str,
+    inputs: Mapping[str, SessionPort],
+    outputs: Mapping[str, SessionPort],
+) -> None:
+    if source not in inputs or answer not in outputs:
+        raise GraphError(
+            f"metadata {RECURRENT} pairs {source} with {answer}; the graph has"
+            f" inputs {', '.join(inputs)} and outputs {', '.join(outputs)}"
+        )
+    if not _fits(inputs[source], outputs[answer]):
+        raise GraphError(
+            f"metadata {RECURRENT}: {_misfit(source, answer, inputs, outputs)}"
+        )
+
+
+def _misfit(
+    source: str,
+    answer: str,
+    inputs: Mapping[str, SessionPort],
+    outputs: Mapping[str, SessionPort],
+) -> str:
+    taken, given = inputs[source], outputs[answer]
+    return (
+        f"output {answer} is {given.type} of rank {len(given.shape)}, input {source}"
+        f" {taken.type} of rank {len(taken.shape)}"
+    )
 
 
 def recurrent_inputs(model: ir.Model) -> dict[str, str]:
     """Return the ``{recurrent input: output}`` of a graph in memory."""
-    return recurrence(
-        model.metadata_props, _ports(model.graph.inputs), _ports(model.graph.outputs)
-    )
+    return recurrence(model.metadata_props, *sides(model))
+
+
+def sides(
+    model: ir.Model,
+) -> tuple[dict[str, SessionPort], dict[str, SessionPort]]:
+    """Return the inputs and the outputs of a graph in memory, those of known rank."""
+    return _ports(model.graph.inputs), _ports(model.graph.outputs)
 
 
 def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
@@ -81,13 +138,13 @@ def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
     }
 
 
-def _parse(text: str) -> dict[str, str]:
+def _parse(text: str) -> dict[str, str | None]:
     try:
         pairs = documents.from_json(text)
     except documents.MalformedError as error:
         raise GraphError(f"metadata {RECURRENT} is not JSON: {error}") from error
     if not isinstance(pairs, dict) or not all(
-        isinstance(answer, str) for answer in pairs.values()
+        answer is None or isinstance(answer, str) for answer in pairs.values()
     ):
         raise GraphError(f"metadata {RECURRENT} is not {{input: output}}: {text}")
     return dict(pairs)

@@ -18,7 +18,7 @@ from me2e_compress.runtime.opening import (
     open_file,
     open_graph,
 )
-from me2e_compress.runtime.recurrence import SessionPort, recurrence
+from me2e_compress.runtime.recurrence import SessionPort, not_fed_back, recurrence
 
 __all__ = ["Session", "SessionPort", "evaluate_constants", "replay", "run_once"]
 
@@ -122,8 +122,10 @@ class Session:
             GraphError: a node failed on these inputs.
         """
         if missing := [name for name in self.inputs if name not in feeds]:
+            reason = not_fed_back(missing[0], self.inputs, self.outputs)
             raise FramesError(
                 f"input {missing[0]} is missing; there is {', '.join(feeds) or 'none'}"
+                f"{reason}"
             )
         names = list(self.outputs) if outputs is None else list(outputs)
         try:

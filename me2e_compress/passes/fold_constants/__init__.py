@@ -69,6 +69,7 @@ class FoldConstants(Pass):
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
         tally = _Tally(lifted=lift_constants(model))
+        declared = [value.shape for value in model.graph.outputs]
         for body in graphs_of(model.graph):
             tally.seated += _seat_ranges(body, model.opset_imports, self.name)
         before = -1
@@ -78,7 +79,9 @@ class FoldConstants(Pass):
             tally.kept = 0
             for body in list(graphs_of(model.graph)):
                 self._fold(body, model.opset_imports, tally, trust=body is model.graph)
-        return PassResult(model, tally.changes, _notes(tally))
+        found = [value.shape for value in model.graph.outputs]
+        refined = sum(a is not b for a, b in zip(declared, found, strict=True))
+        return PassResult(model, tally.changes + refined, _notes(tally))
 
     def _fold(
         self, body: ir.Graph, opsets: dict[str, int], tally: _Tally, *, trust: bool

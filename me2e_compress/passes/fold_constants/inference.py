@@ -5,22 +5,33 @@ from collections.abc import Mapping
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of
+from me2e_compress.graph import array_of, refined
 from me2e_compress.rewrite import Array, is_standard
 
 
 def infer_node(
-    node: ir.Node, known: Mapping[ir.Value, Array], opsets: Mapping[str, int]
+    node: ir.Node,
+    known: Mapping[ir.Value, Array],
+    opsets: Mapping[str, int],
+    *,
+    trust_shapes: bool = True,
 ) -> bool:
     """Ask ONNX for the shapes of a node's outputs; True if more is known than before.
 
     What is recorded already stays: only outputs without a static shape are written.
+
+    Args:
+        node: the node.
+        known: the values that are known as arrays.
+        opsets: the model's.
+        trust_shapes: False inside bodies: what a loop answers may have another shape
+            every round.
     """
     try:
         found = _ask(node, known, {}, opsets)
     except (onnx.shape_inference.InferenceError, onnx.checker.ValidationError):
         return False
-    return _record(node, found)
+    return _record(node, found, answers=trust_shapes)
 
 
 def branch_fits(node: ir.Node, branch: ir.Graph, opsets: Mapping[str, int]) -> bool:
@@ -88,11 +99,18 @@ def _ask(
     )
 
 
-def _record(node: ir.Node, found: Mapping[str, onnx.TypeProto]) -> bool:
+def _record(
+    node: ir.Node, found: Mapping[str, onnx.TypeProto], *, answers: bool
+) -> bool:
     learnt = False
     for value in node.outputs:
         proto = found.get(value.name or "")
-        if proto is None or value.is_graph_output():
+        if proto is None:
+            continue
+        if value.is_graph_output():
+            shape = ir.serde.deserialize_type_proto_for_shape(proto)
+            if answers and (more := refined(value.shape, shape)) is not value.shape:
+                value.shape, learnt = more, True
             continue
         if value.type is None:
             value.type = ir.serde.deserialize_type_proto_for_type(proto)

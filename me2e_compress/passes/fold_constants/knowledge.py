@@ -164,7 +164,8 @@ class Sweep:
         for value in node.inputs:
             if value is not None:
                 self._known(value)
-        if infer_node(node, self.known.arrays, self.opsets):
+        arrays, trust = self.known.arrays, self.trust_shapes
+        if infer_node(node, arrays, self.opsets, trust_shapes=trust):
             self.learnt.update(outputs)
 
     def _add(self, node: ir.Node) -> None:

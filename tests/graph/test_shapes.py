@@ -1,0 +1,44 @@
+"""What is known of shapes, and what an exporter's symbols must not hide."""
+
+import onnx_ir as ir
+
+from me2e_compress import graph, recipe
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+
+CHAIN = """
+<ir_version: 9, opset_import: ["" : 17]>
+six (float[BATCH,6,8] x) => (float["Addy_dim_0","Addy_dim_1",8] y, float[one,48] z)
+    <int64[1] minus = {-1}, int64 zero = {0}>
+{
+    y = Add(x, x)
+    s = Shape(y)
+    b = Gather(s, zero)
+    r = Reshape(b, minus)
+    full = Concat<axis=0>(r, minus)
+    z = Reshape(y, full)
+}
+"""
+
+
+def test_an_output_s_symbol_does_not_hide_the_size_that_is_inferred() -> None:
+    model = ir.from_onnx_text(CHAIN.replace("BATCH", "1"))
+    graph.infer_shapes(model)
+    assert str(model.graph.outputs[0].shape) == "[1,6,8]"
+
+
+def test_an_output_keeps_the_symbol_of_a_size_that_stays_open() -> None:
+    model = ir.from_onnx_text(CHAIN.replace("BATCH", "batch"))
+    graph.infer_shapes(model)
+    assert str(model.graph.outputs[0].shape) == "[Addy_dim_0,6,8]"
+
+
+def test_shape_arithmetic_behind_an_output_with_a_symbol_is_folded() -> None:
+    model = ir.from_onnx_text(CHAIN.replace("BATCH", "1"))
+    report = PassManager(recipe.load("exact")).run(model, Context(ModuleMap.whole()))
+    assert [node.op_type for node in report.model.graph] == ["Add", "Reshape"]
+    assert [str(value.shape) for value in report.model.graph.outputs] == [
+        "[1,6,8]",
+        "[1,48]",
+    ]

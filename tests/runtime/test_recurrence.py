@@ -1,0 +1,79 @@
+"""Which outputs come back as inputs."""
+
+import re
+
+import numpy as np
+import pytest
+
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.runtime.recurrence import SessionPort, not_fed_back, recurrence
+from me2e_compress.runtime.session import Session
+from tests.nets import conv_attention
+
+STATE = SessionPort("tensor(float)", (1, 8))
+FLAG = SessionPort("tensor(bool)", (1,))
+
+
+def pairs(inputs: str, outputs: str, metadata: str | None = None) -> dict[str, str]:
+    sides = [dict.fromkeys(names.split(), STATE) for names in (inputs, outputs)]
+    told = {} if metadata is None else {"me2e.recurrent": metadata}
+    return recurrence(told, *sides)
+
+
+def test_a_pair_in_the_metadata_leaves_the_naming_rule_to_the_others() -> None:
+    tracks = [f"prev_track{i}" for i in range(15)]
+    found = pairs(
+        " ".join(["img", "prev_bev", *tracks]),
+        " ".join(["bev_embed", *(f"{name}_out" for name in tracks)]),
+        '{"prev_bev": "bev_embed"}',
+    )
+    named = {name: f"{name}_out" for name in tracks}
+    assert found == {"prev_bev": "bev_embed", **named}
+
+
+def test_prev_x_is_answered_by_next_x() -> None:
+    assert pairs("img prev_bev", "plan next_bev") == {"prev_bev": "next_bev"}
+
+
+def test_x_out_comes_before_next_x() -> None:
+    found = pairs("prev_bev", "next_bev prev_bev_out")
+    assert found == {"prev_bev": "prev_bev_out"}
+
+
+def test_metadata_s_null_keeps_an_input_from_being_fed_back() -> None:
+    assert pairs("a b", "a_out b_out", '{"a": null}') == {"b": "b_out"}
+
+
+def test_an_output_is_fed_back_once() -> None:
+    assert pairs("a b", "b_out", '{"a": "b_out"}') == {"a": "b_out"}
+
+
+def test_ports_that_do_not_fit_are_named_with_what_they_are() -> None:
+    with pytest.raises(GraphError, match=r"output b is tensor\(bool\) of rank"):
+        recurrence({"me2e.recurrent": '{"a": "b"}'}, {"a": STATE}, {"b": FLAG})
+
+
+@pytest.mark.parametrize(
+    ("name", "outputs", "why"),
+    [
+        ("prev_a", {}, "no output is called prev_a_out or next_a, and the metadata"),
+        (
+            "a",
+            {"a_out": FLAG},
+            "output a_out is tensor.bool. of rank 1, input a",
+        ),
+        ("a", {"a_out": STATE}, "a_out is not fed back to it: the metadata"),
+        ("img", {"plan": STATE}, "^$"),
+    ],
+)
+def test_why_an_input_is_not_fed_back(
+    name: str, outputs: dict[str, SessionPort], why: str
+) -> None:
+    assert re.search(why, not_fed_back(name, {name: STATE}, outputs))
+
+
+def test_a_missing_state_is_an_error_that_says_why() -> None:
+    model = conv_attention()
+    model.metadata_props["me2e.recurrent"] = "{}"
+    with pytest.raises(FramesError, match=r"memory is missing.*memory_out is not"):
+        Session(model).run({"image": np.zeros((1, 3, 8, 8), np.float32)})
