@@ -59,17 +59,19 @@ class Job:
 
 @dataclasses.dataclass(frozen=True)
 class Taken:
-    """What one run of a tool took, in seconds.
+    """What one run of a tool took.
 
     Attributes:
-        startup_s: CPU time until its imports were done.
-        cpu_s: CPU time of the work.
-        wall_s: wall time of the work.
+        startup_s: CPU time until its imports were done, seconds.
+        cpu_s: CPU time of the work, seconds.
+        wall_s: wall time of the work, seconds.
+        peak_mb: largest resident memory, imports included.
     """
 
     startup_s: float
     cpu_s: float
     wall_s: float
+    peak_mb: float
 
 
 def ours(job: Job, verify_frames: int = 0) -> Work:
@@ -125,8 +127,19 @@ def work_alone(tool: str, job: Job) -> None:
     startup, wall = time.process_time(), time.perf_counter()
     with contextlib.redirect_stderr(io.StringIO()):
         work()
-    taken = Taken(startup, time.process_time() - startup, time.perf_counter() - wall)
+    cpu, wall = time.process_time() - startup, time.perf_counter() - wall
+    taken = Taken(startup, cpu, wall, peak_mb())
     print(json.dumps(dataclasses.asdict(taken)))
+
+
+def peak_mb() -> float:
+    """Return the largest resident set of this process; Linux.
+
+    Not getrusage: there a process inherits the peak of the one that started it.
+    """
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    (line,) = (each for each in status.splitlines() if each.startswith("VmHWM"))
+    return int(line.split()[1]) / 1024
 
 
 def measure(tool: str, job: Job) -> Taken:
@@ -206,12 +219,13 @@ def compare(source: Path, folder: Path, preset: str, rounds: int) -> None:
 
 def show_times(taken: Mapping[str, Sequence[Taken]]) -> None:
     """Print the least and the median CPU time of the rounds, start-up apart."""
-    print(f"\n{'':14}  start-up  CPU s min  median  wall s min")
+    print(f"\n{'':14}  start-up  CPU s min  median  wall s min  peak MB")
     for tool, runs in taken.items():
         cpu = [each.cpu_s for each in runs]
         print(
             f"{tool:14} {min(each.startup_s for each in runs):9.2f} {min(cpu):10.2f}"
             f" {np.median(cpu):7.2f} {min(each.wall_s for each in runs):11.2f}"
+            f" {max(each.peak_mb for each in runs):8.0f}"
         )
     ratios = [
         mine.cpu_s / theirs.cpu_s

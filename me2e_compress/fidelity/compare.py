@@ -12,7 +12,7 @@ import numpy.typing as npt
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import Session, detached, replay
 
 Float64: TypeAlias = npt.NDArray[np.float64]
 
@@ -81,7 +81,8 @@ class Reference:
     @classmethod
     def of(cls, session: Session, frames: Frames) -> Self:
         """Run the model once over the frames."""
-        return cls(session, frames, tuple(replay(session, frames)))
+        answers = tuple(detached(each) for each in replay(session, frames))
+        return cls(session, frames, answers)
 
     def compare(self, other: Session) -> Fidelity:
         """Compare another model with it, as :func:`compare` does."""

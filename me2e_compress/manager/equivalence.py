@@ -1,7 +1,7 @@
 """Do two graphs give the same outputs?"""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,7 @@ from me2e_compress.calibration.dataset import CalibrationSet, synthetic
 from me2e_compress.errors import GraphError
 from me2e_compress.manager.report import Verification
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import Session, detached, replay
 
 TOLERANCES = {"float64": 1e-9, "float32": 1e-4, "float16": 1e-2, "bfloat16": 5e-2}
 """Allowed max|a-b|/max|a| by output dtype: what reordered sums of that dtype cost in
@@ -51,18 +51,20 @@ class VerificationInputs:
             return cls(chosen, "recorded")
         return cls(list(synthetic(model, seed=seed, count=count)), "synthetic")
 
-    def run(self, model: ir.Model) -> list[Outputs]:
+    def run(self, model: ir.Model) -> Iterator[Outputs]:
         """Run a graph over the frames, recurrent state fed forward.
+
+        Yields:
+            The outputs of every frame, which are the caller's to keep.
 
         Raises:
             GraphError: onnxruntime cannot run it, or an output is no tensor.
         """
-        found = list(replay(Session(model), self.frames))
-        for outputs in found:
+        for outputs in replay(Session(model), self.frames):
             for name, value in outputs.items():
                 if not isinstance(value, np.ndarray):
                     raise GraphError(f"output {name} is no tensor: not compared")
-        return found
+            yield detached(outputs)
 
     def nudged(self, seed: int) -> "VerificationInputs":
         """Move every float of the inputs by a few units in its last place."""
@@ -139,14 +141,14 @@ def verify(
     candidates that are nearly equal), that output tells nothing about the passes, and
     is named as unsteady. Outputs that are steady are judged all the same.
     """
-    left = inputs.run(before)
+    left = list(inputs.run(before))  # its session is gone before the next one opens
     allowed = tolerances(left[0])
     try:
-        right = inputs.run(after)
+        gaps = errors(left, inputs.run(after))
     except GraphError:
-        broken = dict.fromkeys(left[0], float("inf"))
-        return Verification(passes, inputs.kind, broken, allowed)
-    found = Verification(passes, inputs.kind, errors(left, right), allowed)
+        gaps = dict.fromkeys(left[0], float("inf"))
+        return Verification(passes, inputs.kind, gaps, allowed)
+    found = Verification(passes, inputs.kind, gaps, allowed)
     if passed(found):
         return found
     rounding = unsteadiness(before, left, inputs)

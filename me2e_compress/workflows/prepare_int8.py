@@ -70,6 +70,7 @@ class PreparedGraph:
         manager = PassManager(chosen[:at], verify_frames=0)
         model = manager.run(loaded, Context(modules)).model
         graph.infer_shapes(model)
+        _leave_the_message(model)
         return cls(file, model, modules, reader)
 
     def tensors(self) -> tuple[str, ...]:
@@ -98,3 +99,15 @@ class PreparedGraph:
 
     def _refuse(self, reason: str) -> NoReturn:
         raise PreconditionError(f"{self.file}: {reason}")
+
+
+def _leave_the_message(model: ir.Model) -> None:
+    """Copy the weights that lie in the message that the file was read into.
+
+    One that the passes left there keeps the whole message in memory.
+    """
+    for value in (v for g in model.graphs() for v in g.initializers.values()):
+        tensor = value.const_value
+        if isinstance(tensor, ir.serde.TensorProtoTensor):
+            array = tensor.numpy().copy()
+            value.const_value = ir.Tensor(array, dtype=tensor.dtype, name=value.name)

@@ -1,5 +1,6 @@
 import ml_dtypes
 import numpy as np
+import onnx_ir as ir
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -96,3 +97,11 @@ def test_a_nudge_moves_the_last_places_of_floats_only(a: np.ndarray, seed: int) 
     assert np.all(moved <= 8 * np.abs(np.spacing(a)).astype(np.float64))
     assert np.all(moved > 0)
     assert np.array_equal(frame.arrays["n"], np.arange(3))
+
+
+def test_outputs_do_not_keep_the_memory_of_their_session(driver: ir.Model) -> None:
+    frame = Frame(0, True, {"camera": np.ones((1, 4), np.float32)})
+
+    (outputs,) = VerificationInputs([frame], "recorded").run(driver)
+
+    assert all(value.flags.owndata for value in outputs.values())
