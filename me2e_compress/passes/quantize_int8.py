@@ -117,7 +117,8 @@ class QuantizeInt8(Pass):
         overrides = Overrides()
         if self.overrides is not None:
             overrides = Overrides.load(self.overrides)
-        return make_plan(model, self._scheme(context), self._rules(), overrides)
+        costs = TARGETS.parse(self.target).costs
+        return make_plan(model, self._scheme(context), self._rules(), overrides, costs)
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of what its target reads in int8."""

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import ClassVar, Literal, TypeAlias
 
 import onnx
@@ -12,6 +12,7 @@ import onnx_ir.passes.common as common
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import is_standard, opset_of
+from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import KeptFloat, QuantPlan
 
 Severity = Literal["error", "warning"]
@@ -117,6 +118,15 @@ class Target(abc.ABC):
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
         """List the plan's nodes that stay float in that copy, and why."""
         return ()
+
+    def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
+        """Estimate what int8 saves and costs; None where nothing is known of that.
+
+        Args:
+            model: the float graph, shapes inferred.
+            layers: the nodes that could be int8.
+        """
+        return None
 
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules that a graph for it is held against."""

@@ -1,6 +1,7 @@
 """The graph that int8 is put on: what comes before is done, shapes are inferred."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, Self
@@ -90,11 +91,13 @@ class PreparedGraph:
 
     def _of_all(self) -> tuple[str, ...]:
         names: dict[str, None] = {}
-        for rules in RULE_SETS.usable():
-            every = QuantizeInt8(modules=self.modules.names(), rules=rules)
+        for rules, target in itertools.product(RULE_SETS.usable(), TARGETS.usable()):
+            every = QuantizeInt8(
+                modules=self.modules.names(), rules=rules, target=target
+            )
             plan = every.plan(self.model, Context(self.modules))
-            for target in map(TARGETS.parse, TARGETS.usable()):
-                names |= dict.fromkeys(target.tensors(plan, self.model))
+            found = TARGETS.parse(target).tensors(plan, self.model)
+            names |= dict.fromkeys(found)
         return tuple(names)
 
     def _refuse(self, reason: str) -> NoReturn:

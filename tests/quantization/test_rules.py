@@ -41,7 +41,7 @@ def test_rules_can_be_switched_off_one_by_one() -> None:
 
     assert [rule.name for rule in left.rules()] == [
         "operator", "module", "weight", "attention-length", "small-product",
-        "narrow-convolution",
+        "narrow-convolution", "cost",
     ]  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from me2e_compress.graph import (
     static_shape,
 )
 from me2e_compress.graph.shapes import is_one_matrix
+from me2e_compress.quantization.costs import CostsOf
 from me2e_compress.quantization.plan.decision import (
     FLOAT,
     INT8,
@@ -32,29 +33,33 @@ def make_plan(
     scheme: QuantScheme,
     rules: RuleSet | None = None,
     overrides: Overrides = NONE,
+    costs: CostsOf | None = None,
 ) -> QuantPlan:
     """Decide for every node; one look at each, so linear in the graph.
 
-    First every node by itself, then what must be decided together: residual branches
-    of Adds behind int8 convolutions, and scales that are shared.
+    First every node by itself, then what must be decided together: int8 that does not
+    pay, residual branches of Adds behind int8 convolutions, and scales that are shared.
 
     Args:
         model: the float graph: modules stamped on its nodes, shapes inferred.
         scheme: which modules are to be int8.
         rules: asked in order; None for the set ``paper``.
         overrides: what the user has decided; it beats every rule that is not firm.
+        costs: estimates what int8 saves and costs on the target, for rules that ask.
 
     Raises:
         RecipeError: an override matches no node, or wants int8 where it cannot be.
     """
     asked = RULE_SETS.parse("paper") if rules is None else rules
     in_order = asked.rules()
-    facts = RuleFacts(model, scheme.modules)
+    facts = RuleFacts(model, scheme.modules, costs)
     pins = overrides.bind(model)
     main = model.graph
     decided = {
         node: _decide(node, facts, in_order, pins, main) for node in main.all_nodes()
     }
+    for rule in in_order:
+        decided.update(_second_thoughts(rule, decided, facts, pins))
     decided.update(_residuals(main, decided, facts, pins))
     pins.check(decided)
     decisions = tuple(decided.values())
@@ -110,6 +115,26 @@ def _decide(
         axis=None if weight is None else _scale_axis(node),
         borderline=close,
     )
+
+
+def _second_thoughts(
+    rule: Rule, decided: Mapping[ir.Node, Decision], facts: RuleFacts, pins: Pins
+) -> dict[ir.Node, Decision]:
+    """Return the decisions that a rule takes back, knowing all the others."""
+    int8 = {node: None for node, each in decided.items() if each.dtype == INT8}
+    return {
+        node: dataclasses.replace(
+            decided[node],
+            dtype=FLOAT,
+            rule=rule.name,
+            reason=reason,
+            activations=(),
+            weight=None,
+            axis=None,
+        )
+        for node, reason in rule.objections(int8, facts).items()
+        if node in int8 and (rule.firm or pins.of(node) is None)
+    }
 
 
 def _int8(

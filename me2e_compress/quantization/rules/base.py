@@ -11,6 +11,7 @@ import onnx_ir as ir
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.quantization.coordinates import find_coordinates
+from me2e_compress.quantization.costs import CostsOf
 from me2e_compress.quantization.find_attention import Attention, find_attention
 from me2e_compress.registry import Registry
 
@@ -21,11 +22,22 @@ class RuleFacts:
     Args:
         model: the graph, shapes inferred, in topological order.
         modules: which are to be int8.
+        costs: estimates what int8 saves and costs on the target; None where no target
+            is known, or it says nothing of costs.
+
+    Attributes:
+        model, modules, costs: as given.
     """
 
-    def __init__(self, model: ir.Model, modules: Collection[str]) -> None:
+    def __init__(
+        self,
+        model: ir.Model,
+        modules: Collection[str],
+        costs: CostsOf | None = None,
+    ) -> None:
         self.model = model
         self.modules = frozenset(modules)
+        self.costs = costs
 
     @functools.cached_property
     def constants(self) -> Collection[ir.Value]:
@@ -59,6 +71,17 @@ class Rule(abc.ABC):
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Return why this node stays in float; None if it need not."""
 
+    def objections(
+        self, int8: Collection[ir.Node], facts: RuleFacts
+    ) -> Mapping[ir.Node, str]:
+        """Return why some nodes stay in float, now that all others are decided.
+
+        Args:
+            int8: the nodes that no rule objects to, in graph order.
+            facts: as before.
+        """
+        return {}
+
     def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Return what is close about a node, for a reader to look at; None if nothing.
 
@@ -82,6 +105,7 @@ RULES: Registry[Rule] = Registry(
         "small-product": f"{_HERE}.tensorrt_rules:SmallProduct",
         "narrow-convolution": f"{_HERE}.tensorrt_rules:NarrowConvolution",
         "coordinates": f"{_HERE}.tensorrt_rules:Coordinates",
+        "cost": f"{_HERE}.cost_rule:CostGate",
     },
 )
 

@@ -14,6 +14,7 @@ import onnx_ir as ir
 from me2e_compress.graph import CONVOLUTIONS, static_shape
 from me2e_compress.graph.shapes import extent
 from me2e_compress.quantization.rules.base import Rule, RuleFacts
+from me2e_compress.quantization.rules.cost_rule import CostGate
 from me2e_compress.quantization.rules.paper_rules import PaperRules
 
 
@@ -114,6 +115,6 @@ class TensorRTRules(PaperRules):
     share_concat: ClassVar[bool] = True
 
     def own_rules(self) -> tuple[Rule, ...]:
-        """Return those of the paper and three more."""
-        more = (SmallProduct(), NarrowConvolution(), Coordinates())
+        """Return those of the paper and four more, that of costs last."""
+        more = (SmallProduct(), NarrowConvolution(), Coordinates(), CostGate())
         return (*super().own_rules(), *more)

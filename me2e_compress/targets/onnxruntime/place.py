@@ -1,13 +1,16 @@
 """Write a plan into a graph as onnxruntime's CPU kernels read it."""
 
 import dataclasses
+from collections.abc import Collection
 from typing import ClassVar
 
 import onnx_ir as ir
 
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
 from me2e_compress.targets.base import LintRule, Target
+from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.kernels import objection
 from me2e_compress.targets.onnxruntime.lint_rules import RULES
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
@@ -54,6 +57,10 @@ class OnnxRuntime(Target):
             for each, reason in reasons
             if reason
         )
+
+    def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs:
+        """Estimate what int8 of some layers saves and costs on one core."""
+        return costs_of(model, layers)
 
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its kernels."""

@@ -1,0 +1,134 @@
+"""One layer, or a chain of equal ones, timed in float and in int8 on onnxruntime."""
+
+import dataclasses
+from statistics import median
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.graph import provenance
+from me2e_compress.graph.provenance import Provenance
+from me2e_compress.modules import ModuleMap
+from me2e_compress.quantization.plan import QuantPlan, make_plan
+from me2e_compress.quantization.rules import RULE_SETS
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.interleaved import time_interleaved
+from me2e_compress.runtime.session import Session
+from me2e_compress.targets.onnxruntime import OnnxRuntime
+
+WHOLE = ModuleMap.whole()
+CPU_S = 0.06
+"""CPU seconds for a layer and form, at least; five runs in any case."""
+MOST_RUNS = 200
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """A layer with a constant weight, cut out of its graph.
+
+    Attributes:
+        op: Conv, MatMul (with the Add of its bias) or Gemm.
+        read: shape of what it reads.
+        weight: shape of its weight.
+        attributes: of a Conv or Gemm, as ONNX text: ``group=1, pads=[1,1,1,1]``.
+        bias: whether it has one.
+        relu: whether a ReLU follows.
+        length: how many of it stand behind each other.
+    """
+
+    op: str
+    read: tuple[int, ...]
+    weight: tuple[int, ...]
+    attributes: str = ""
+    bias: bool = True
+    relu: bool = False
+    length: int = 1
+
+    def graph(self) -> ir.Model:
+        """Build it with random weights, ``x`` to ``y``, shapes inferred."""
+        columns = self.weight[1] if self.op == "MatMul" else self.weight[0]
+        if self.op == "Gemm" and "transB=1" not in self.attributes:
+            columns = self.weight[1]
+        text = (
+            '<ir_version: 9, opset_import: ["" : 17]>\n'
+            f"layer (float{_dims(self.read)} x, float{_dims(self.weight)} w,"
+            f" float[{columns}] b) => (float y) {{\n"
+            f"{''.join(self._nodes())}}}"
+        )
+        parsed = onnx.parser.parse_model(text)
+        parsed.graph.output[0].type.tensor_type.ClearField("shape")
+        made = ir.from_proto(onnx.shape_inference.infer_shapes(parsed))
+        generator = np.random.default_rng(0)
+        for value in list(made.graph.inputs)[1:]:
+            made.graph.inputs.remove(value)
+            shape = graph.static_shape(value) or ()
+            array = generator.standard_normal(shape).astype(np.float32)
+            fan = max(1.0, float(np.sqrt(array.size / columns)))
+            value.const_value = ir.tensor(array / np.float32(fan), name=value.name)
+            made.graph.register_initializer(value)
+        for node in made.graph:
+            past = Provenance(WHOLE.names()[0], (str(node.outputs[0].name),))
+            provenance.stamp(node, past)
+        return made
+
+    def _nodes(self) -> list[str]:
+        lines, last = [], "x"
+        for step in range(self.length):
+            end = "y" if step == self.length - 1 else f"e{step}"
+            attributes = f"<{self.attributes}>" if self.attributes else ""
+            chain = [f"{self.op}{attributes}({{}}, w)"]
+            if self.bias and self.op == "MatMul":
+                chain.append("Add({}, b)")
+            elif self.bias:
+                chain = [f"{self.op}{attributes}({{}}, w, b)"]
+            chain += ["Relu({})"] if self.relu else []
+            names = [*(f"n{step}_{i}" for i in range(len(chain) - 1)), end]
+            for name, call in zip(names, chain, strict=True):
+                lines.append(f"{name} = {call.format(last)}\n")
+                last = name
+        return lines
+
+
+def int8_of(model: ir.Model) -> ir.Model:
+    """Quantize a layer for onnxruntime, every range [-4, 4]."""
+    plan = plan_of(model)
+    target = OnnxRuntime()
+    names = target.tensors(plan, model)
+    ranges = Ranges(
+        tensors=dict.fromkeys(names, (-4.0, 4.0)),
+        frames=1,
+        model="",
+        source="",
+        method="max-min",
+    )
+    return target.place(model, plan, ranges)
+
+
+def plan_of(model: ir.Model) -> QuantPlan:
+    """Plan int8 for a layer, whatever it costs."""
+    rules = RULE_SETS.parse("paper{without=[gemv]}")
+    return make_plan(model, QuantScheme.of(WHOLE.names(), WHOLE), rules)
+
+
+def time_both(layer: Layer) -> tuple[float, float]:
+    """Return CPU seconds in float and in int8: medians, in turn, one thread."""
+    model = layer.graph()
+    sessions = {
+        "float": Session(model, threads=1),
+        "int8": Session(int8_of(model), threads=1),
+    }
+    array = np.random.default_rng(1).standard_normal(layer.read).astype(np.float32)
+    frames = [Frame(0, starts_scene=True, arrays={"x": array})]
+    once = time_interleaved(sessions, frames, 3)
+    shortest = min(min(each.cpu_s) for each in once.values())
+    runs = int(np.clip(CPU_S / shortest, 5, MOST_RUNS))
+    found = time_interleaved(sessions, frames, runs)
+    return median(found["float"].cpu_s), median(found["int8"].cpu_s)
+
+
+def _dims(shape: tuple[int, ...]) -> str:
+    return f"[{','.join(map(str, shape))}]"

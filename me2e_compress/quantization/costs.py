@@ -1,0 +1,201 @@
+"""What int8 saves in arithmetic and pays at its borders, and where that is a loss."""
+
+import dataclasses
+import itertools
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import TypeAlias
+
+import onnx_ir as ir
+
+Layers = frozenset[ir.Node]
+
+
+@dataclasses.dataclass(frozen=True)
+class Join:
+    """An Add or Concat: it is in int8 if a layer before it and one behind it are.
+
+    Attributes:
+        makers: the layers that its inputs come from.
+        readers: the layers that read its result.
+    """
+
+    makers: Layers
+    readers: Layers
+
+
+@dataclasses.dataclass(frozen=True)
+class Border:
+    """A tensor where int8 may begin or end.
+
+    Attributes:
+        quantize_s: seconds to quantize it where no int8 layer makes it.
+        dequantize_s: seconds to give it in float where an int8 layer makes it.
+        makers: layers; if any of them is int8, the tensor is.
+        readers: layers that read it.
+        joins: Adds and Concats that read it.
+        read_as_float: whether anything else reads it, or it leaves the graph.
+    """
+
+    quantize_s: float
+    dequantize_s: float
+    makers: Layers = frozenset()
+    readers: Layers = frozenset()
+    joins: tuple[Join, ...] = ()
+    read_as_float: bool = False
+
+    def layers(self) -> Iterator[ir.Node]:
+        """Walk all layers whose int8 decides what it costs."""
+        yield from self.makers
+        yield from self.readers
+        for join in self.joins:
+            yield from join.makers
+            yield from join.readers
+
+    def paid_s(self, int8: Collection[ir.Node]) -> float:
+        """Return the seconds that go into it if exactly these layers are int8."""
+        if _some(self.makers, int8):
+            stays = (
+                not self.read_as_float
+                and all(each in int8 for each in self.readers)
+                and all(_some(each.readers, int8) for each in self.joins)
+            )
+            return 0.0 if stays else self.dequantize_s
+        read = _some(self.readers, int8) or any(
+            _some(each.makers, int8) and _some(each.readers, int8)
+            for each in self.joins
+        )
+        return self.quantize_s if read else 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Loss:
+    """Int8 that does not pay.
+
+    Attributes:
+        saved_s: seconds that the layers themselves save in int8, mostly less than 0 or
+            little.
+        paid_s: seconds that quantizing and dequantizing take for their sake.
+        layers: how many layers these figures are of, together.
+    """
+
+    saved_s: float
+    paid_s: float
+    layers: int = 1
+
+    def __str__(self) -> str:
+        """Return the comparison in words."""
+        whose = "" if self.layers == 1 else f" ({self.layers} layers together)"
+        return (
+            f"int8 would save {self.saved_s * 1e6:.1f} µs of arithmetic and take"
+            f" {self.paid_s * 1e6:.1f} µs to quantize and dequantize{whose}"
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Costs:
+    """What int8 would save and cost in one graph on one machine.
+
+    Attributes:
+        machine: whose seconds these are.
+        saved_s: seconds that each layer saves in int8, its borders apart; layers whose
+            shapes are open are not in it, and are not judged.
+        borders: the tensors where int8 may begin or end.
+        margin_s: a loss below that is not told from none: the smaller file wins.
+    """
+
+    machine: str
+    saved_s: Mapping[ir.Node, float]
+    borders: tuple[Border, ...]
+    margin_s: float = 1e-6
+
+    def net_s(self, int8: Collection[ir.Node]) -> float:
+        """Return the seconds saved in all if exactly these layers are int8."""
+        paid = sum(border.paid_s(int8) for border in self.borders)
+        return sum(self.saved_s.get(each, 0.0) for each in int8) - paid
+
+    def losses(self, int8: Iterable[ir.Node]) -> dict[ir.Node, Loss]:
+        """Find the layers that are faster in float.
+
+        First one by one: a layer goes if that saves time while all others stay; its
+        neighbours are then looked at again. Then what hangs together in int8 goes if it
+        does not pay as a whole. Not always the best choice, but near it, and linear.
+
+        Args:
+            int8: the layers that could be int8.
+
+        Returns:
+            The layers that had better stay float.
+        """
+        kept = dict.fromkeys(int8)
+        touching: dict[ir.Node, list[Border]] = {each: [] for each in kept}
+        for border in self.borders:
+            for each in dict.fromkeys(border.layers()):
+                if each in touching:
+                    touching[each].append(border)
+        return self._alone(kept, touching) | self._together(kept, touching)
+
+    def _alone(
+        self, kept: dict[ir.Node, None], touching: Mapping[ir.Node, list[Border]]
+    ) -> dict[ir.Node, Loss]:
+        found: dict[ir.Node, Loss] = {}
+        waiting = deque(each for each in kept if each in self.saved_s)
+        while waiting:
+            layer = waiting.popleft()
+            if layer not in kept:
+                continue
+            before = sum(border.paid_s(kept) for border in touching[layer])
+            del kept[layer]
+            paid = before - sum(border.paid_s(kept) for border in touching[layer])
+            if self.saved_s[layer] + self.margin_s >= paid:
+                kept[layer] = None
+                continue
+            found[layer] = Loss(self.saved_s[layer], paid)
+            near = itertools.chain(*(border.layers() for border in touching[layer]))
+            waiting += [n for n in dict.fromkeys(near) if n in self.saved_s]
+        return found
+
+    def _together(
+        self, kept: dict[ir.Node, None], touching: Mapping[ir.Node, list[Border]]
+    ) -> dict[ir.Node, Loss]:
+        found: dict[ir.Node, Loss] = {}
+        seen: set[ir.Node] = set()
+        for first in kept:
+            island = _connected(first, kept, touching, seen)
+            if not island or any(each not in self.saved_s for each in island):
+                continue
+            borders = dict.fromkeys(b for each in island for b in touching[each])
+            paid = sum(border.paid_s(kept) for border in borders)
+            saved = sum(self.saved_s[each] for each in island)
+            if saved + self.margin_s < paid:
+                loss = Loss(saved, paid, len(island))
+                found.update(dict.fromkeys(island, loss))
+        return found
+
+
+CostsOf: TypeAlias = Callable[[ir.Model, Collection[ir.Node]], Costs | None]
+"""Estimates what a target's int8 of some layers would save and cost in a graph."""
+
+
+def _some(layers: Iterable[ir.Node], int8: Collection[ir.Node]) -> bool:
+    return any(each in int8 for each in layers)
+
+
+def _connected(
+    first: ir.Node,
+    kept: Collection[ir.Node],
+    touching: Mapping[ir.Node, list[Border]],
+    seen: set[ir.Node],
+) -> list[ir.Node]:
+    """Return the layers that are joined to one by borders, unless it was seen."""
+    found: list[ir.Node] = []
+    waiting = [first]
+    while waiting:
+        layer = waiting.pop()
+        if layer in seen or layer not in kept:
+            continue
+        seen.add(layer)
+        found.append(layer)
+        for border in touching[layer]:
+            waiting += border.layers()
+    return found

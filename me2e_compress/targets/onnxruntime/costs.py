@@ -1,0 +1,225 @@
+"""What int8 saves and costs on onnxruntime's CPU: counts, and seconds a piece."""
+
+import dataclasses
+import math
+from collections.abc import Collection, Mapping
+from typing import TypeAlias
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.graph import static_shape
+from me2e_compress.graph.nodes import constant_values
+from me2e_compress.quantization.costs import Border, Costs, Join, Layers
+from me2e_compress.targets.onnxruntime.kernels import JOINS, end_of
+from me2e_compress.targets.onnxruntime.region import Region, find_region
+
+Counts: TypeAlias = Mapping[str, int]
+"""How often each constant of :class:`CpuSeconds` goes into a time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CpuSeconds:
+    """Nanoseconds of one core for one piece of work.
+
+    Attributes:
+        machine: whose.
+        kernel: of every kernel, whatever it does.
+        float_mac: a multiply-accumulate in float32.
+        float_grouped_mac: one of a grouped convolution.
+        float_element: an element that a layer reads or writes.
+        float_reorder: an element that a convolution reads from, or gives to, anything
+            but a convolution: those work on channels in blocks.
+        float_weight: a weight.
+        int8_mac: a multiply-accumulate of uint8 and int8.
+        int8_grouped_mac: one of a grouped convolution.
+        int8_patch: a pixel copied into place under a kernel larger than 1.
+        int8_answer: an element that a convolution rounds to uint8.
+        int8_product: an element that a matrix product gives in float32.
+        int8_weight: a weight.
+        quantize: an element, float32 to uint8.
+        dequantize: an element, uint8 to float32.
+    """
+
+    machine: str
+    kernel: float
+    float_mac: float
+    float_grouped_mac: float
+    float_element: float
+    float_reorder: float
+    float_weight: float
+    int8_mac: float
+    int8_grouped_mac: float
+    int8_patch: float
+    int8_answer: float
+    int8_product: float
+    int8_weight: float
+    quantize: float
+    dequantize: float
+
+    def seconds(self, counts: Counts) -> float:
+        """Return how long some work takes."""
+        return 1e-9 * sum(float(getattr(self, each)) * n for each, n in counts.items())
+
+
+ZEN5 = CpuSeconds(
+    machine="onnxruntime (one core with VNNI)",
+    kernel=300,
+    float_mac=0.009,
+    float_grouped_mac=0.012,
+    float_element=0.04,
+    float_reorder=0.05,
+    float_weight=0.015,
+    int8_mac=0.0023,
+    int8_grouped_mac=0.023,
+    int8_patch=1.1,
+    int8_answer=0.06,
+    int8_product=0.3,
+    int8_weight=0.008,
+    quantize=0.1,
+    dequantize=0.17,
+)
+"""Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
+``python -m benchmarks.fit_cpu_costs``. Ratios carry over to other processors with VNNI
+better than the seconds do."""
+
+
+def costs_of(
+    model: ir.Model, chosen: Collection[ir.Node], machine: CpuSeconds = ZEN5
+) -> Costs:
+    """Estimate what int8 of some layers would save and cost.
+
+    Args:
+        model: the float graph, shapes inferred.
+        chosen: what could be int8; what has no kernel is passed over.
+        machine: seconds a piece.
+    """
+    weights = constant_values(model)
+    names = {str(node.outputs[0].name) for node in chosen if node.inputs[1] in weights}
+    region = find_region(model.graph, names)
+    saved = {}
+    for layer in region.layers:
+        work = work_of(layer)
+        if work is not None:
+            saved[layer] = machine.seconds(work[0]) - machine.seconds(work[1])
+    flow = _Flow(region)
+    borders = tuple(flow.border(value, machine) for value in region.grids)
+    return Costs(machine.machine, saved, borders)
+
+
+def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
+    """Count the work of a layer in float and in int8; None where shapes are open."""
+    macs = graph.macs(layer)
+    read, weight = static_shape(layer.inputs[0]), static_shape(layer.inputs[1])
+    made = static_shape(layer.outputs[0])
+    if macs is None or read is None or weight is None or made is None:
+        return None
+    inputs, outputs, weights = map(math.prod, (read, made, weight))
+    float_ = {"kernel": 1, "float_element": inputs + outputs, "float_weight": weights}
+    int8 = {"kernel": 1, "int8_weight": weights}
+    if layer.op_type != "Conv":
+        float_ |= {"float_mac": macs}
+        int8 |= {"int8_mac": macs, "int8_product": outputs}
+        return float_, int8
+    grouped = "grouped_" if layer.attributes.get_int("group", 1) > 1 else ""
+    float_ |= {f"float_{grouped}mac": macs, "float_reorder": _reordered(layer)}
+    int8 |= {f"int8_{grouped}mac": macs, "int8_answer": outputs}
+    taps = math.prod(weight[2:])
+    if taps > 1 and not grouped:
+        int8["int8_patch"] = taps * outputs // weight[0]
+    return float_, int8
+
+
+def _reordered(layer: ir.Node) -> int:
+    """Count the elements that a float convolution takes from or gives to others."""
+    source, end = layer.inputs[0], end_of(layer)
+    found = 0
+    if source is not None and not _is_convolved(source):
+        found += math.prod(static_shape(source) or ())
+    if not any(reader.op_type in _BLOCKED for reader in end.consumers()):
+        found += math.prod(static_shape(end) or ())
+    return found
+
+
+_BLOCKED = (
+    "Add",
+    "AveragePool",
+    "Concat",
+    "Conv",
+    "GlobalAveragePool",
+    "MaxPool",
+    "Mul",
+)
+"""Operators that onnxruntime computes on blocks of channels, as convolutions."""
+
+
+def _is_convolved(value: ir.Value) -> bool:
+    node = value.producer()
+    return node is not None and node.op_type in (*_BLOCKED, "Clip", "Relu")
+
+
+class _Flow:
+    """Follows the uint8 tensors of a region to the layers before and behind them."""
+
+    def __init__(self, region: Region) -> None:
+        self._region = region
+        self._layers = {end_of(layer): layer for layer in region.layers}
+        self._carriers = {end_of(node): node for node in region.readers}
+        self._makers: dict[ir.Value, Layers] = {}
+        self._readers: dict[ir.Value, Layers] = {}
+
+    def border(self, value: ir.Value, machine: CpuSeconds) -> Border:
+        """Describe one of the tensors."""
+        elements = math.prod(static_shape(value) or ())
+        direct, carriers, others = self._uses(value)
+        joins = [node for node in carriers if node.op_type in JOINS]
+        return Border(
+            machine.seconds({"kernel": 1, "quantize": elements}),
+            machine.seconds({"kernel": 1, "dequantize": elements}),
+            self.makers(value),
+            frozenset(direct),
+            tuple(
+                Join(self.makers(end), self.readers(end)) for end in map(end_of, joins)
+            ),
+            others or value.is_graph_output(),
+        )
+
+    def makers(self, value: ir.Value) -> Layers:
+        """Return the layers that a tensor comes from: the nearest, of a join."""
+        if value not in self._makers:
+            self._makers[value] = frozenset()
+            self._makers[value] = self._find_makers(value)
+        return self._makers[value]
+
+    def _find_makers(self, value: ir.Value) -> Layers:
+        if value in self._layers and value in self._region.born:
+            return frozenset({self._layers[value]})
+        node = self._carriers.get(value)
+        if node is None:
+            return frozenset()
+        read = node.inputs if node.op_type in JOINS else node.inputs[:1]
+        sides = [each for each in read if each is not None]
+        near = [self._layers[each] for each in sides if each in self._layers]
+        return frozenset(near) or frozenset().union(*map(self.makers, sides))
+
+    def readers(self, value: ir.Value) -> Layers:
+        """Return the layers that read a tensor: the nearest, behind joins and moves."""
+        if value not in self._readers:
+            direct, carriers, _ = self._uses(value)
+            behind = map(self.readers, map(end_of, carriers))
+            self._readers[value] = frozenset(direct) or frozenset().union(*behind)
+        return self._readers[value]
+
+    def _uses(self, value: ir.Value) -> tuple[list[ir.Node], list[ir.Node], bool]:
+        """Sort the readers of a tensor: layers, what carries it on, and others."""
+        layers: list[ir.Node] = []
+        carriers: list[ir.Node] = []
+        others = False
+        for reader, index in value.uses():
+            if not self._region.reads(reader, index):
+                others = True
+            elif reader in self._region.layers:
+                layers.append(reader)
+            else:
+                carriers.append(reader)
+        return layers, carriers, others
