@@ -35,6 +35,10 @@ Workers = Annotated[int, typer.Option(min=1, help="routes at a time")]
 Engine = Annotated[str, typer.Option(help="local or ray")]
 Address = Annotated[str | None, typer.Option(help="of a Ray cluster")]
 Adapter = Annotated[Path | None, typer.Option(help="TOML: adapts the model")]
+SetDim = Annotated[
+    list[str] | None,
+    typer.Option(help="size of an open dimension: batch=1; once for each"),
+]
 Json = Annotated[bool, typer.Option("--json", help="for programs")]
 RecipeOutput = Annotated[Path, typer.Option("-o", "--output", help="the RECIPE.toml")]
 TrialScheme = Annotated[str, typer.Option("--scheme", help="modules that may be int8")]

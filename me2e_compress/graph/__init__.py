@@ -12,6 +12,11 @@ from me2e_compress.graph.files import (
     save,
     sha256_of,
 )
+from me2e_compress.graph.macs import (
+    macs,
+    macs_counter,
+    total_macs,
+)
 from me2e_compress.graph.nodes import (
     array_of,
     graphs_of,
@@ -31,18 +36,14 @@ from me2e_compress.graph.shapes import (
     infer_shapes,
     open_shape,
     rank_of,
-    refined,
     static_shape,
 )
 from me2e_compress.graph.summary import (
     Port,
     Size,
     interface,
-    macs,
-    macs_counter,
     node_count,
     size,
-    total_macs,
 )
 
 __all__ = [
@@ -72,7 +73,6 @@ __all__ = [
     "opset_of",
     "producer_of",
     "rank_of",
-    "refined",
     "save",
     "sha256_of",
     "size",

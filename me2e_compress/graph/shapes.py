@@ -31,7 +31,7 @@ def rank_of(value: ir.Value | None) -> int | None:
     return None if value is None or value.shape is None else len(value.shape)
 
 
-def infer_shapes(model: ir.Model) -> None:
+def infer_shapes(model: ir.Model, *, strict: bool = False) -> None:
     """Infer types and shapes by ONNX, data propagation included, in place.
 
     A node of an unknown domain stops nothing: what it gives keeps the shape that the
@@ -39,16 +39,21 @@ def infer_shapes(model: ir.Model) -> None:
     so do the inputs and the order of the initializers in any case. Of the outputs,
     dimensions that the file leaves open become numbers: an exporter's symbol
     (``Gathery_dim_0``) hides what is known, and shape arithmetic behind it would stay.
+
+    Raises:
+        onnx.shape_inference.InferenceError: strict, and shapes contradict each other.
     """
     try:
         proto = onnx.shape_inference.infer_shapes(
-            _without_weights(model), strict_mode=False, data_prop=True
+            _without_weights(model), strict_mode=strict, data_prop=True
         )
     except (
         onnx.checker.ValidationError,
         onnx.shape_inference.InferenceError,
         ir.serde.SerdeError,
-    ):
+    ) as error:
+        if strict and isinstance(error, onnx.shape_inference.InferenceError):
+            raise
         return
     _adopt(model.graph, proto.graph, set(model.graph.outputs))
 

@@ -9,6 +9,7 @@ import onnx_ir.passes.common as common
 from me2e_compress import graph
 from me2e_compress.errors import VerificationError
 from me2e_compress.graph import provenance
+from me2e_compress.graph.shapes import refined
 from me2e_compress.passes.base import Pass, PassResult
 
 
@@ -100,7 +101,7 @@ def _refined_outputs(before: ir.Model, after: ir.Model) -> tuple[graph.Port, ...
     found = {value.name: value.shape for value in after.graph.outputs}
     return tuple(
         dataclasses.replace(
-            port, shape=str(graph.refined(value.shape, found.get(value.name)))
+            port, shape=str(refined(value.shape, found.get(value.name)))
         )
         for port, value in zip(
             graph.interface(before)[1], before.graph.outputs, strict=True

@@ -14,6 +14,7 @@ PASSES: Registry[Pass] = Registry(
     RecipeError,
     {
         "import-normalize": f"{_HERE}.import_normalize:ImportNormalize",
+        "fix-shapes": f"{_HERE}.fix_shapes:FixShapes",
         "fold-constants": f"{_HERE}.fold_constants:FoldConstants",
         "fold-with-onnxsim": f"{_HERE}.fold_with_onnxsim:FoldWithOnnxsim",
         "eliminate-redundant": f"{_HERE}.eliminate_redundant:EliminateRedundant",

@@ -1,8 +1,9 @@
 """Items as text: ``name``, ``name{option=value, ...}`` or ``name:value``.
 
-A value is a number, ``true`` or ``false``, ``null``, a list ``[a, b]``, a word, or a
-string in double quotes with JSON's escapes. A word needs no quotes, and may have braces
-of its own: ``quantize-int8{rules=paper{attention_limit=256}}``.
+A value is a number, ``true`` or ``false``, ``null``, a list ``[a, b]``, a mapping
+``{a=1, "b c"=2}``, a word, or a string in double quotes with JSON's escapes. A word
+needs no quotes, and may have braces of its own:
+``quantize-int8{rules=paper{attention_limit=256}}``.
 """
 
 import dataclasses
@@ -113,9 +114,17 @@ def write_value(value: object) -> str:
     """Write the value of an option: a number, a list, or else a string."""
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
+    if isinstance(value, Mapping):
+        pairs = (f"{_key(name)}={write_value(each)}" for name, each in value.items())
+        return "{" + ", ".join(pairs) + "}"
     if value is None or isinstance(value, bool | int | float | str):
         return json.dumps(value)
     return json.dumps(str(value))
+
+
+def _key(name: object) -> str:
+    """Write the name of a mapping's value, in quotes if it is no plain word."""
+    return str(name) if re.fullmatch(r"\w+", str(name)) else json.dumps(str(name))
 
 
 class _Reader:
@@ -140,18 +149,28 @@ class _Reader:
         while not self.take("}"):
             if options and not self.take(","):
                 self.fail("a comma or } is expected")
-            name = self.match(_KEY)
-            if name is None:
-                self.fail("option=value is expected")
+            name = self.key()
             if name in options:
                 self.fail(f"option {name} is given twice")
-            self.take("=")
+            if not self.take("="):
+                self.fail("option=value is expected")
             options[name] = self.value()
         return options
+
+    def key(self) -> str:
+        name = self.match(_KEY)
+        if name is not None:
+            return name
+        quoted = self.match(_QUOTED)
+        if quoted is None:
+            self.fail("option=value is expected")
+        return self.string(quoted)
 
     def value(self) -> object:
         if self.take("["):
             return self.sequence()
+        if self.take("{"):
+            return self.options()
         quoted = self.match(_QUOTED)
         if quoted is not None:
             return self.string(quoted)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import gc
+from collections.abc import Mapping
 from pathlib import Path
 
 import onnx_ir as ir
@@ -20,6 +21,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import Part, draw, shard
 from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.workflows.checks import (
     check_count,
     check_folder,
@@ -51,6 +53,7 @@ class CalibrateOptions:
         tensorrt_cache: write a TensorRT calibration cache too.
         onnxruntime_table: write onnxruntime's table too, into this folder.
         threads: of onnxruntime; 0 takes all.
+        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
 
     Raises:
         RecipeError: no such method, a number below 0, or a shard that is none.
@@ -68,6 +71,7 @@ class CalibrateOptions:
     tensorrt_cache: str | Path | None = None
     onnxruntime_table: str | Path | None = None
     threads: int = 0
+    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check what can be checked without a file."""
@@ -172,7 +176,7 @@ def calibrate(
     _check_sources(frames, options)
     checkpoint = output.with_name(output.name + ".checkpoint")
     _check_outputs(source, frames, (output, checkpoint), options)
-    passes = recipe.load(options.recipe)
+    passes = with_sizes(recipe.load(options.recipe), options.dims)
     loaded = graph.load(source)
     part = None if frames is None else _part(loaded, Path(frames), options)
     ready = PreparedGraph.of(source, loaded, options.module_map, passes)

@@ -16,6 +16,10 @@ Given: TypeAlias = str | Path | None
 """An input as the user names it; a word that does not name a file is harmless."""
 
 
+_MOST_DIGITS = 18
+"""Of a size: what a 64-bit integer holds."""
+
+
 def model_path(text: str | Path, beside: Path = Path()) -> Path:
     """Find the file that a word means; an existing file wins.
 
@@ -146,3 +150,20 @@ def check_count(option: str, value: int, least: int = 0) -> None:
     """
     if value < least:
         raise RecipeError(f"{option} is {value}: it must be {least} or more")
+
+
+def sizes(texts: Iterable[str]) -> dict[str, int]:
+    """Read sizes of open dimensions: ``batch=1``, ``image:0=1``.
+
+    Raises:
+        RecipeError: not of that form, or a dimension is given twice.
+    """
+    found: dict[str, int] = {}
+    for text in texts:
+        name, _, size = text.rpartition("=")
+        if not name or not size.isdecimal() or len(size) > _MOST_DIGITS:
+            raise RecipeError(f"--set-dim is {text!r}: write NAME=SIZE, e.g. batch=1")
+        if name in found:
+            raise RecipeError(f"--set-dim gives {name} twice")
+        found[name] = int(size)
+    return found

@@ -1,7 +1,7 @@
 """One compression, from file to file."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TypeAlias
@@ -13,6 +13,7 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.runtime.atomic import write_json
@@ -45,6 +46,7 @@ class CompressOptions:
         module_map: preset or TOML file; None finds the preset.
         seed: of everything random.
         verify_frames: frames that exact passes are checked on; 0 checks none.
+        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
 
     Raises:
         RecipeError: a number below 0.
@@ -59,6 +61,7 @@ class CompressOptions:
     module_map: str | Path | None = None
     seed: int = 0
     verify_frames: int = 2
+    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -91,7 +94,7 @@ class CompressOptions:
             )
         if self.scheme is not None:
             passes = (*passes, QuantizeInt8(scheme=self.scheme))
-        return self._with_int8(passes)
+        return self._with_int8(with_sizes(passes, self.dims))
 
     def _with_int8(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
         """Set options of the passes that quantize, else of those that read ranges."""

@@ -1,15 +1,19 @@
 """What a graph holds: interface, and nodes, parameters, MACs by module."""
 
 import dataclasses
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 import onnx_ir as ir
 
 from me2e_compress import graph, recipe
 from me2e_compress.graph import Port, provenance
+from me2e_compress.graph.macs import why_uncounted
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
+from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.workflows.checks import load_map, model_path
 from me2e_compress.workflows.result import (
     AT_LEAST,
@@ -20,6 +24,9 @@ from me2e_compress.workflows.result import (
     number,
     table,
 )
+
+_SHOWN = 8
+"""Operators of unknown MACs that are named."""
 
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
@@ -41,6 +48,8 @@ class InspectResult(Result):
         macs: multiply-accumulates of the nodes whose count is known, all modules
             together; None if none is.
         unknown_macs_nodes: how many nodes are not in ``macs``.
+        uncounted: why, with the number of nodes.
+        open_dimensions: of the inputs, by name: MACs wait for their sizes.
     """
 
     file: str
@@ -54,6 +63,8 @@ class InspectResult(Result):
     rules: dict[str, int]
     macs: int | None
     unknown_macs_nodes: int
+    uncounted: dict[str, int]
+    open_dimensions: tuple[str, ...]
 
     @property
     def headline(self) -> str:
@@ -92,8 +103,15 @@ class InspectResult(Result):
         if not self.unknown_macs_nodes:
             return total
         known = "" if self.macs is None else f"at least {total}, "
+        found = [f"{count} {reason}" for reason, count in self.uncounted.items()]
+        why = ", ".join(found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
+        ways = ""
+        if self.open_dimensions:
+            ways = f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"
         nodes = "node" if self.unknown_macs_nodes == 1 else "nodes"
-        return f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted"
+        return (
+            f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
+        )
 
     def records(self) -> list[dict[str, object]]:
         """Return a row a module."""
@@ -104,24 +122,33 @@ class InspectResult(Result):
         return dataclasses.asdict(self)
 
 
-def inspect(model: str | Path, module_map: str | Path | None = None) -> InspectResult:
+def inspect(
+    model: str | Path,
+    module_map: str | Path | None = None,
+    dims: Mapping[str, int] | None = None,
+) -> InspectResult:
     """Read a graph and weigh its modules.
 
     Args:
         model: an ONNX file, or the name of one that ships.
         module_map: preset or TOML file; None finds the preset.
+        dims: sizes that open dimensions of the inputs are given first.
 
     Raises:
         GraphError: no such model.
+        PreconditionError: no input has such a dimension.
         ModuleMapError: no such map.
     """
     path = model_path(model)
     loaded = graph.load(path)
     modules = load_map(module_map, loaded)
+    if dims:
+        loaded = FixShapes(dims).run(loaded, Context(modules)).model
     placed = assign(loaded, modules)
     inputs, outputs = graph.interface(loaded)
     items = itemise(loaded, modules, placed.module_of)
-    costs = {item.module: item for item in weigh(loaded, modules)}
+    folded = _folded(loaded, modules)
+    costs = {item.module: item for item in _costs(folded, modules)}
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
     return InspectResult(
@@ -136,6 +163,8 @@ def inspect(model: str | Path, module_map: str | Path | None = None) -> InspectR
         {str(rule): count for rule, count in placed.rules().items()},
         total if total or not unknown else None,
         unknown,
+        _uncounted(folded),
+        open_dimensions(loaded),
     )
 
 
@@ -150,11 +179,27 @@ def _with_cost(item: Item, cost: Item | None) -> Item:
 
 def weigh(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
     """Weigh the modules once the shape arithmetic is done, which MACs need to know."""
+    return _costs(_folded(model, modules), modules)
+
+
+def _folded(model: ir.Model, modules: ModuleMap) -> ir.Model:
+    """Return a graph imported, its shape arithmetic done, its shapes inferred."""
     if provenance.missing(model):
         manager = PassManager(recipe.parse(_SHAPES), verify_frames=0)
         model = manager.run(model, Context(modules)).model
     graph.infer_shapes(model)
+    return model
+
+
+def _costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
     return itemise(model, modules, provenance.module_of, graph.macs_counter(model))
+
+
+def _uncounted(model: ir.Model) -> dict[str, int]:
+    """Count the nodes of unknown MACs by the reason, most first."""
+    count = graph.macs_counter(model)
+    unknown = [node for node in model.graph.all_nodes() if count(node) is None]
+    return dict(Counter(map(why_uncounted, unknown)).most_common())
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -1,15 +1,16 @@
 """Which nodes become int8, which stay float, by which rule, and why."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph
+from me2e_compress import graph, recipe
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.passes import Context
+from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import (
     INT8,
@@ -35,12 +36,14 @@ class PlanOptions:
         rules: ``paper`` or ``tensorrt``; None is ``paper``.
         overrides: TOML file of exceptions.
         module_map: preset or TOML file; None finds the preset.
+        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
     """
 
     scheme: str | None = None
     rules: str | None = None
     overrides: str | Path | None = None
     module_map: str | Path | None = None
+    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -201,5 +204,6 @@ def _made(
     """Return a plan as it is, or plan a float graph after the exact passes."""
     if isinstance(read, QuantPlan):
         return read
-    ready = PreparedGraph.of(file, read, options.module_map)
+    passes = with_sizes(recipe.load("exact"), options.dims)
+    ready = PreparedGraph.of(file, read, options.module_map, passes)
     return quantizer.plan(ready.model, Context(ready.modules))

@@ -2,6 +2,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.graph.macs import why_uncounted
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "f" : 1, "trt" : 1]>\n'
 
@@ -59,6 +60,37 @@ def only_node(text: str) -> ir.Node:
             " => (uint8[1,4,6,6] y) { y = QLinearConv(x, s, z, w, s, z, s, z) }",
             4 * 6 * 6 * 3 * 3 * 3,
         ),
+        (
+            "m (float[30,2,4] x, float[2,32,4] w, float[2,32,8] r)"
+            " => (float[30,2,2,8] y) { y = LSTM<hidden_size=8,"
+            ' direction="bidirectional">(x, w, r) }',
+            30 * 2 * 2 * (32 * 4 + 32 * 8),
+        ),
+        (
+            "m (float[30,2,4] x, float[1,24,4] w, float[1,24,8] r)"
+            " => (float[30,1,2,8] y) { y = GRU<hidden_size=8>(x, w, r) }",
+            30 * 2 * (24 * 4 + 24 * 8),
+        ),
+        (
+            "m (float[30,2,4] x, float[1,8,4] w, float[1,8,8] r)"
+            " => (float[30,1,2,8] y) { y = RNN<hidden_size=8>(x, w, r) }",
+            30 * 2 * (8 * 4 + 8 * 8),
+        ),
+        (
+            "m (float[1,6,8,8] x, float[4,6,3,3] w, float[1,18,6,6] o)"
+            " => (float[1,4,6,6] y) { y = DeformConv(x, w, o) }",
+            4 * 6 * 6 * 6 * 3 * 3,
+        ),
+        (
+            "m (float[1,4,5,5] x, float[4,3,2,2] w) => (float[1,6,6,6] y)"
+            " { y = ConvTranspose<group=2>(x, w) }",
+            4 * 5 * 5 * 3 * 2 * 2,
+        ),
+        (
+            "m (float[7,2,3] x, float[3,4] w) => (float[7,2,4] y)"
+            ' { y = Einsum<equation="...j,jk->...k">(x, w) }',
+            7 * 2 * 3 * 4,
+        ),
         ("m (float[9] x) => (float[9] y) { y = Relu(x) }", 0),
     ],
 )
@@ -72,18 +104,35 @@ def test_macs_by_hand(text: str, expected: int) -> None:
         "m (float[N,4] x, float[4,5] w) => (float[N,5] y) { y = MatMul(x, w) }",
         "m (float[1,2,4,4] x, float t) => (float[1,2,4,4] y) { y = RotateTRT(x, t) }",
         "m (float[2] x) => (float[2] y) { y = trt.Rotate(x) }",
-        "m (float[3,1,4] x, float[1,8,4] w, float[1,8,2] r)"
-        " => (float[3,1,1,2] y) { y = LSTM<hidden_size=2>(x, w, r) }",
-        "m (float[2,3] x, float[3,4] w) => (float[2,4] y)"
-        ' { y = Einsum<equation="...j,jk->...k">(x, w) }',
+        "m (float[3,3] x) => (float y) { y = Det(x) }",
+        "m (float[2,3] x, float[3,4] w, float[4,2] v) => (float[2,2] y)"
+        ' { y = Einsum<equation="ij,jk,kl->il">(x, w, v) }',
         "m (int64 n, bool c, float[2,2] x) => (float[2,2] y) {"
         " y = Loop (n, c, x) <body = b (int64 i, bool d, float[2,2] a)"
         " => (bool d, float[2,2] e) { e = MatMul(a, a) }> }",
     ],
-    ids=["open shape", "plugin", "domain", "uncounted", "ellipsis", "loop"],
+    ids=["open shape", "plugin", "domain", "uncounted", "three", "loop"],
 )
 def test_macs_that_are_not_known(text: str) -> None:
     assert graph.macs(only_node(text)) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "m (float[N,4] x, float[4,5] w) => (float[N,5] y) { y = MatMul(x, w) }",
+            "MatMul (open shape)",
+        ),
+        (
+            "m (float[2] x) => (float[2] y) { y = trt.Rotate(x) }",
+            "Rotate (plugin or function)",
+        ),
+        ("m (float[3,3] x) => (float y) { y = Det(x) }", "Det (no rule)"),
+    ],
+)
+def test_why_macs_are_not_known(text: str, reason: str) -> None:
+    assert why_uncounted(only_node(text)) == reason
 
 
 def test_a_plugin_leaves_the_sum_a_lower_bound() -> None:

@@ -9,6 +9,7 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import FramesError
 from me2e_compress.workflows import calibrate as workflow
+from me2e_compress.workflows.checks import sizes
 
 Frames = Annotated[Path | None, typer.Argument(help="FRAMES; none for --import")]
 Output = Annotated[Path, typer.Option("-o", "--output", help="JSON; of a shard .npz")]
@@ -31,6 +32,7 @@ def calibrate(
     count: Count = 256,
     seed: given.Seed = 0,
     module_map: given.ModuleMap = None,
+    set_dim: given.SetDim = None,
     shard: Shard = None,
     merge: Merge = None,
     imported: Import = None,
@@ -50,6 +52,7 @@ def calibrate(
         recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,
         shard=shard, merge=tuple(merge or ()), imported=imported, threads=threads,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
+        dims=sizes(set_dim or ()),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.calibrate(model, frames, output, options, listener)

@@ -10,6 +10,7 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import RecipeError
 from me2e_compress.workflows import compress as workflow
+from me2e_compress.workflows.checks import sizes
 
 VerifyFrames = Annotated[
     int, typer.Option(min=0, help="frames that exact passes are checked on; 0: none")
@@ -37,6 +38,7 @@ def compress(
     module_map: given.ModuleMap = None,
     seed: given.Seed = 0,
     verify_frames: VerifyFrames = 2,
+    set_dim: given.SetDim = None,
     as_json: given.Json = False,
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report."""
@@ -53,6 +55,7 @@ def compress(
         module_map=module_map,
         seed=seed,
         verify_frames=verify_frames,
+        dims=sizes(set_dim or ()),
     )
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)

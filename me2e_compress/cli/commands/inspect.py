@@ -3,12 +3,14 @@
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import show
 from me2e_compress.workflows import inspect as workflow
+from me2e_compress.workflows.checks import sizes
 
 
 def inspect(
     model: given.Model,
     module_map: given.ModuleMap = None,
+    set_dim: given.SetDim = None,
     as_json: given.Json = False,
 ) -> None:
     """Show what a graph holds: interface, and nodes, parameters, MACs by module."""
-    show(workflow.inspect(model, module_map), as_json)
+    show(workflow.inspect(model, module_map, sizes(set_dim or ())), as_json)

@@ -8,6 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import show
 from me2e_compress.workflows import plan as workflow
+from me2e_compress.workflows.checks import sizes
 
 Model = Annotated[str, typer.Argument(help="an ONNX file, float or with a plan")]
 Against = Annotated[
@@ -25,6 +26,7 @@ def plan(
     rules: given.Rules = None,
     overrides: given.Overrides = None,
     module_map: given.ModuleMap = None,
+    set_dim: given.SetDim = None,
     against: Against = None,
     output: Output = None,
     every: Every = False,
@@ -32,7 +34,7 @@ def plan(
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
     options = workflow.PlanOptions(
-        scheme=scheme, rules=rules, overrides=overrides, module_map=module_map
+        scheme, rules, overrides, module_map, sizes(set_dim or ())
     )
     found = workflow.plan(model, output, against, options)
     show(found, as_json, found.tables(every=every))

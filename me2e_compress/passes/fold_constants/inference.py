@@ -5,7 +5,8 @@ from collections.abc import Mapping
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, refined
+from me2e_compress.graph import array_of
+from me2e_compress.graph.shapes import refined
 from me2e_compress.rewrite import Array, is_standard
 
 

@@ -1,0 +1,162 @@
+"""Give open dimensions a size: a graph of one batch has shapes that can be folded."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import onnx
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.passes.base import Context, Pass, PassResult
+
+FIXED = "me2e.fixed"
+"""Metadata with the sizes that were given to open dimensions, as JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FixShapes(Pass):
+    """Give open dimensions of the inputs a size, and infer what follows from it.
+
+    Given:   image float[batch,3,224,224]  ->  Shape, Gather, ... -> y float[batch,10]
+    Result:  image float[1,3,224,224]  ->  Shape, Gather, ... -> y float[1,10]
+             with dims={batch=1}
+
+    Attributes:
+        dims: size by the name of the dimension, or by input and axis where it has no
+            name: ``{batch=1, "image:2"=224}``.
+
+    Raises:
+        RecipeError: a size below 1, or none at all.
+    """
+
+    name: ClassVar[str] = "fix-shapes"
+    exact: ClassVar[bool] = True
+    changes_interface: ClassVar[bool] = True
+    dims: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if not self.dims:
+            raise RecipeError(f"{self.name} needs sizes: dims={{batch=1}}")
+        for name, size in self.dims.items():
+            if size < 1:
+                raise RecipeError(f"{self.name}: {name}={size} must be 1 or more")
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Write the sizes wherever the dimensions stand, then infer shapes.
+
+        Raises:
+            PreconditionError: no input has such a dimension, or the graph does not
+                work with that size.
+        """
+        known = _fixed(model)
+        wanted = {k: size for k, size in self.dims.items() if known.get(k) != size}
+        if not wanted:
+            return PassResult(model, 0)
+        there = open_dimensions(model)
+        if unknown := [name for name in wanted if name not in there]:
+            raise PreconditionError(
+                f"{self.name}: no open dimension is called {unknown[0]!r}; there is"
+                f" {', '.join(there) or 'none'}"
+            )
+        sound = _refusal(model) is None
+        count = _write(model, wanted)
+        if sound and (reason := _refusal(model)) is not None:
+            sizes = ", ".join(f"{name}={size}" for name, size in wanted.items())
+            raise PreconditionError(f"{self.name}: the graph refuses {sizes}: {reason}")
+        graph.infer_shapes(model)  # of a graph that ONNX never inferred strictly
+        model.metadata_props[FIXED] = json.dumps({**known, **wanted}, sort_keys=True)
+        return PassResult(model, count)
+
+
+def open_dimensions(model: ir.Model) -> tuple[str, ...]:
+    """Name the open dimensions of the inputs: their symbols, else ``input:axis``."""
+    names: dict[str, None] = {}
+    for value in model.graph.inputs:
+        for axis, dim in enumerate(value.shape or ()):
+            if isinstance(dim, ir.SymbolicDim):
+                symbols = _symbols(dim) or (f"{value.name}:{axis}",)
+                names |= dict.fromkeys(symbols)
+    return tuple(names)
+
+
+def _fixed(model: ir.Model) -> dict[str, object]:
+    """Read the sizes that open dimensions of a graph were given before."""
+    try:
+        found = json.loads(model.metadata_props.get(FIXED, "{}"))
+    except json.JSONDecodeError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def with_sizes(passes: Sequence[Pass], dims: Mapping[str, int]) -> tuple[Pass, ...]:
+    """Put sizes of open dimensions before the passes, behind an import alone."""
+    if not dims:
+        return tuple(passes)
+    at = int(bool(passes) and passes[0].name == "import-normalize")
+    return (*passes[:at], FixShapes(dims), *passes[at:])
+
+
+def _symbols(dim: ir.SymbolicDim) -> tuple[str, ...]:
+    """Name the symbols of a dimension: of ``2*s0 + 1`` that is ``s0``."""
+    if dim.value is None:
+        return ()
+    try:
+        return tuple(sorted(dim.free_symbols()))
+    except ValueError:  # a name that is no expression
+        return (dim.value,)
+
+
+def _write(model: ir.Model, sizes: Mapping[str, int]) -> int:
+    """Write sizes into every shape that names them; count the inputs that changed."""
+    for node in model.graph.all_nodes():
+        for value in node.outputs:
+            value.shape = _sized(value.shape, sizes, "")
+    for each in model.graph.subgraphs():
+        for value in each.inputs:
+            value.shape = _sized(value.shape, sizes, "")
+    count = 0
+    for value in model.graph.inputs:
+        before, value.shape = value.shape, _sized(value.shape, sizes, f"{value.name}")
+        count += value.shape is not before
+    return count
+
+
+def _sized(
+    shape: ir.Shape | None, sizes: Mapping[str, int], owner: str
+) -> ir.Shape | None:
+    """Return a shape with sizes in the place of their names; itself if it has none."""
+    if shape is None:
+        return None
+    dims = [
+        _size(dim, sizes, f"{owner}:{axis}") if isinstance(dim, ir.SymbolicDim) else dim
+        for axis, dim in enumerate(shape)
+    ]
+    same = all(a is b for a, b in zip(dims, shape, strict=True))
+    return shape if same else ir.Shape(dims)
+
+
+def _size(
+    dim: ir.SymbolicDim, sizes: Mapping[str, int], place: str
+) -> int | ir.SymbolicDim:
+    if dim.value is None:
+        return sizes.get(place, dim)
+    if dim.value in sizes:
+        return sizes[dim.value]
+    symbols = _symbols(dim)
+    if not any(name in sizes for name in symbols):
+        return dim
+    found = dim.evaluate({name: sizes[name] for name in symbols if name in sizes})
+    return found if isinstance(found, int) else dim
+
+
+def _refusal(model: ir.Model) -> str | None:
+    """Return why ONNX cannot infer the shapes of a graph; None if it can."""
+    try:
+        graph.infer_shapes(model, strict=True)
+    except onnx.shape_inference.InferenceError as error:
+        return " ".join(str(error).split())[:200]
+    return None

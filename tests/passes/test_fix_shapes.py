@@ -1,0 +1,123 @@
+"""Open dimensions that are given a size."""
+
+from collections.abc import Mapping
+
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph, recipe
+from me2e_compress.errors import Me2eError, PreconditionError, RecipeError
+from me2e_compress.manager import PassManager, Report
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
+
+OPEN = """
+<ir_version: 9, opset_import: ["" : 17]>
+open (float[batch,3,side,side] image, float["2*batch",4] pairs)
+    => (float[batch,rest] y, float[twice,4] z) <int64[1] minus = {-1}, int64 zero = {0}>
+{
+    s = Shape(image)
+    b = Gather(s, zero)
+    r = Reshape(b, minus)
+    full = Concat<axis=0>(r, minus)
+    y = Reshape(image, full)
+    z = Relu(pairs)
+}
+"""
+
+
+def fixed(sizes: Mapping[str, int], text: str = OPEN) -> Report:
+    passes = with_sizes(recipe.load("exact"), sizes)
+    model = ir.from_onnx_text(text)
+    return PassManager(passes).run(model, Context(ModuleMap.whole()))
+
+
+def test_sizes_make_every_shape_static_and_its_arithmetic_foldable() -> None:
+    model = fixed({"batch": 2, "side": 4}).model
+    values = (*model.graph.inputs, *model.graph.outputs)
+    assert [str(value.shape) for value in values] == [
+        "[2,3,4,4]",
+        "[4,4]",
+        "[2,48]",
+        "[4,4]",
+    ]
+    assert [node.op_type for node in model.graph] == ["Reshape", "Relu"]
+
+
+def test_a_graph_made_static_is_verified_on_seeded_inputs() -> None:
+    (check,) = fixed({"batch": 2, "side": 4}).verifications
+    assert check.inputs == "synthetic"
+
+
+def test_a_dimension_that_is_not_named_stays_open() -> None:
+    model = fixed({"batch": 2}).model
+    assert str(model.graph.inputs[0].shape) == "[2,3,side,side]"
+
+
+def test_a_dimension_without_a_name_is_input_and_axis() -> None:
+    text = (
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[?,3] image) => (float[?,3] y) { y = Relu(image) }"
+    )
+    model = fixed({"image:0": 5}, text).model
+    assert str(model.graph.outputs[0].shape) == "[5,3]"
+
+
+def test_an_unknown_dimension_is_an_error_that_lists_those_there_are() -> None:
+    with pytest.raises(PreconditionError, match="called 'btch'; there is batch, side"):
+        fixed({"btch": 1})
+
+
+def test_a_size_that_the_graph_refuses_is_an_error() -> None:
+    text = (
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "m (float[n,3] x, float[4,5] w) => (float[3,5] y)"
+        " { t = Transpose(x) y = MatMul(t, w) }"
+    )
+    with pytest.raises(PreconditionError, match="the graph refuses n=1"):
+        fixed({"n": 1}, text)
+
+
+@pytest.mark.parametrize("text", ["fix-shapes", "fix-shapes{dims={}}"])
+def test_a_pass_without_sizes_is_an_error(text: str) -> None:
+    with pytest.raises(RecipeError, match="fix-shapes needs"):
+        recipe.parse(text)
+
+
+def test_sizes_are_1_or_more() -> None:
+    with pytest.raises(Me2eError, match="batch=0 must be 1 or more"):
+        FixShapes({"batch": 0})
+
+
+def test_a_second_run_changes_nothing() -> None:
+    model, context = ir.from_onnx_text(OPEN), Context(ModuleMap.whole())
+    assert FixShapes({"batch": 2}).run(model, context).changes == 2
+    assert FixShapes({"batch": 2}).run(model, context).changes == 0
+
+
+def test_sizes_are_written_in_a_pipeline_and_read_back() -> None:
+    passes = (FixShapes({"batch": 1, "a::b_dim_0": 2, "image:0": 3}),)
+    assert recipe.parse(recipe.to_text(passes)) == passes
+
+
+def test_the_graph_says_what_was_fixed() -> None:
+    model = fixed({"batch": 2}).model
+    assert model.metadata_props["me2e.fixed"] == '{"batch": 2}'
+
+
+def test_an_import_comes_before_the_sizes() -> None:
+    passes = with_sizes(recipe.load("exact"), {"batch": 1})
+    assert [each.name for each in passes[:2]] == ["import-normalize", "fix-shapes"]
+
+
+def test_shapes_that_an_exporter_recorded_for_a_plugin_are_given_the_size() -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
+        "m (float[batch,3] x) => (float[batch,3] y) {"
+        " a = trt.Rotate(x) y = Relu(a) }"
+    )
+    model.graph[0].outputs[0].shape = ir.Shape(["batch", 3])
+    model.graph[0].outputs[0].type = ir.TensorType(ir.DataType.FLOAT)
+    FixShapes({"batch": 2}).run(model, Context(ModuleMap.whole()))
+    assert graph.static_shape(model.graph[0].outputs[0]) == (2, 3)
