@@ -3,50 +3,32 @@
     python -m benchmarks.bench_kinds OUT [--only vit,detr] [--peer-python PYTHON]
 
 The models are those of :mod:`benchmarks.model_kinds` (extra ``models``). First every
-tool simplifies what was exported: nodes, bytes with the weights beside the graph, CPU
-seconds, and the largest relative error of an output on frames that are held out,
-against the source with all of onnxruntime's optimizations off. Then ours and the peers
+tool simplifies what was exported: nodes, MB with the weights beside the graph, CPU
+seconds of the work, and the largest relative error of an output on a frame that is held
+out, against torch. Then ours and the peers
 quantize the graph after our exact passes, as :mod:`benchmarks.bench_int8_cpu` does and
 with its files. PYTHON is one that ModelOpt is installed for. Rows are printed as they
 come, and ``OUT/kinds.md`` holds both tables.
 """
 
 import argparse
-import dataclasses
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import onnxruntime
+import numpy as np
 
 from benchmarks import bench_exact_passes as simplifiers
 from benchmarks import bench_int8_cpu as quantizers
 from benchmarks import subjects
-from benchmarks.model_kinds import KINDS
+from benchmarks.model_kinds import KINDS, expected
 from me2e_compress import graph
+from me2e_compress.runtime.opening import REFUSALS
 
+FAILED: tuple[type[BaseException], ...] = (SystemExit, *REFUSALS)
 SIMPLIFIERS = ("ours", "onnxsim", "onnxslim")
 FLOAT, OURS, ORT, MODELOPT = "float", "ours", "onnxruntime uint8", "ModelOpt"
 OTHERS = {*quantizers.PEERS, *quantizers.OURS} - {OURS, ORT, MODELOPT}
 """What the other benchmark measures and this table has no column for."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Simplified:
-    """What one tool made of a graph.
-
-    Attributes:
-        nodes: subgraphs included.
-        megabytes: weights in files beside the graph included.
-        cpu_s: of the work, start-up apart.
-        error: largest max|a - b| / max|a| of an output.
-    """
-
-    nodes: int
-    megabytes: float
-    cpu_s: float
-    error: float
 
 
 def main() -> None:
@@ -68,62 +50,41 @@ def main() -> None:
 
 
 GRAPH_HEAD = """
-| model | nodes, MB | ours | onnxsim | onnxslim | error of ours |
-|---|---|---|---|---|---|"""
+| model | nodes, MB | ours: nodes, MB, s, error | onnxsim | onnxslim |
+|---|---|---|---|---|"""
 INT8_HEAD = """
 | model | float MB, CPU ms | ours: MB, ms, dB | onnxruntime.quantization | ModelOpt |
 |---|---|---|---|---|"""
 
 
 def graph_row(subject: subjects.Subject) -> str:
-    """Let every tool simplify one graph, and tell nodes, MB and CPU seconds."""
-    frames = simplifiers.frames(subject.held_out, 1)
-    wanted = answers(subject.source, frames, optimized=False)
-    found = {name: simplified(name, subject, frames, wanted) for name in SIMPLIFIERS}
-    cells = [
-        each
-        if isinstance(each, str)
-        else f"{each.nodes}, {each.megabytes:.1f}, {each.cpu_s:.1f} s"
-        for each in found.values()
-    ]
+    """Let every tool simplify one graph; tell nodes, MB, CPU seconds and error."""
+    cells = [simplified(name, subject) for name in SIMPLIFIERS]
     source = graph.node_count(graph.load(subject.source))
-    ours = found["ours"]
-    error = "" if isinstance(ours, str) else f"{ours.error:.1e}"
     size = megabytes(subject.source)
-    return f"| {subject.name} | {source}, {size:.1f} | {' | '.join(cells)} | {error} |"
+    return f"| {subject.name} | {source}, {size:.1f} | {' | '.join(cells)} |"
 
 
-def simplified(
-    tool: str,
-    subject: subjects.Subject,
-    frames: Sequence[simplifiers.Frame],
-    wanted: Sequence[Sequence[Any]],
-) -> Simplified | str:
-    """Run one tool and measure its file; a text says why there is none."""
+def simplified(tool: str, subject: subjects.Subject) -> str:
+    """Run one tool and measure its file, or say why there is none."""
     target = subject.folder / f"simplified-by-{tool}.onnx"
     job = simplifiers.Job(subject.source, target, str(subject.map), None)
     try:
         taken = simplifiers.measure(tool, job)
-        got = answers(target, frames, optimized=True)
-    except (SystemExit, RuntimeError) as failed:
-        return f"failed: {str(failed)[:80]}"
-    worst = max(map(simplifiers.error, wanted, got))
+        error = error_of(target, subject)
+    except FAILED as failed:
+        return f"failed: {str(failed)[:100]}"
     nodes = graph.node_count(graph.load(target))
-    return Simplified(nodes, megabytes(target), taken.cpu_s, worst)
+    return f"{nodes}, {megabytes(target):.1f}, {taken.cpu_s:.1f}, {error:.1e}"
 
 
-def answers(
-    path: Path, frames: Sequence[simplifiers.Frame], *, optimized: bool
-) -> list[list[Any]]:
-    """Run a file over frames."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = simplifiers.THREADS
-    options.log_severity_level = 4
-    if not optimized:
-        none = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-        options.graph_optimization_level = none
-    session = onnxruntime.InferenceSession(path, options)
-    return [list(session.run(None, frame)) for frame in frames]
+def error_of(path: Path, subject: subjects.Subject) -> float:
+    """Return the largest max|a - b| / max|a| of an output, ``a`` being torch's."""
+    (frame,) = simplifiers.frames(subject.held_out, 1)
+    with np.load(expected(subject.source)) as held:
+        wanted = [held[name] for name in held]
+    session = simplifiers.session(path)
+    return simplifiers.error(wanted, list(session.run(None, frame)))
 
 
 def megabytes(path: Path) -> float:

@@ -178,6 +178,11 @@ def make(name: str, out: Path) -> Path:
     return source
 
 
+def expected(source: Path) -> Path:
+    """Return the file of torch's own outputs on the first frame that is held out."""
+    return source.with_name("expected.npz")
+
+
 def record(kind: Kind, folder: Path, count: int, seed: int) -> None:
     """Write frames of the model's input, each a scene of its own."""
     folder.mkdir(parents=True)
@@ -196,6 +201,10 @@ def export(kind: Kind, path: Path) -> None:
     example = torch.zeros(kind.shape)
     if kind.half:
         wrapped, example = wrapped.half(), example.half()
+    with np.load(path.parent / "held-out" / "000000.npz") as frame, torch.no_grad():
+        found = wrapped(torch.from_numpy(frame["x"]))
+    answers = zip(kind.outputs, found, strict=True)
+    np.savez(expected(path), **{name: value.numpy() for name, value in answers})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
