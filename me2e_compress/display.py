@@ -136,6 +136,10 @@ class Displayed(abc.ABC):
         """Return what is said below the tables."""
         return (self.headline,)
 
+    def alerts(self) -> tuple[str, ...]:
+        """Return what must not be overlooked: said last, in bold."""
+        return ()
+
     def __repr__(self) -> str:
         """Show the class and the one line."""
         return f"<{type(self).__name__}: {self.headline}>"
@@ -143,6 +147,7 @@ class Displayed(abc.ABC):
     def _repr_html_(self) -> str:
         """Show the tables and the lines."""
         below = "".join(f"<p>{html.escape(line)}</p>" for line in self.lines())
+        below += "".join(f"<pre><b>{html.escape(e)}</b></pre>" for e in self.alerts())
         return "".join(each.html() for each in self.tables()) + below
 
 

@@ -113,6 +113,12 @@ class Ranges(Displayed):
                 )
         return found
 
+    def hold_for(self, model: str, tensors: tuple[str, ...], method: str) -> bool:
+        """Whether they are of this graph and method, and of all these tensors."""
+        asked = OBSERVERS.text(OBSERVERS.parse(method), defaults=True)
+        known = self.model == model and self.method == asked
+        return known and all(name in self.tensors for name in tensors)
+
     def check(
         self,
         *,

@@ -1,8 +1,9 @@
-"""Part of a recording: some frames drawn by seed, or one shard of many."""
+"""Part of a recording: frames drawn by seed, one shard of many, or those held out."""
 
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from me2e_compress.runtime.frames import Frame
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """Some of the frames of a recording, in its order, scenes from their beginning.
+    """Some of the frames of a recording, in its order; the first starts a scene.
 
     Attributes:
         whole: the recording.
@@ -37,11 +38,16 @@ class Part:
 
     def __getitem__(self, index: int) -> Frame:
         """Read one frame; its index is the place in the whole recording."""
-        return self.whole[self.places[index]]
+        frame = self.whole[self.places[index]]
+        return frame if index else dataclasses.replace(frame, starts_scene=True)
 
     def __iter__(self) -> Iterator[Frame]:
         """Read the frames in order, one in memory at a time."""
-        return (self.whole[place] for place in self.places)
+        return (self[index] for index in range(len(self)))
+
+
+Recording: TypeAlias = CalibrationSet | Part
+"""Recorded frames: all of a folder, or some of them."""
 
 
 def draw(whole: CalibrationSet, count: int, seed: int) -> Part:
@@ -65,6 +71,34 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> Part:
     order = np.random.default_rng(seed).permutation(len(scenes)).tolist()
     drawn = [place for at in order for place in scenes[at]]
     return Part(whole, tuple(sorted(drawn[:count])))
+
+
+def hold_out(whole: CalibrationSet, most: int) -> tuple[Part, Part]:
+    """Split a recording: frames to calibrate on, and frames to measure on.
+
+    A quarter of the frames is measured on, ``most`` of them at most and one at least.
+    They are the last ones; where scenes are short enough, none of theirs is calibrated
+    on, since neighbours in a scene look alike. A recording of one frame is both.
+
+    Args:
+        whole: the recording.
+        most: largest number of frames to measure on, above 0.
+
+    Returns:
+        The two parts.
+    """
+    frames = len(whole)
+    if frames == 1:
+        return Part(whole, (0,)), Part(whole, (0,))
+    count = max(1, min(most, frames // 4))
+    cut = frames - count
+    scene = max(start for start in whole.scenes if start <= cut)
+    if scene >= frames / 2:
+        cut = scene
+    return (
+        Part(whole, tuple(range(cut))),
+        Part(whole, tuple(range(cut, cut + count))),
+    )
 
 
 def shard(part: Part, number: int, count: int) -> Part:

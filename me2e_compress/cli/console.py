@@ -101,6 +101,8 @@ def show(
             print_table(each)
     for line in found.lines():
         say(line)
+    for line in found.alerts():
+        console.print(Text(line, "bold"), soft_wrap=True)
 
 
 def say(line: str) -> None:

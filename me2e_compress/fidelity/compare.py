@@ -25,11 +25,14 @@ class OutputFidelity:
         name: of the output.
         sqnr_db: 10 log10(sum a^2 / sum (a - b)^2) in dB; infinite where they are equal.
         error: max|a - b| / max|a|; infinite where a is zero and b is not.
+        discrete: whether it holds whole numbers or booleans, such as labels: their
+            SQNR says little.
     """
 
     name: str
     sqnr_db: float
     error: float
+    discrete: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +58,7 @@ class Fidelity:
         plan: how far the plan moved; None where it was not measured.
         plan_reason: why not; empty where it was.
         frames: how many were compared.
+        plan_output: the output that holds the plan; empty where it was not measured.
     """
 
     outputs: tuple[OutputFidelity, ...]
@@ -62,6 +66,7 @@ class Fidelity:
     plan: Displacement | None
     plan_reason: str
     frames: int
+    plan_output: str = ""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,9 +89,15 @@ class Reference:
         answers = tuple(detached(each) for each in replay(session, frames))
         return cls(session, frames, answers)
 
-    def compare(self, other: Session) -> Fidelity:
-        """Compare another model with it, as :func:`compare` does."""
-        return _compare(self.session, iter(self.answers), other, self.frames)
+    def compare(self, other: Session, frames: Frames | None = None) -> Fidelity:
+        """Compare another model with it, as :func:`compare` does.
+
+        Args:
+            other: the model; the reference itself, to see what other frames change.
+            frames: what it is shown; None shows it the same.
+        """
+        shown = self.frames if frames is None else frames
+        return _compare(self.session, iter(self.answers), other, shown)
 
 
 def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
@@ -137,6 +148,7 @@ def _compare(
         Displacement(float(np.mean(moved)), float(np.max(moved))) if moved else None,
         reason,
         count,
+        adapter.output if adapter is not None and moved else "",
     )
 
 
@@ -158,6 +170,7 @@ class _Tally:
     def __init__(self, name: str) -> None:
         self.name = name
         self.signal = self.noise = self.gap = self.reach = 0.0
+        self.discrete = False
 
     def add(self, a: Array, b: Array, frame: int) -> None:
         if a.shape != b.shape:
@@ -166,6 +179,7 @@ class _Tally:
                 f" {list(b.shape)} in the second"
             )
         x, y = self._wide(a, "first", frame), self._wide(b, "second", frame)
+        self.discrete = a.dtype.kind not in "fc"
         if not x.size:
             return
         gap = np.abs(x - y)
@@ -176,11 +190,11 @@ class _Tally:
 
     def result(self) -> OutputFidelity:
         if self.noise == 0:
-            return OutputFidelity(self.name, math.inf, 0.0)
+            return OutputFidelity(self.name, math.inf, 0.0, self.discrete)
         if self.signal == 0:
-            return OutputFidelity(self.name, -math.inf, math.inf)
+            return OutputFidelity(self.name, -math.inf, math.inf, self.discrete)
         sqnr = 10 * math.log10(self.signal / self.noise)
-        return OutputFidelity(self.name, sqnr, self.gap / self.reach)
+        return OutputFidelity(self.name, sqnr, self.gap / self.reach, self.discrete)
 
     def _wide(self, value: Array, which: str, frame: int) -> Float64:
         wide = np.asarray(value, np.float64)

@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.calibration.dataset import CalibrationSet, synthetic
+from me2e_compress.calibration.dataset import synthetic
+from me2e_compress.calibration.sample import Recording
 from me2e_compress.errors import GraphError
 from me2e_compress.manager.report import Verification
 from me2e_compress.runtime.frames import Frame
@@ -39,7 +40,7 @@ class VerificationInputs:
 
     @classmethod
     def of(
-        cls, model: ir.Model, frames: CalibrationSet | None, seed: int, count: int
+        cls, model: ir.Model, frames: Recording | None, seed: int, count: int
     ) -> "VerificationInputs":
         """Take the first recorded frames, or make seeded inputs where none are given.
 

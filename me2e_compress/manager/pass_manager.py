@@ -20,7 +20,7 @@ from me2e_compress.errors import (
 )
 from me2e_compress.graph import provenance
 from me2e_compress.manager import equivalence, pass_contract, reproducer
-from me2e_compress.manager.report import Report, Step, Verification
+from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.recipe import to_text
@@ -77,7 +77,11 @@ class PassManager:
         progress(len(passes), len(passes), "verify")
         books.verify(model)
         return Report(
-            model, to_text(passes), tuple(books.steps), tuple(books.verifications)
+            model,
+            to_text(passes),
+            tuple(books.steps),
+            tuple(books.verifications),
+            tuple(books.lossy),
         )
 
     def _with_import(self, model: ir.Model) -> tuple[Pass, ...]:
@@ -118,6 +122,7 @@ class _Books:
         self.context = context
         self.steps: list[Step] = []
         self.verifications: list[Verification] = []
+        self.lossy: list[LossyPass] = []
         self._stretch: list[tuple[Pass, ir.Model]] = []
         self._size = graph.size(checkpoint)
         self._digest = graph.digest(checkpoint)
@@ -145,6 +150,8 @@ class _Books:
         self._enter(current, result, process_time() - start)
         if current.exact:
             self._stretch.append((current, model))
+        else:
+            self.lossy.append(LossyPass(current, model, result.changes))
         return result.model
 
     def verify(self, model: ir.Model) -> None:

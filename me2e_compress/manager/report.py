@@ -18,6 +18,7 @@ from me2e_compress.display import (
     table,
 )
 from me2e_compress.graph import Size
+from me2e_compress.passes.base import Pass
 
 _PACKAGES = ("me2e-compress", "onnx", "onnx-ir", "onnxruntime", "numpy")
 
@@ -46,6 +47,21 @@ class Step:
     before: Size
     after: Size
     notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LossyPass:
+    """A pass that promises nothing of the outputs, as it was run.
+
+    Attributes:
+        applied: the pass.
+        before: the graph that it was given, shapes inferred.
+        changes: places it changed.
+    """
+
+    applied: Pass
+    before: ir.Model
+    changes: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,12 +95,14 @@ class Report(Displayed):
         pipeline: the passes as text; feeding it to ``--passes`` repeats the run.
         steps: pass by pass.
         verifications: the numeric checks, in order.
+        lossy: the passes that are not exact, in order, to be judged by what they did.
     """
 
     model: ir.Model
     pipeline: str
     steps: tuple[Step, ...]
     verifications: tuple[Verification, ...]
+    lossy: tuple[LossyPass, ...] = ()
 
     @property
     def headline(self) -> str:

@@ -8,8 +8,8 @@ from typing import ClassVar, Literal
 import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.means import load_means, token_means
+from me2e_compress.calibration.sample import Recording
 from me2e_compress.errors import FramesError, PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Substitute
@@ -223,7 +223,7 @@ def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
 def _means_of(
     model: ir.Model,
     values: Sequence[ir.Value],
-    frames: CalibrationSet | None,
+    frames: Recording | None,
     file: Path | None,
 ) -> tuple[dict[str, Array], str]:
     """Read means from a file, or measure them on frames.

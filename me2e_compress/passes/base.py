@@ -10,8 +10,8 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.sample import Recording
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.modules import ModuleMap
 
@@ -24,11 +24,16 @@ class Context:
         modules: which part of the graph is which.
         frames: recorded inputs, in scenes; None where the user gave none.
         seed: for everything random.
+        measured: the ranges that passes measured on the frames, by the pass's name: a
+            pass that runs again on the same graph need not measure again.
     """
 
     modules: ModuleMap
-    frames: CalibrationSet | None = None
+    frames: Recording | None = None
     seed: int = 0
+    measured: dict[str, Ranges] = dataclasses.field(
+        default_factory=dict, compare=False, repr=False
+    )
 
     def ranges(
         self,
@@ -66,7 +71,11 @@ class Context:
                 f"{name} needs recorded frames (--frames) or saved ranges (--ranges):"
                 " int8 ranges are never made up"
             )
-        return Calibrator(method).run(model, tensors, self.frames)
+        known = self.measured.get(name)
+        if known is None or not known.hold_for(graph.digest(model), tensors, method):
+            known = Calibrator(method).run(model, tensors, self.frames)
+            self.measured[name] = known
+        return known
 
 
 @dataclasses.dataclass(frozen=True)

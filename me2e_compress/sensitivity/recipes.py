@@ -1,10 +1,11 @@
 """From what was found to a recipe."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.quantization.plan.overrides import Override
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.sensitivity.analysis import Sensitivity
 from me2e_compress.sensitivity.trials import Int8Choice, Trials
@@ -134,13 +135,19 @@ def write_recipe(
     write_bytes(path, "\n".join(lines).encode())
     if not choice.floats or not choice.modules:
         return None
-    entries = [
-        f"[[override]]\nnodes = {_string(each.nodes or '')}\n"
-        f'dtype = "{each.dtype}"\nreason = "{each.reason}"\n'
-        for each in choice.overrides().override
-    ]
-    write_bytes(overrides, "\n".join(entries).encode())
+    write_bytes(overrides, overrides_text(choice.overrides().override).encode())
     return overrides
+
+
+def overrides_text(overrides: Iterable[Override]) -> str:
+    """Write overrides as the TOML that ``--overrides`` reads."""
+    entries = []
+    for each in overrides:
+        keys = ("nodes", "module", "op", "reads", "dtype", "reason")
+        given = {key: text for key in keys if (text := getattr(each, key))}
+        lines = (f"{key} = {_string(text)}\n" for key, text in given.items())
+        entries.append("[[override]]\n" + "".join(lines))
+    return "\n".join(entries)
 
 
 def _array(names: tuple[str, ...]) -> str:

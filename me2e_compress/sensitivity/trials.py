@@ -37,11 +37,13 @@ class Int8Choice:
     def overrides(self) -> Overrides:
         """Build the overrides that keep the nodes in float."""
         return Overrides(
-            override=tuple(
-                Override(dtype=FLOAT, nodes=name.translate(_GLOB), reason="sensitive")
-                for name in self.floats
-            )
+            override=tuple(keep_float(name, "sensitive") for name in self.floats)
         )
+
+
+def keep_float(name: str, reason: str) -> Override:
+    """Return the override that keeps one node in float."""
+    return Override(dtype=FLOAT, nodes=name.translate(_GLOB), reason=reason)
 
 
 Drive: TypeAlias = Callable[[Int8Choice, ir.Model], float]

@@ -4,12 +4,16 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from time import process_time
 from typing import TypeAlias
+
+import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress import recipe as recipes
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import RecipeError
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.passes import Context, Pass
@@ -19,11 +23,18 @@ from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.workflows.checks import (
     check_count,
+    check_number,
     check_output,
     load_map,
     model_path,
 )
-from me2e_compress.workflows.compress_result import CompressResult, beside
+from me2e_compress.workflows.compress_fidelity import (
+    MeasuredLoss,
+    SplitFrames,
+    measure_loss,
+)
+from me2e_compress.workflows.compress_result import CompressResult, beside, loss_record
+from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.zoo.shipped import sample_frames
 
@@ -46,10 +57,14 @@ class CompressOptions:
         module_map: preset or TOML file; None finds the preset.
         seed: of everything random.
         verify_frames: frames that exact passes are checked on; 0 checks none.
+        measure_frames: most frames that are kept out of calibration, to measure lossy
+            passes on; 0 measures nothing and calibrates on all.
+        floor: least SQNR of an output, in dB, without a warning.
+        allow_empty: write the graph although nothing in it became int8.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
 
     Raises:
-        RecipeError: a number below 0.
+        RecipeError: a number below 0, or a floor that is not finite.
     """
 
     scheme: str | None = None
@@ -61,12 +76,17 @@ class CompressOptions:
     module_map: str | Path | None = None
     seed: int = 0
     verify_frames: int = 2
+    measure_frames: int = 4
+    floor: float = SQNR_FLOOR_DB
+    allow_empty: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         check_count("--seed", self.seed)
         check_count("--verify-frames", self.verify_frames)
+        check_count("--measure-frames", self.measure_frames)
+        check_number("--floor", self.floor, zero=True)
 
     def passes(self, recipe: Recipe | None) -> tuple[Pass, ...]:
         """Build the passes of a recipe, with what these options say about int8.
@@ -146,6 +166,8 @@ def compress(
         GraphError: no such model, or the output would harm an input.
         RecipeError: nothing to do, or options that do not fit the passes.
         FramesError: frames that do not fit the model.
+        PreconditionError: nothing became int8 although a pass quantizes; nothing is
+            written.
         Me2eError: a pass refused the graph or broke.
     """
     options = options or CompressOptions()
@@ -154,26 +176,55 @@ def compress(
     read = [file for each in passes for file in each.files()]
     named = recipe if isinstance(recipe, str | Path) else None
     check_output(_written(output), (source, named, frames, options.module_map, *read))
+    start = process_time()
     with collector_paused():
         loaded = graph.load(source)
         modules = load_map(options.module_map, loaded)
-        recording = None
-        if frames is not None:
-            recording = CalibrationSet(Path(frames))
-            recording.check(loaded)
-        samples = None if recording is not None else sample_frames(source)
+        frames_of = _split(source, loaded, frames, passes, options)
+        context = Context(modules, frames_of.calibration, options.seed)
         manager = PassManager(
-            passes,
-            options.verify_frames,
-            output.parent,
-            None if samples is None else CalibrationSet(samples),
+            passes, options.verify_frames, output.parent, frames_of.samples
         )
-        report = manager.run(
-            loaded,
-            Context(modules, recording, options.seed),
-            partial(listener.on_progress, "passes"),
+        progress = partial(listener.on_progress, "passes")
+        report = manager.run(loaded, context, progress)
+        int8 = Int8Outcome.of(report, context)
+        _refuse_empty(int8, options, listener)
+        loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
+        seconds = process_time() - start
+        return _write(report, source, output, int8, loss, seconds)
+
+
+def _split(
+    source: Path,
+    loaded: ir.Model,
+    folder: str | Path | None,
+    passes: tuple[Pass, ...],
+    options: CompressOptions,
+) -> SplitFrames:
+    """Read and check the frames, and keep some for the measurement."""
+    recording = samples = None
+    if folder is not None:
+        recording = CalibrationSet(Path(folder))
+        recording.check(loaded)
+    elif (shipped := sample_frames(source)) is not None:
+        samples = CalibrationSet(shipped)
+    lossy = not all(each.exact for each in passes)
+    saved = any(each.reads_ranges and not each.needs_frames for each in passes)
+    most = options.measure_frames if lossy else 0
+    return SplitFrames.of(recording, samples, most, saved=saved)
+
+
+def _refuse_empty(
+    int8: Int8Outcome | None, options: CompressOptions, listener: Listener
+) -> None:
+    """Refuse to write, or warn of, a graph in which nothing became int8."""
+    if int8 is None or not int8.empty:
+        return
+    if not options.allow_empty:
+        raise PreconditionError(
+            f"{int8.empty}; nothing is written, --allow-empty writes it nevertheless"
         )
-        return _write(report, source, output)
+    listener.on_warning(int8.empty)
 
 
 def _written(output: Path) -> tuple[Path, ...]:
@@ -181,13 +232,20 @@ def _written(output: Path) -> tuple[Path, ...]:
     return output, data, beside(output, "plan"), beside(output, "report")
 
 
-def _write(report: Report, source: Path, output: Path) -> CompressResult:
+def _write(
+    report: Report,
+    source: Path,
+    output: Path,
+    int8: Int8Outcome | None,
+    loss: MeasuredLoss | None,
+    seconds: float,
+) -> CompressResult:
     """Write the graph and its plan; the report last, it vouches for the others."""
     graph.save(report.model, output)
     plan = plan_of(report.model)
     if plan is not None:
         save_plan(plan, beside(output, "plan"))
-    record = report.record(source, output)
+    record = report.record(source, output) | loss_record(report, int8, loss)
     write_json(beside(output, "report"), record, indent=2)
     sizes = graph.file_bytes(source), graph.file_bytes(output)
-    return CompressResult(source, output, report, record, *sizes)
+    return CompressResult(source, output, report, record, *sizes, int8, loss, seconds)

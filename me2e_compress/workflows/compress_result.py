@@ -1,10 +1,19 @@
 """What a compression made: the graph, the report and their tables."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress.manager import Report
+from me2e_compress.workflows.compress_fidelity import MeasuredLoss
+from me2e_compress.workflows.compress_verdict import (
+    alerts,
+    fidelity_table,
+    verdict,
+    weights_table,
+)
+from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.result import Result, Table, megabytes
 
 
@@ -20,6 +29,9 @@ class CompressResult(Result):
         record: what ``STEM.report.json`` holds.
         source_bytes: with the weights beside it.
         output_bytes: with the weights beside it.
+        int8: what became int8 and what did not; None where no pass quantizes.
+        loss: how true the graph stayed; None where every pass is exact.
+        seconds: CPU time of everything but the writing.
     """
 
     source: Path
@@ -28,6 +40,9 @@ class CompressResult(Result):
     record: Mapping[str, object]
     source_bytes: int
     output_bytes: int
+    int8: Int8Outcome | None = None
+    loss: MeasuredLoss | None = None
+    seconds: float = 0.0
 
     @property
     def report_path(self) -> Path:
@@ -44,8 +59,29 @@ class CompressResult(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return pass by pass what changed, and how exact passes were checked."""
-        return self.report.tables()
+        """Return pass by pass what changed, how it was checked, and how true it is."""
+        measured = None if self.loss is None else fidelity_table(self.loss)
+        return (*self.report.tables(), *filter(None, [measured]))
+
+    def details(self) -> tuple[Table, ...]:
+        """Return the largest weights that stay float."""
+        weights = None if self.int8 is None else weights_table(self.int8)
+        return tuple(filter(None, [weights]))
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the verdict: size, int8, how far outputs and plan moved, time."""
+        return (*verdict(self.report, self.int8, self.loss), self._time, self.headline)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what must not be overlooked: no int8, or quality below the floor."""
+        return tuple(alerts(self.int8, self.loss))
+
+    @property
+    def _time(self) -> str:
+        said = f"took {self.seconds:.0f} CPU s"
+        if self.loss is not None and self.loss.fidelity is not None:
+            said += f", {self.loss.seconds:.0f} of them to measure"
+        return said
 
     def records(self) -> list[dict[str, object]]:
         """Return a row a pass."""
@@ -70,3 +106,37 @@ class CompressResult(Result):
 def beside(output: Path, what: str) -> Path:
     """Name the file that lies beside a compressed graph: ``plan`` or ``report``."""
     return output.with_name(f"{output.stem}.{what}.json")
+
+
+def loss_record(
+    report: Report, int8: Int8Outcome | None, loss: MeasuredLoss | None
+) -> dict[str, object]:
+    """Return what a report file says of int8 and fidelity; null: not finite, or none.
+
+    Times are left out: the same run writes the same.
+    """
+    return {
+        "int8": None if int8 is None else dataclasses.asdict(int8),
+        "fidelity": None if loss is None else _fidelity_record(loss),
+        "verdict": [*verdict(report, int8, loss), *alerts(int8, loss)],
+    }
+
+
+def _fidelity_record(loss: MeasuredLoss) -> dict[str, object]:
+    remedy = loss.remedy
+    found = dataclasses.asdict(dataclasses.replace(loss, remedy=None))
+    del found["seconds"]
+    if remedy is not None:
+        found["remedy"] = dataclasses.asdict(remedy) | {"overrides": remedy.overrides()}
+    return {name: _finite(value) for name, value in found.items()}
+
+
+def _finite(value: object) -> object:
+    """Replace what is not a finite number, at any depth, by None."""
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -9,11 +9,19 @@ from me2e_compress import recipe
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import RecipeError
+from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
 from me2e_compress.workflows import compress as workflow
 from me2e_compress.workflows.checks import sizes
 
 VerifyFrames = Annotated[
     int, typer.Option(min=0, help="frames that exact passes are checked on; 0: none")
+]
+MeasureFrames = Annotated[
+    int, typer.Option(min=0, help="most frames kept to measure on; 0: none")
+]
+Floor = Annotated[float, typer.Option(help="warn of an output below this SQNR, in dB")]
+AllowEmpty = Annotated[
+    bool, typer.Option("--allow-empty", help="write it although nothing became int8")
 ]
 
 
@@ -38,6 +46,9 @@ def compress(
     module_map: given.ModuleMap = None,
     seed: given.Seed = 0,
     verify_frames: VerifyFrames = 2,
+    measure_frames: MeasureFrames = 4,
+    floor: Floor = SQNR_FLOOR_DB,
+    allow_empty: AllowEmpty = False,
     set_dim: given.SetDim = None,
     as_json: given.Json = False,
 ) -> None:
@@ -55,6 +66,9 @@ def compress(
         module_map=module_map,
         seed=seed,
         verify_frames=verify_frames,
+        measure_frames=measure_frames,
+        floor=floor,
+        allow_empty=allow_empty,
         dims=sizes(set_dim or ()),
     )
     with listening() as listener:

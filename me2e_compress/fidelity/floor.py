@@ -1,0 +1,146 @@
+"""The floor under fidelity: what fell below it, and which outputs it cannot judge."""
+
+import dataclasses
+from collections.abc import Collection, Iterator
+
+import numpy as np
+
+from me2e_compress.fidelity.compare import Fidelity, Reference
+from me2e_compress.runtime.frames import Frame, Frames
+
+SQNR_FLOOR_DB = 20.0
+"""Noise of a tenth of the signal's amplitude."""
+
+PLAN_FLOOR_M = 0.5
+"""A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
+
+MOST_EXCESS = 1e6
+"""What an output has that ought to be zero and is not."""
+
+STEPS = 127
+"""Int8's grid has so many steps on either side of zero."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shortfall:
+    """One figure below the floor.
+
+    Attributes:
+        output: of the model; the one that holds the plan is judged in metres.
+        value: what was measured: dB, or metres of the mean displacement.
+        unit: ``dB`` or ``m``.
+        excess: amplitude of the noise over the largest that the floor allows, above 1.
+    """
+
+    output: str
+    value: float
+    unit: str
+    excess: float
+
+    def __str__(self) -> str:
+        """Return output, value and unit."""
+        return f"{self.output} {shown(self.value, self.unit)}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Floor:
+    """How true a model must stay.
+
+    Attributes:
+        sqnr_db: least SQNR of every output but the plan and discrete ones, dB; of the
+            plan too where its displacement was not measured.
+        plan_m: most that the waypoints may move on average, metres.
+    """
+
+    sqnr_db: float = SQNR_FLOOR_DB
+    plan_m: float = PLAN_FLOOR_M
+
+    def excess(self, found: Fidelity, output: str) -> float:
+        """Return the noise of an output over what is allowed: above 1 is too much.
+
+        Args:
+            found: what was measured.
+            output: one of the outputs that were compared.
+        """
+        if found.plan is not None and output == found.plan_output:
+            return found.plan.mean_m / self.plan_m
+        (sqnr,) = (each.sqnr_db for each in found.outputs if each.name == output)
+        return float(min(10 ** ((self.sqnr_db - sqnr) / 20), MOST_EXCESS))
+
+    def shortfalls(
+        self, found: Fidelity, unsteady: Collection[str] = ()
+    ) -> tuple[Shortfall, ...]:
+        """List what is below the floor, the worst first.
+
+        Args:
+            found: what was measured.
+            unsteady: outputs that are not judged.
+        """
+        below = []
+        for each in found.outputs:
+            excess = self.excess(found, each.name)
+            if excess <= 1 or each.discrete or each.name in unsteady:
+                continue
+            value, unit = each.sqnr_db, "dB"
+            if found.plan is not None and each.name == found.plan_output:
+                value, unit = found.plan.mean_m, "m"
+            below.append(Shortfall(each.name, value, unit, excess))
+        return tuple(sorted(below, key=lambda each: -each.excess))
+
+    def __str__(self) -> str:
+        """Return both limits."""
+        return f"{self.sqnr_db:g} dB, {self.plan_m:g} m of plan"
+
+
+def shown(value: float, unit: str) -> str:
+    """Write a figure with its unit: dB to a tenth, metres to the centimetre."""
+    return f"{value:z.1f} dB" if unit == "dB" else f"{value:.2f} {unit}"
+
+
+def unsteady_outputs(reference: Reference, floor: Floor) -> dict[str, float]:
+    """Find the outputs that fall below the floor although nothing was compressed.
+
+    The model itself is shown its frames again, their largest float input (the images,
+    as a rule) rounded to int8: less than int8 anywhere in the graph does. An output
+    that this puts below the floor chooses between candidates that are nearly equal;
+    its SQNR counts the choices and says little of the graph.
+
+    Returns:
+        Its SQNR then, dB, by output; of the plan the displacement, metres.
+    """
+    session = reference.session
+    rounded = reference.compare(
+        session, _Rounded(reference.frames, tuple(session.recurrent))
+    )
+    return {each.output: each.value for each in floor.shortfalls(rounded)}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rounded:
+    """Frames whose largest float input, states apart, lies on int8's grid."""
+
+    frames: Frames
+    states: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self._round, self.frames)
+
+    def _round(self, frame: Frame) -> Frame:
+        sizes = {
+            name: values.size
+            for name, values in frame.arrays.items()
+            if values.dtype.kind == "f" and name not in self.states
+        }
+        if not sizes:
+            return frame
+        return _rounded(frame, max(sizes, key=lambda name: sizes[name]))
+
+
+def _rounded(frame: Frame, name: str) -> Frame:
+    values = np.asarray(frame.arrays[name], np.float64)
+    step = float(np.abs(values).max(initial=0.0)) / STEPS or 1.0
+    grid = (np.rint(values / step) * step).astype(frame.arrays[name].dtype)
+    return dataclasses.replace(frame, arrays={**frame.arrays, name: grid})

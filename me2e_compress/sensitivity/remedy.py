@@ -1,0 +1,196 @@
+"""Where int8 loses quality, and what gives it back: nodes or modules in float."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from typing import TypeAlias
+
+from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.floor import Floor, Shortfall
+from me2e_compress.quantization.plan import FLOAT, RESIDUAL, QuantPlan
+from me2e_compress.quantization.plan.overrides import Override
+from me2e_compress.sensitivity.analysis import BLAME
+from me2e_compress.sensitivity.recipes import overrides_text
+from me2e_compress.sensitivity.trials import keep_float
+
+MOST_TRIALS = 16
+"""Variants built and run in one search: two nodes among a hundred."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Int8Node:
+    """A node that is int8, named so that an override can name it.
+
+    Attributes:
+        name: of the node.
+        op: its operator.
+        module: its ME2E module; empty if unknown.
+    """
+
+    name: str
+    op: str
+    module: str
+
+    def __str__(self) -> str:
+        """Return name, operator and module."""
+        where = f", module {self.module}" if self.module else ""
+        return f"{self.name} ({self.op}{where})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Remedy:
+    """What is kept in float to be true to the float model.
+
+    Attributes:
+        nodes: that alone make much of the noise, in the order in which they were found.
+        modules: kept in float as a whole, where the noise is spread over their nodes.
+        fidelity: with these in float, on the frames of the search.
+        shortfalls: what is below the floor then; empty where they cure it.
+        trials: variants that were built and run.
+    """
+
+    nodes: tuple[Int8Node, ...]
+    modules: tuple[str, ...]
+    fidelity: Fidelity
+    shortfalls: tuple[Shortfall, ...]
+    trials: int
+
+    @property
+    def cures(self) -> bool:
+        """Whether nothing is below the floor any more."""
+        return not self.shortfalls
+
+    def overrides(self) -> str:
+        """Write what ``--overrides`` takes; empty where nothing was found."""
+        return overrides_text(
+            (
+                *(Override(dtype=FLOAT, module=each) for each in self.modules),
+                *(keep_float(each.name, "") for each in self.nodes),
+            )
+        )
+
+
+Measure: TypeAlias = Callable[[Sequence[Int8Node]], Fidelity]
+"""Builds the variant in which these nodes alone are float, and compares it."""
+
+
+def int8_nodes(plan: QuantPlan) -> tuple[Int8Node, ...]:
+    """List the nodes that a plan makes int8, in graph order.
+
+    Residual Adds are left out: they follow their convolution. So are nodes without a
+    name of their own.
+    """
+    chosen = [each for each in plan.placed if each.rule != RESIDUAL and each.node]
+    often = Counter(each.node for each in chosen)
+    return tuple(
+        Int8Node(each.node, each.op, each.module)
+        for each in chosen
+        if often[each.node] == 1
+    )
+
+
+def find_remedy(
+    nodes: Sequence[Int8Node],
+    start: Fidelity,
+    measure: Measure,
+    floor: Floor,
+    *,
+    unsteady: Collection[str] = (),
+    most_trials: int = MOST_TRIALS,
+    progress: Callable[[int, int, str], None] = lambda done, most, what: None,
+) -> Remedy:
+    """Search the nodes that must be float for every output to be above the floor.
+
+    The noise of the worst output is followed by bisection: half of the nodes is int8 at
+    a time, one trial a step; what the other half makes is what is left of the noise,
+    squares added up. A node that alone makes half of the noise's amplitude is kept
+    float; where no such node is found, the module is that most of the noise comes
+    from. Then the whole is measured again, and the next one is looked for.
+
+    Args:
+        nodes: those that are int8, in graph order.
+        start: of all of them in int8.
+        measure: tells the fidelity of a variant.
+        floor: what is to be reached.
+        unsteady: outputs that are not judged.
+        most_trials: most variants to build.
+        progress: called as ``progress(trials done, most trials, words)``.
+    """
+    search = _Search(nodes, measure, floor, unsteady, most_trials, progress)
+    return search.run(start)
+
+
+class _Search:
+    """One search: what is float so far, and how many trials are left."""
+
+    def __init__(
+        self,
+        nodes: Sequence[Int8Node],
+        measure: Measure,
+        floor: Floor,
+        unsteady: Collection[str],
+        most_trials: int,
+        progress: Callable[[int, int, str], None],
+    ) -> None:
+        self._nodes = tuple(nodes)
+        self._run = measure
+        self._floor = floor
+        self._unsteady = unsteady
+        self._most = most_trials
+        self._progress = progress
+        self._done = 0
+        self._alone: list[Int8Node] = []
+        self._modules: list[str] = []
+
+    def run(self, start: Fidelity) -> Remedy:
+        """Follow the worst output until none is below the floor, or trials are out."""
+        found = start
+        while below := self._floor.shortfalls(found, self._unsteady):
+            # A step of the bisection, and the trial that confirms it.
+            if self._done + 2 > self._most or not self._keep(below[0]):
+                break
+            found = self._measure(self._floats())
+        nodes = [each for each in self._alone if each.module not in self._modules]
+        return Remedy(tuple(nodes), tuple(self._modules), found, below, self._done)
+
+    def _keep(self, worst: Shortfall) -> bool:
+        """Keep more nodes float; False where nothing is left that would help."""
+        left = [each for each in self._nodes if each not in self._floats()]
+        group = self._bisect(left, worst)
+        if len(group) == 1:
+            self._alone += group
+            return True
+        modules = Counter(each.module for each in group if each.module)
+        inside = {each.module for each in left}
+        if not modules or len(inside) == 1:
+            return False  # all that is left would be float
+        self._modules.append(modules.most_common(1)[0][0])
+        return True
+
+    def _bisect(
+        self, group: Sequence[Int8Node], worst: Shortfall
+    ) -> Sequence[Int8Node]:
+        """Narrow a group down for as long as one half makes most of the noise."""
+        whole = noise = worst.excess
+        while len(group) > 1 and self._done + 1 < self._most:
+            middle = len(group) // 2
+            first, second = group[:middle], group[middle:]
+            floats = [each for each in self._nodes if each not in first]
+            one = self._floor.excess(self._measure(floats), worst.output)
+            other = max(noise**2 - one**2, 0.0) ** 0.5
+            if max(one, other) < BLAME * whole:
+                break
+            group, noise = (first, one) if one >= other else (second, other)
+        return group
+
+    def _floats(self) -> list[Int8Node]:
+        return [
+            each
+            for each in self._nodes
+            if each in self._alone or each.module in self._modules
+        ]
+
+    def _measure(self, floats: Sequence[Int8Node]) -> Fidelity:
+        self._progress(self._done, self._most, "")
+        self._done += 1
+        return self._run(floats)

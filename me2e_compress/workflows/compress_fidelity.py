@@ -1,0 +1,224 @@
+"""What lossy passes did to a model, on frames kept out of calibration."""
+
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.sample import Recording, hold_out
+from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.fidelity.compare import Fidelity, Reference
+from me2e_compress.fidelity.floor import Floor, Shortfall, unsteady_outputs
+from me2e_compress.manager import Report
+from me2e_compress.manager.report import LossyPass
+from me2e_compress.passes import Context
+from me2e_compress.quantization.plan import plan_of
+from me2e_compress.runtime.session import Session
+from me2e_compress.sensitivity.recipes import overrides_text
+from me2e_compress.sensitivity.remedy import Int8Node, Remedy, find_remedy, int8_nodes
+from me2e_compress.sensitivity.trials import keep_float
+from me2e_compress.workflows.listener import Listener
+
+KEPT_OUT = "kept out of calibration"
+SHARED = "calibrated on as well: there is no other"
+PERHAPS_SHARED = "that the saved ranges may have been measured on"
+SHIPPED_FRAMES = "that ship with the model"
+
+
+@dataclasses.dataclass(frozen=True)
+class SplitFrames:
+    """Which frames passes see, and which the result is measured on.
+
+    Attributes:
+        calibration: for the passes; None where there are none.
+        measured: for the measurement; None where there are none.
+        kind: what the measured ones are, in words; where there are none, why not.
+        samples: that exact passes are checked on where the user gave none.
+    """
+
+    calibration: Recording | None
+    measured: Recording | None
+    kind: str
+    samples: CalibrationSet | None = None
+
+    @classmethod
+    def of(
+        cls,
+        recording: CalibrationSet | None,
+        samples: CalibrationSet | None,
+        most: int,
+        *,
+        saved: bool,
+    ) -> "SplitFrames":
+        """Keep frames out of calibration.
+
+        Args:
+            recording: what the user gave.
+            samples: what ships with the model.
+            most: largest number to measure on; 0 keeps none.
+            saved: whether ranges come from a file, so that nothing is calibrated.
+        """
+        if not most:
+            return cls(recording, None, "--measure-frames 0", samples)
+        if recording is None:
+            reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
+            return cls(None, samples, reason, samples)
+        calibration, measured = hold_out(recording, most)
+        if saved:
+            return cls(recording, measured, PERHAPS_SHARED)
+        return cls(calibration, measured, SHARED if len(recording) == 1 else KEPT_OUT)
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasuredLoss:
+    """How true a compressed model stayed, and where it did not.
+
+    Attributes:
+        fidelity: against the graph before the first lossy pass; None: not measured.
+        on: which frames, in words; where nothing was measured, why not.
+        floor: what it is held against.
+        unsteady: outputs that are not judged: the uncompressed model itself falls that
+            low, in dB or metres, when its largest input is rounded to int8.
+        shortfalls: what is below the floor, the worst first.
+        guilty: the passes that the shortfalls come from.
+        remedy: what would give the quality back; None: nothing was searched, since
+            another pass is guilty, or the one that quantizes takes no overrides.
+        seconds: CPU time of measuring and searching.
+    """
+
+    fidelity: Fidelity | None
+    on: str
+    floor: Floor
+    unsteady: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    shortfalls: tuple[Shortfall, ...] = ()
+    guilty: tuple[str, ...] = ()
+    remedy: Remedy | None = None
+    seconds: float = 0.0
+
+
+def measure_loss(
+    report: Report,
+    context: Context,
+    frames: SplitFrames,
+    floor: Floor,
+    listener: Listener,
+) -> MeasuredLoss | None:
+    """Compare the graph with what it was before the first lossy pass.
+
+    Below the floor, the outputs that choose between near-equal candidates are set
+    aside, and the nodes of the int8 plan are searched for what makes the loss.
+
+    Returns:
+        What was found; None where every pass is exact.
+    """
+    if not report.lossy:
+        return None
+    if frames.measured is None:
+        return MeasuredLoss(None, frames.kind, floor)
+    start = process_time()
+    listener.on_progress("fidelity", 0, 1, "")
+    measurement = _Measurement(report, context, frames.measured, floor, listener)
+    found = MeasuredLoss(None, frames.kind, floor)
+    try:
+        found = measurement.judge(found)
+    except (EvaluationError, FramesError, GraphError) as error:
+        found = dataclasses.replace(found, on=str(error))
+    return dataclasses.replace(found, seconds=process_time() - start)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Measurement:
+    """One measurement, and the search that it may lead to."""
+
+    report: Report
+    context: Context
+    frames: Recording
+    floor: Floor
+    listener: Listener
+
+    def judge(self, found: MeasuredLoss) -> MeasuredLoss:
+        """Measure; below the floor, find out which outputs, passes and nodes."""
+        reference = self._reference(self.report.lossy[0])
+        fidelity = self._compare(reference)
+        found = dataclasses.replace(found, fidelity=fidelity)
+        if not self.floor.shortfalls(fidelity):
+            return found
+        unsteady = unsteady_outputs(reference, self.floor)
+        below = self.floor.shortfalls(fidelity, unsteady)
+        found = dataclasses.replace(found, unsteady=unsteady, shortfalls=below)
+        return self._blame(found, reference) if below else found
+
+    def _blame(self, found: MeasuredLoss, reference: Reference) -> MeasuredLoss:
+        """Name the passes, and where int8 is to blame, the nodes."""
+        lossy = self.report.lossy
+        names = tuple(each.applied.name for each in lossy)
+        quantizer = next((each for each in lossy if each.applied.quantizes), None)
+        if quantizer is None:
+            return dataclasses.replace(found, guilty=names)
+        if quantizer is not lossy[0]:  # it is judged by what it adds to the others
+            reference = self._reference(quantizer)
+            added = self._compare(reference)
+            if not self.floor.shortfalls(added, found.unsteady):
+                others = tuple(each for each in names if each != quantizer.applied.name)
+                return dataclasses.replace(found, guilty=others)
+        guilty = dataclasses.replace(found, guilty=(quantizer.applied.name,))
+        plan = plan_of(self.report.model)
+        if plan is None or "overrides" not in quantizer.applied.option_names():
+            return guilty
+        reference, start = self._fewer(reference, found.unsteady)
+        with TemporaryDirectory(prefix="me2e-trial-") as folder:
+            trial = _Trial(quantizer, self.context, reference, Path(folder) / "o.toml")
+            remedy = find_remedy(
+                int8_nodes(plan),
+                start,
+                trial.measure,
+                self.floor,
+                unsteady=found.unsteady,
+                progress=partial(self.listener.on_progress, "search"),
+            )
+        return dataclasses.replace(guilty, remedy=remedy)
+
+    def _fewer(
+        self, reference: Reference, unsteady: Collection[str]
+    ) -> tuple[Reference, Fidelity]:
+        """Take the first frame alone if it shows the loss; two where state is fed."""
+        count = 2 if reference.session.recurrent else 1
+        few = Reference(
+            reference.session,
+            tuple(islice(reference.frames, count)),
+            reference.answers[:count],
+        )
+        found = self._compare(few)
+        if self.floor.shortfalls(found, unsteady):
+            return few, found
+        return reference, self._compare(reference)
+
+    def _reference(self, first: LossyPass) -> Reference:
+        return Reference.of(Session(first.before, release=True), self.frames)
+
+    def _compare(self, reference: Reference) -> Fidelity:
+        return reference.compare(Session(self.report.model, release=True))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Trial:
+    """The pass that quantized, run again with more nodes in float."""
+
+    quantizer: LossyPass
+    context: Context
+    reference: Reference
+    overrides: Path
+
+    def measure(self, floats: Sequence[Int8Node]) -> Fidelity:
+        """Build the variant and compare it; what the user decided still holds."""
+        asked = getattr(self.quantizer.applied, "overrides", None)
+        text = "" if asked is None else Path(asked).read_text(encoding="utf-8")
+        more = overrides_text(keep_float(each.name, "") for each in floats)
+        self.overrides.write_text(f"{text}\n{more}", encoding="utf-8")
+        again = self.quantizer.applied.with_options({"overrides": self.overrides})
+        made = again.run(self.quantizer.before.clone(), self.context).model
+        return self.reference.compare(Session(made, release=True))

@@ -1,0 +1,165 @@
+"""The last lines of a compression: size, int8, how far outputs and plan moved, time."""
+
+from collections.abc import Iterable, Iterator
+
+from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.floor import Shortfall, shown
+from me2e_compress.manager import Report
+from me2e_compress.workflows.compress_fidelity import MeasuredLoss
+from me2e_compress.workflows.int8_outcome import Int8Outcome
+from me2e_compress.workflows.result import Table, megabytes, table
+
+LISTED_WEIGHTS = 5
+"""Float weights that a table shows."""
+
+
+def verdict(
+    report: Report, int8: Int8Outcome | None, loss: MeasuredLoss | None
+) -> Iterator[str]:
+    """Say in a line each what became int8, how far the outputs moved, and on what."""
+    if int8 is not None:
+        yield _int8_line(int8)
+    if loss is None:
+        yield from _exact_line(report)
+    elif loss.fidelity is None:
+        yield f"fidelity: not measured ({loss.on})"
+    else:
+        yield _fidelity_line(loss.fidelity, loss)
+    if loss is not None and loss.unsteady:
+        listed = _listed(loss.unsteady.items(), loss)
+        yield (
+            f"not judged: {listed} before anything is compressed, if only the largest"
+            " input is rounded to int8: near-equal candidates are chosen otherwise, and"
+            " only the road tells what that means"
+        )
+
+
+def alerts(int8: Int8Outcome | None, loss: MeasuredLoss | None) -> Iterator[str]:
+    """Say what must not be overlooked: nothing int8, or quality below the floor."""
+    if int8 is not None and int8.empty:
+        yield int8.empty
+    if loss is None or not loss.shortfalls:
+        return
+    yield (
+        f"below the floor ({loss.floor}): {', '.join(map(str, loss.shortfalls))};"
+        f" lost in {', '.join(loss.guilty)}"
+    )
+    if loss.remedy is not None:
+        yield from _cure(loss)
+
+
+def _cure(loss: MeasuredLoss) -> Iterator[str]:
+    """Name the nodes, and what the outputs are with them in float."""
+    assert loss.remedy is not None
+    remedy, worst = loss.remedy, loss.shortfalls[0].output
+    runs = f"{remedy.trials} variants run on {_frames(remedy.fidelity)}"
+    found = [
+        *(f"module {name}, all over it" for name in remedy.modules),
+        *map(str, remedy.nodes),
+    ]
+    if not found:
+        yield f"no node or module is to blame alone ({runs})"
+        return
+    yield f"lost at {', '.join(found)}"
+    after = ", ".join(map(str, remedy.shortfalls)) or _figure(remedy.fidelity, worst)
+    left = "" if remedy.cures else ", still below the floor"
+    yield f"with --overrides of these lines: {after}{left} ({runs})"
+    yield remedy.overrides().rstrip()
+
+
+def _int8_line(int8: Int8Outcome) -> str:
+    said = f"int8: {int8.nodes} nodes"
+    if int8.float_bytes:
+        rules = ", ".join(f"{k} {megabytes(v)}" for k, v in int8.float_bytes.items())
+        total = megabytes(sum(int8.float_bytes.values()))
+        said += f"; {total} MB of weights stay float, by rule: {rules}"
+    return said
+
+
+def _exact_line(report: Report) -> Iterator[str]:
+    judged = [
+        (error, check.inputs)
+        for check in report.verifications
+        for name, error in check.errors.items()
+        if name not in check.unsteady
+    ]
+    if judged:
+        worst, inputs = max(judged)
+        yield f"every output is the same within {worst:.1e} of its largest ({inputs})"
+
+
+def _fidelity_line(found: Fidelity, loss: MeasuredLoss) -> str:
+    where = f"on {_frames(found)} {loss.on}"
+    said = []
+    if found.plan is not None:
+        said.append(
+            f"the plan moves {found.plan.mean_m:.3f} m on average,"
+            f" {found.plan.max_m:.2f} m at most"
+        )
+    others = [each for each in found.outputs if each.name != found.plan_output]
+    judged = [e for e in others if not e.discrete and e.name not in loss.unsteady]
+    if judged:
+        worst = min(judged, key=lambda each: each.sqnr_db)
+        said.append(
+            f"the noisiest output is {worst.name}, {shown(worst.sqnr_db, 'dB')}"
+        )
+    return f"{'; '.join(said) or 'no output could be judged'} ({where})"
+
+
+def _listed(items: Iterable[tuple[str, float]], loss: MeasuredLoss) -> str:
+    plan = "" if loss.fidelity is None else loss.fidelity.plan_output
+    has_metres = loss.fidelity is not None and loss.fidelity.plan is not None
+    return ", ".join(
+        f"{name} {shown(value, 'm' if has_metres and name == plan else 'dB')}"
+        for name, value in items
+    )
+
+
+def _figure(found: Fidelity, output: str) -> str:
+    if found.plan is not None and output == found.plan_output:
+        return str(Shortfall(output, found.plan.mean_m, "m", 0.0))
+    (value,) = (each.sqnr_db for each in found.outputs if each.name == output)
+    return str(Shortfall(output, value, "dB", 0.0))
+
+
+def _frames(found: Fidelity) -> str:
+    return f"{found.frames} frame{'s' * (found.frames > 1)}"
+
+
+def fidelity_table(loss: MeasuredLoss) -> Table | None:
+    """Show signal to noise and largest error of every output; None if not measured."""
+    found = loss.fidelity
+    if found is None:
+        return None
+    below = {each.output for each in loss.shortfalls}
+    rows = [
+        (
+            each.name,
+            f"{each.sqnr_db:z.1f}",
+            f"{each.error:.1e}",
+            "below" if each.name in below else _judged(each.name, each.discrete, loss),
+        )
+        for each in found.outputs
+    ]
+    rows += [(name, "removed", "", "") for name in found.missing]
+    title = f"Fidelity on {_frames(found)} {loss.on}"
+    return table(title, ("output", "SQNR dB", "max|a-b|/max|a|", "floor"), rows)
+
+
+def _judged(name: str, discrete: bool, loss: MeasuredLoss) -> str:
+    return "not judged" if discrete or name in loss.unsteady else "above"
+
+
+def weights_table(int8: Int8Outcome) -> Table | None:
+    """Show the largest weights that stayed float, and why; None if there are none."""
+    if not int8.weights:
+        return None
+    return table(
+        "Largest weights that stay float",
+        ("weight", "read by", "rule", "MB"),
+        [
+            (each.name, each.op, f"{each.rule}: {each.reason}", megabytes(each.bytes))
+            for each in int8.weights[:LISTED_WEIGHTS]
+        ],
+        words=3,
+    )

@@ -1,0 +1,275 @@
+"""``compress`` measures what it did, warns, and says what gives the quality back."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+import me2e_compress as me2e
+from me2e_compress import graph
+from me2e_compress.errors import PreconditionError
+from tests.cli.conftest import Command
+from tests.frames import record
+from tests.nets import conv_attention, net
+
+PROJECTION = """
+<ir_version: 9, opset_import: ["" : 17]>
+net (float[1,8,64] img, float[6,4,4] lidar2img, float[4,256] points,
+     float[64,64] first, float[64,64] second, float[64,12] out)
+    => (float[1,6,2] plan, float[6,2,256] bev)
+    <int64[1] zero = {0}, int64[1] two = {2}, int64[1] three = {3}, int64[1] row = {1},
+     float least = {0.1}, float width = {800.0}, int64[3] waypoints = {1, 6, 2}> {
+    ["/backbone/first"] a = MatMul(img, first)
+    ["/backbone/Relu"] r = Relu(a)
+    ["/backbone/second"] b = MatMul(r, second)
+    ["/bev_encoder/project"] seen = MatMul(lidar2img, points)
+    ["/bev_encoder/uv"] uv = Slice(seen, zero, two, row)
+    ["/bev_encoder/z"] z = Slice(seen, two, three, row)
+    ["/bev_encoder/Max"] depth = Max(z, least)
+    ["/bev_encoder/Div"] pixel = Div(uv, depth)
+    ["/bev_encoder/Scale"] share = Div(pixel, width)
+    ["/bev_encoder/Tanh"] bev = Tanh(share)
+    ["/plan_head/mean"] mean = ReduceMean<axes=[1]>(b)
+    ["/plan_head/out"] flat = MatMul(mean, out)
+    ["/plan_head/Reshape"] plan = Reshape(flat, waypoints)
+}
+"""
+
+MAP = "".join(
+    f'[modules.{name}]\nrole = "{role}"\npatterns = ["{name}"]\n'
+    for name, role in (
+        ("backbone", "feature"),
+        ("bev_encoder", "feature"),
+        ("plan_head", "prediction"),
+    )
+)
+GUILTY = "/bev_encoder/project"
+
+
+def projection() -> ir.Model:
+    """Layers, and a product of camera matrices with points in front of the car."""
+    random = np.random.default_rng(0)
+    points = np.ones((4, 256))
+    points[0], points[1] = random.uniform(-8, 8, (2, 256))
+    points[2] = random.uniform(4, 40, 256)
+    layers = {"first": (64, 64), "second": (64, 64), "out": (64, 12)}
+    weights = {name: random.normal(0, 0.1, size) for name, size in layers.items()}
+    return net(PROJECTION, {**weights, "points": points})
+
+
+def camera_frame(seed: int) -> dict[str, Any]:
+    random = np.random.default_rng(seed)
+    camera = np.eye(4)
+    camera[0, 0] = camera[1, 1] = 1200.0
+    camera[:2, 2] = 800.0
+    cameras = camera + random.normal(0, 0.01, (6, 1, 1))
+    image = random.standard_normal((1, 8, 64))
+    return {"img": image.astype("f"), "lidar2img": cameras.astype("f")}
+
+
+@pytest.fixture
+def cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the graph, its map and eight frames; the current one."""
+    graph.save(projection(), tmp_path / "in.onnx")
+    (tmp_path / "map.toml").write_text(MAP)
+    record(tmp_path / "frames", [camera_frame(seed) for seed in range(8)])
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+PAPER = (
+    *("compress", "in.onnx", "--scheme", "full", "--rules", "paper"),
+    *("--map", "map.toml", "--frames", "frames", "--verify-frames", 0),
+    *("-o", "out.onnx"),
+)
+
+
+def test_lost_quality_is_found_named_and_given_back(
+    command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The camera projection in int8: depths of metres on a scale of pixels."""
+    assert command(*PAPER) == 0
+
+    said = capsys.readouterr().out
+    assert "below the floor (20 dB, 0.5 m of plan): bev" in said
+    assert f"lost at {GUILTY} (MatMul, module bev_encoder)" in said
+    (cameras / "more.toml").write_text(said[said.index("[[override]]") :])
+
+    assert command(*PAPER, "--overrides", "more.toml") == 0
+    assert "below the floor" not in capsys.readouterr().out
+
+
+def test_the_report_holds_the_measurement_and_the_remedy(cameras: Path) -> None:
+    options = me2e.CompressOptions(
+        scheme="full", rules="paper", module_map="map.toml", verify_frames=0
+    )
+
+    found = me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
+
+    assert found.loss is not None
+    assert found.loss.remedy is not None
+    assert found.loss.remedy.cures
+    assert [each.output for each in found.loss.shortfalls] == ["bev"]
+    told = json.loads((cameras / "out.report.json").read_text())
+    assert told["fidelity"]["on"] == "kept out of calibration"
+    assert told["fidelity"]["fidelity"]["frames"] == 2
+    assert told["fidelity"]["remedy"]["nodes"][0]["name"] == GUILTY
+    assert told["fidelity"]["floor"] == {"sqnr_db": 20.0, "plan_m": 0.5}
+    assert told["verdict"] == [
+        *(line for line in found.lines()[:-2]),
+        *found.alerts(),
+    ]
+    (note,) = [n for n in told["steps"][-1]["notes"] if "calibrated" in n]
+    assert note.endswith("calibrated on 6 frames")
+
+
+def test_a_lower_floor_warns_of_nothing_and_searches_nothing(
+    command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(*PAPER, "--floor", 0) == 0
+
+    said = capsys.readouterr().out
+    assert "below the floor" not in said
+    assert "the noisiest output is bev" in said
+
+
+def test_the_search_calibrates_nothing_again(cameras: Path) -> None:
+    """One calibration of the frames, however many variants are tried."""
+    from me2e_compress.calibration.calibrator import Calibrator
+
+    options = me2e.CompressOptions(
+        scheme="full", rules="paper", module_map="map.toml", verify_frames=0
+    )
+    ran = list[int]()
+    whole = Calibrator.run
+
+    def counted(self: Calibrator, *given: Any) -> Any:
+        ran.append(1)
+        return whole(self, *given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Calibrator, "run", counted)
+        me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
+
+    assert len(ran) == 1
+
+
+def test_one_frame_is_calibrated_and_measured_on_and_that_is_said(
+    command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(cameras / "one", [camera_frame(0)])
+    once = [*PAPER[: PAPER.index("frames")], "one", *PAPER[PAPER.index("frames") + 1 :]]
+
+    assert command(*once) == 0
+
+    assert "calibrated on as well: there is no other" in capsys.readouterr().out
+
+
+def test_without_measuring_all_frames_are_calibrated_on(cameras: Path) -> None:
+    options = me2e.CompressOptions(
+        scheme="full", module_map="map.toml", verify_frames=0, measure_frames=0
+    )
+
+    found = me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
+
+    assert found.loss is not None
+    assert found.loss.fidelity is None
+    assert any("on 8 frames" in note for note in found.report.steps[-1].notes)
+
+
+def test_state_is_fed_forward_on_held_out_frames(tmp_path: Path) -> None:
+    """What a recurrent model answers second depends on what it answered first."""
+    model = conv_attention()
+    graph.save(model, tmp_path / "in.onnx")
+    generator = np.random.default_rng(0)
+    frames = [
+        {"image": generator.standard_normal((1, 3, 8, 8)).astype("f")} for _ in range(8)
+    ]
+    record(tmp_path / "frames", frames)
+    names = '[modules.{0}]\nrole = "{1}"\npatterns = ["{0}"]\n'
+    roles = ("backbone", "feature"), ("head", "prediction")
+    (tmp_path / "map.toml").write_text("".join(names.format(*each) for each in roles))
+    options = me2e.CompressOptions(
+        scheme="full",
+        rules="paper",
+        module_map=tmp_path / "map.toml",
+        verify_frames=0,
+    )
+    found = me2e.compress(
+        tmp_path / "in.onnx", tmp_path / "o.onnx", None, tmp_path / "frames", options
+    )
+    record(tmp_path / "last", frames[-2:])
+
+    again = me2e.compare(
+        tmp_path / "in.onnx", tmp_path / "o.onnx", tmp_path / "last"
+    ).fidelity
+
+    assert found.loss is not None
+    assert found.loss.fidelity is not None
+    measured = [each.sqnr_db for each in found.loss.fidelity.outputs]
+    assert measured == pytest.approx([each.sqnr_db for each in again.outputs], abs=0.2)
+
+
+NO_LAYER = """
+<ir_version: 9, opset_import: ["" : 17]>
+net (float[4,1,32] x, float[1,128,32] w, float[1,128,32] r) => (float[4,1,1,32] y) {
+    ["/head/LSTM"] y = LSTM<hidden_size=32>(x, w, r)
+}
+"""
+
+
+@pytest.fixture
+def lstm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A graph without a layer that anything makes int8; the current folder."""
+    weights = {name: np.ones((1, 128, 32)) for name in "wr"}
+    graph.save(net(NO_LAYER, weights), tmp_path / "in.onnx")
+    frame = {"x": np.ones((4, 1, 32), np.float32)}
+    record(tmp_path / "frames", [frame, frame])
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+EMPTY = ("compress", "in.onnx", "--scheme", "full", "--frames", "frames")
+
+
+def test_nothing_int8_is_an_error_and_writes_nothing(
+    command: Command, lstm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(lstm.iterdir())
+
+    assert command(*EMPTY, "-o", "out.onnx") == 1
+
+    said = capsys.readouterr().err
+    assert "made nothing int8" in said
+    assert "rule operator: LSTM is no weighted layer" in said
+    assert "--allow-empty" in said
+    assert sorted(lstm.iterdir()) == before
+
+
+def test_nothing_int8_is_said_first_and_last_where_it_is_allowed(
+    command: Command, lstm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(*EMPTY, "--allow-empty", "-o", "out.onnx") == 0
+
+    said = capsys.readouterr()
+    assert "made nothing int8" in said.err.splitlines()[0]
+    assert "made nothing int8" in said.out.splitlines()[-1]
+    assert (lstm / "out.onnx").is_file()
+
+
+def test_nothing_int8_is_an_error_in_python_too(lstm: Path) -> None:
+    options = me2e.CompressOptions(scheme="full")
+
+    with pytest.raises(PreconditionError, match="nothing is written"):
+        me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
+
+
+def test_an_exact_recipe_is_judged_by_its_verification(cameras: Path) -> None:
+    found = me2e.compress("in.onnx", "out.onnx", "exact", "frames")
+
+    assert found.loss is None
+    assert "every output is the same within" in found.lines()[0]
+    assert not found.alerts()
