@@ -92,7 +92,7 @@ def show(
         tables: instead of its own.
     """
     if as_json:
-        print_json(found.to_json())
+        print_json(found.document())
         return
     for each in found.tables() if tables is None else tables:
         print_table(each)
@@ -110,27 +110,66 @@ def say(line: str) -> None:
     console.print(escape(line), soft_wrap=True)
 
 
-def table(title: str, *columns: str, left: int = 1) -> Shown:
-    """Make a table whose first ``left`` columns are words and the rest numbers."""
-    made = Shown(title=Text(title, "bold"), title_justify="left")
-    made.show_edge = made.pad_edge = _is_wide()  # four characters that numbers can use
-    for at, name in enumerate(columns):
-        side: Literal["left", "right"] = "left" if at < left else "right"
-        whole = at == 0 and left == 1
-        made.add_column(Text(name), justify=side, overflow="fold", no_wrap=whole)
-    return made
-
-
 def print_table(content: Table) -> None:
-    """Print a table, with intervals if the terminal is wide enough, and its note."""
-    made = table(content.title, *content.columns, left=content.words)
-    for row in content.rows:
-        made.add_row(*(_text(cell, _is_wide()) for cell in row))
-    console.print(made)
+    """Print a table and its note; intervals too, if the terminal is wide enough.
+
+    Where its words do not fit side by side, a row is a few lines: no name is broken.
+    """
+    widths = _widths(content)
+    if widths is None:
+        _print_rows(content)
+    else:
+        console.print(_grid(content, widths))
     if content.note:
         console.print(Text(content.note, "dim"))
     if content.details and is_verbose():
-        console.print(Text(content.details, "dim"))
+        console.print(Text(content.details, "dim"), soft_wrap=True)
+
+
+def _widths(content: Table) -> list[int] | None:
+    """Share the terminal among columns so that no word breaks; None if it is narrow."""
+    count = len(content.columns)
+    columns = [
+        [name, *(_text(row[at], _is_wide()).plain for row in content.rows)]
+        for at, name in enumerate(content.columns)
+    ]
+    words = [[len(w) for text in texts for w in text.split()] for texts in columns]
+    lines = [[len(w) for text in texts for w in text.splitlines()] for texts in columns]
+    least, most = ([max(each, default=1) for each in of] for of in (words, lines))
+    frame = 3 * count + 1 if _is_wide() else 3 * (count - 1)
+    spare, wanted = console.width - frame - sum(least), sum(most) - sum(least)
+    if spare < 0:
+        return None
+    if wanted <= spare:
+        return most
+    return [
+        low + (high - low) * spare // wanted
+        for low, high in zip(least, most, strict=True)
+    ]
+
+
+def _grid(content: Table, widths: Sequence[int]) -> Shown:
+    """Make a table whose first columns are words and the rest numbers."""
+    made = Shown(title=Text(content.title, "bold"), title_justify="left")
+    made.show_edge = made.pad_edge = _is_wide()  # four characters that numbers can use
+    for at, (name, width) in enumerate(zip(content.columns, widths, strict=True)):
+        side: Literal["left", "right"] = "left" if at < content.words else "right"
+        made.add_column(Text(name), justify=side, overflow="fold", width=width)
+    for row in content.rows:
+        made.add_row(*(_text(cell, _is_wide()) for cell in row))
+    return made
+
+
+def _print_rows(content: Table) -> None:
+    """Print each row as its name and, indented, what is told of it."""
+    console.print(Text(content.title, "bold"))
+    alone = len(content.columns) == 2
+    for first, *others in content.rows:
+        console.print(Text(first.text), soft_wrap=True)
+        for name, cell in zip(content.columns[1:], others, strict=True):
+            if cell.text:
+                label = "" if alone or not name else f"{name}: "
+                console.print(Text(f"    {label}{cell.text}"), soft_wrap=True)
 
 
 def _is_wide() -> bool:

@@ -140,9 +140,9 @@ class CalibrateResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the ranges, and which are always zero; nothing of a shard."""
+        """Return the ranges, and which are always zero; of a shard which it is."""
         if self.ranges is None:
-            return None
+            return {"shard": self.shard, "frames": self.frames}
         return {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
 
 

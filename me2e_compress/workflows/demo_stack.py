@@ -85,7 +85,7 @@ class FilesResult(Result):
 
     def to_json(self) -> object:
         """Return a row a file."""
-        return self.records()
+        return {"files": self.records()}
 
 
 @dataclasses.dataclass(frozen=True)

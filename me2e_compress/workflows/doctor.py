@@ -67,7 +67,7 @@ class DoctorResult(Result):
 
     def to_json(self) -> object:
         """Return what was found."""
-        return self.records()
+        return {"checkups": self.records()}
 
 
 def doctor() -> DoctorResult:

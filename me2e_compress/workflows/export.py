@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from me2e_compress.errors import GraphError
+from me2e_compress.graph import file_bytes
 from me2e_compress.workflows.checks import check_count, check_output
+from me2e_compress.workflows.result import Result, Table, megabytes
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
 
@@ -34,6 +36,46 @@ class ExportOptions:
     def __post_init__(self) -> None:
         """Check the seed."""
         check_count("--seed", self.seed or 0)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ExportResult(Result):
+    """A stack that was written.
+
+    Attributes:
+        stack: its name.
+        output: the file.
+        opset: of the file.
+    """
+
+    stack: str
+    output: Path
+    opset: int
+
+    @property
+    def headline(self) -> str:
+        """File, stack, opset, size."""
+        size = megabytes(file_bytes(self.output))
+        return f"{self.output}: {self.stack}, opset {self.opset}, {size} MB"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return none: the line says it."""
+        return ()
+
+    def records(self) -> list[dict[str, object]]:
+        """Return one row: the file."""
+        return [
+            {
+                "stack": self.stack,
+                "output": self.output,
+                "opset": self.opset,
+                "bytes": file_bytes(self.output),
+            }
+        ]
+
+    def to_json(self) -> object:
+        """Return the file: stack, path, opset, bytes."""
+        return self.records()[0]
 
 
 def export_stack(

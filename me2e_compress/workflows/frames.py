@@ -9,6 +9,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.extras import need_closed_loop
 from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.result import Result, Table
 from me2e_compress.zoo.stacks import STACKS, find
 from me2e_compress.zoo.synthetic_frames import frames as synthetic
 
@@ -39,6 +40,46 @@ class FramesOptions:
     def __post_init__(self) -> None:
         """Check the seed."""
         check_count("--seed", self.seed)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class FramesResult(Result):
+    """A recording that was written.
+
+    Attributes:
+        stack: or model, whose frames they are.
+        output: the folder.
+        options: which frames.
+    """
+
+    stack: str
+    output: Path
+    options: FramesOptions
+
+    @property
+    def headline(self) -> str:
+        """Folder, frames, stack, seed."""
+        count, seed = self.options.count, self.options.seed
+        return f"{self.output}: {count} frames of {self.stack}, seed {seed}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return none: the line says it."""
+        return ()
+
+    def records(self) -> list[dict[str, object]]:
+        """Return one row: the recording."""
+        return [
+            {
+                "stack": self.stack,
+                "output": self.output,
+                "frames": self.options.count,
+                "seed": self.options.seed,
+            }
+        ]
+
+    def to_json(self) -> object:
+        """Return the recording: stack, folder, frames, seed."""
+        return self.records()[0]
 
 
 def record_frames(

@@ -9,7 +9,7 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import model_path
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.workflows.result import Result, Status, Table, table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +64,13 @@ class LintResult(Result):
         if self.build is not None and not self.build.passed:
             return f"{self.model}: {_why(self.build)}"
         return None
+
+    @property
+    def status(self) -> Status:
+        """Whether the target would take the graph."""
+        if self.refusal is not None:
+            return "refused"
+        return "warning" if self.findings else "ok"
 
     def check(self) -> None:
         """Go on if the target takes the graph.

@@ -14,6 +14,7 @@ from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import (
     INT8,
+    Decision,
     PlanDifference,
     QuantPlan,
     differences,
@@ -70,8 +71,12 @@ class PlanResult(Result):
         """Return the differences, and the headline."""
         return (*map(str, self.changes or ()), self.headline)
 
-    def tables(self, *, every: bool = False) -> tuple[Table, ...]:
-        """Return the decisions, and what was decided together.
+    def tables(self) -> tuple[Table, ...]:
+        """Return how many nodes of each module became what, by which rule."""
+        return () if self.changes is not None else self.plan.tables()
+
+    def details(self, *, every: bool = False) -> tuple[Table, ...]:
+        """Return a row a node, and what was decided together.
 
         Args:
             every: every node, not only what could be int8.
@@ -79,29 +84,21 @@ class PlanResult(Result):
         if self.changes is not None:
             return ()
         rows = [
-            (
-                each.module,
-                each.node,
-                each.op,
-                each.dtype,
-                each.rule,
-                each.reason + (f" ({each.borderline})" if each.borderline else ""),
-            )
+            (each.node or each.output, _what(each))
             for each in self.plan.decisions
             if every or each.op in WEIGHTED or each.dtype == INT8
         ]
-        columns = ("module", "node", "op", "", "rule", "why")
-        shown = table("Decisions", columns, rows, words=6)
-        return (shown, *self._groups()) if every else (shown,)
+        shown = table("Decisions", ("node", "what, by which rule, why"), rows, words=2)
+        return shown, *self._groups()
 
     def _groups(self) -> tuple[Table, ...]:
         rows = [
-            (group.kind, group.name, ", ".join(group.tensors), ", ".join(group.nodes))
+            (group.name, group.kind, ", ".join(group.tensors), ", ".join(group.nodes))
             for group in self.plan.groups
         ]
         if not rows:
             return ()
-        columns = ("kind", "name", "tensors", "read by")
+        columns = ("of", "kind", "tensors", "read by")
         return (table("Decided together", columns, rows, words=4),)
 
     def records(self) -> list[dict[str, object]]:
@@ -121,7 +118,9 @@ class PlanResult(Result):
 
     def to_json(self) -> object:
         """Return the plan; the differences, where another was given."""
-        return record(self.plan) if self.changes is None else self.changes
+        if self.changes is None:
+            return record(self.plan)
+        return {"differences": self.changes}
 
 
 def plan(
@@ -164,6 +163,14 @@ def plan(
         return PlanResult(found)
     other = _made(files[1], read[1], plain, options)
     return PlanResult(found, tuple(differences(other, found)))
+
+
+def _what(decision: Decision) -> str:
+    """Say in words what a node is, and what becomes of it."""
+    where = f" of {decision.module}" if decision.module else ""
+    close = f" ({decision.borderline})" if decision.borderline else ""
+    said = f"{decision.dtype} by {decision.rule}, {decision.reason}{close}"
+    return f"{decision.op}{where}: {said}"
 
 
 def _read(path: Path) -> QuantPlan | ir.Model:

@@ -1,8 +1,9 @@
 """Results that show themselves: on a terminal, in a notebook, to a program."""
 
 import abc
+import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from me2e_compress.display import (
     AT_LEAST,
@@ -20,14 +21,23 @@ from me2e_compress.errors import MissingPackageError
 __all__ = [
     "AT_LEAST",
     "MOST_ROWS",
+    "SCHEMA",
     "Cell",
     "Result",
+    "Status",
     "Table",
     "giga",
     "megabytes",
     "number",
     "table",
 ]
+
+
+SCHEMA = 1
+"""Version of the documents that ``--json`` prints; docs/json.md tells their keys. It
+grows where a key goes or changes its meaning, not where one is added."""
+
+Status = Literal["ok", "warning", "refused"]
 
 
 class Result(Displayed):
@@ -40,6 +50,25 @@ class Result(Displayed):
     @abc.abstractmethod
     def to_json(self) -> object:
         """Return everything, as JSON data."""
+
+    @property
+    def status(self) -> Status:
+        """What a program acts on: ``refused`` where the command's exit code is 1."""
+        return "warning" if self.alerts() else "ok"
+
+    def document(self) -> dict[str, object]:
+        """Return what ``--json`` prints: version, status, the lines said, everything.
+
+        Values may be dataclasses, paths and numbers that are not finite, which JSON
+        knows as objects, strings and null.
+        """
+        found = self.to_json()
+        if dataclasses.is_dataclass(found) and not isinstance(found, type):
+            found = dataclasses.asdict(found)
+        if not isinstance(found, Mapping):
+            raise TypeError(f"{type(self).__name__}.to_json: not an object")
+        said = [*(self.lines() or (self.headline,)), *self.alerts()]
+        return {"schema": SCHEMA, "status": self.status, "verdict": said, **found}
 
     def to_pandas(self) -> Any:
         """Build a ``pandas.DataFrame`` of the records.

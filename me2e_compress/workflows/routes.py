@@ -10,7 +10,7 @@ from me2e_compress.simulator.routes import load_routes, pick_routes, save_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
 from me2e_compress.workflows.checks import check_count, check_output
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.workflows.result import Result, Status, Table, table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,6 +179,11 @@ class ExaminationResult(Result):
         """Return how many were examined, and why some are refused."""
         why = {one.route.id: one.refusal for one in self.refused}
         return {"examined": len(self.verdicts), "refused": why}
+
+    @property
+    def status(self) -> Status:
+        """Whether all are admitted."""
+        return "refused" if self.refused else "ok"
 
     def check(self) -> None:
         """Go on if all are admitted.

@@ -46,9 +46,9 @@ class ScoreResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the scores of a folder; a list of them for several."""
+        """Return the scores of every folder."""
         found = [{"results": name, **s.to_json()} for name, s in self.scores.items()]
-        return found[0] if len(found) == 1 else found
+        return {"folders": found}
 
 
 def score(

@@ -104,7 +104,7 @@ class SearchResult(Result):
 
     def to_json(self) -> object:
         """Return what was tried."""
-        return self.tried
+        return {"unit": self.unit, "tried": self.tried}
 
 
 def search(

@@ -68,10 +68,11 @@ class TrainResult(Result):
 
     def to_json(self) -> object:
         """Return driver, log and scores of every round."""
-        return [
+        rounds = [
             {"driver": each.driver, "log": each.log, "scores": each.scores.to_json()}
             for each in self.rounds
         ]
+        return {"rounds": rounds}
 
 
 def train(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from tests.cli.conftest import Command
+from tests.cli.conftest import Command, strict
+from tests.docs.documents import faults
 from tests.frames import record
 from tests.nets import conv_attention, image
 
@@ -127,6 +128,21 @@ def test_fewer_frames_are_drawn_by_seed(command: Command, folder: Path) -> None:
     assert any(each != found[0] for each in found[2:])
 
 
+@pytest.mark.parametrize("shard", [(), ("--shard", "1/2")])
+def test_programs_get_json(
+    command: Command,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    shard: tuple[str, ...],
+) -> None:
+    words = ("calibrate", folder / "dense.onnx", folder / "scenes", *shard)
+    place = ("--map", folder / "map.toml", "-o", folder / "r.npz", "--json")
+
+    assert command(*words, *place) == 0
+
+    assert faults("calibrate", strict(capsys.readouterr().out)) == []
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -137,7 +153,6 @@ def test_fewer_frames_are_drawn_by_seed(command: Command, folder: Path) -> None:
         (["--merge", "nowhere"], "no such statistics"),
         (["scenes", "--shard", "half"], "write 2/4"),
         (["scenes", "--shard", "4/4"], "3 scenes cannot be shared by 4"),
-        (["scenes", "--shard", "1/2", "--json"], "a shard has no ranges yet"),
         (["scenes", "--shard", "1/2", "--tensorrt-cache", "c"], "no ranges yet"),
         (["scenes", "--shard", "1/2", "--onnxruntime-table", "t"], "no ranges yet"),
         (

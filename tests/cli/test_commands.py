@@ -9,6 +9,7 @@ from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.runtime.session import Session
 from tests.cli.conftest import Command, strict
+from tests.docs.documents import faults
 
 NAMES = sorted(COMMANDS)
 
@@ -43,6 +44,7 @@ def test_inspect_counts_by_module(
     words = ("inspect", files / "in.onnx", "--map", files / "map.toml", "--json")
     assert command(*words) == 0
     found = json.loads(capsys.readouterr().out)
+    assert faults("inspect", found) == []
     counts = {item["module"]: item["nodes"] for item in found["modules"]}
     assert counts == {"backbone": 1, "occ": 1, "planner": 1}
     assert found["inputs"] == [{"name": "camera", "type": "FLOAT", "shape": "[1,4]"}]
@@ -99,6 +101,7 @@ def test_a_graph_compared_with_itself_is_equal(
     words = (files / "in.onnx", files / "in.onnx", files / "frames", "--json")
     assert command("compare", *words) == 0
     found = strict(capsys.readouterr().out)
+    assert faults("compare", found) == []
     assert [item["error"] for item in found["outputs"]] == [0.0]
     assert [item["sqnr_db"] for item in found["outputs"]] == [None]
     assert found["frames"] == 2
@@ -127,7 +130,7 @@ def test_doctor_names_the_versions(
     command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command("doctor", "--json") == 0
-    found = {
-        item["what"]: item["found"] for item in json.loads(capsys.readouterr().out)
-    }
+    document = json.loads(capsys.readouterr().out)
+    assert faults("doctor", document) == []
+    found = {item["what"]: item["found"] for item in document["checkups"]}
     assert found["onnxruntime"]

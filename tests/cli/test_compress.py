@@ -6,6 +6,7 @@ import pytest
 
 from me2e_compress import graph
 from tests.cli.conftest import Command
+from tests.docs.documents import faults
 
 ABLATE = "ablate-modules{drop=[occ]}"
 
@@ -49,6 +50,7 @@ def test_int8_by_scheme(
     output = ("--map", dense / "map.toml", "-o", dense / "out.onnx", "--json")
     assert command("compress", dense / "dense.onnx", *options, *output) == 0
     record = json.loads(capsys.readouterr().out)
+    assert faults("compress", record) == []
     assert record["steps"][-1]["text"] == 'quantize-int8{scheme="prediction"}'
     weights = graph.load(dense / "out.onnx").graph.initializers.values()
     assert ir.DataType.INT8 in [value.dtype for value in weights]

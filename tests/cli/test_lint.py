@@ -6,6 +6,7 @@ import pytest
 
 from me2e_compress import graph
 from tests.cli.conftest import Command
+from tests.docs.documents import faults
 
 TWIST = (
     '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>'
@@ -46,6 +47,8 @@ def test_findings_for_programs(
     assert command("lint", twisted, "--json") == 1
 
     found = json.loads(capsys.readouterr().out)
+    assert faults("lint", found) == []
+    assert found["status"] == "refused"
     assert [each["rule"] for each in found["findings"]] == ["plugin"] * 3
     assert found["tensorrt_rtx"] is None
 

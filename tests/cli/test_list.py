@@ -3,9 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.cli.commands.list import KINDS
-from me2e_compress.registry import describe
+from me2e_compress import modules, recipe
+from me2e_compress.workflows.listing import KINDS, REGISTRIES
 from tests.cli.conftest import Command
+from tests.docs.documents import faults
 from tests.installed import install
 
 
@@ -15,16 +16,20 @@ def test_every_kind_is_listed_with_its_options(
     assert command("list", "--json") == 0
 
     found = json.loads(capsys.readouterr().out)
-    assert list(found) == list(KINDS)
-    for kind, registry in KINDS.items():
+    assert faults("list", found) == []
+    assert set(found) >= set(KINDS)
+    for kind, registry in REGISTRIES.items():
         assert [entry["name"] for entry in found[kind]] == list(registry.names())
+    assert [entry["name"] for entry in found["recipes"]] == recipe.shipped()
+    maps = [entry["name"] for entry in found["module-maps"]]
+    assert maps == [*modules.presets(), "whole"]
     blind = next(each for each in found["policies"] if each["name"] == "blind")
     assert [option["name"] for option in blind["options"]] == ["speed_mps"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_ours_can_all_be_used_and_say_what_they_are(kind: str) -> None:
-    for entry in describe(KINDS[kind]):
+    for entry in KINDS[kind]():
         assert not entry.error
         assert entry.doc
         for option in entry.options:

@@ -8,6 +8,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
 from tests.cli.conftest import Command, strict
+from tests.docs.documents import faults
 from tests.nets import net
 
 
@@ -39,7 +40,9 @@ def test_the_plan_that_is_shown_is_the_one_that_is_made(
     assert command("plan", dense / "dense.onnx", *words) == 0
 
     shown = json.loads(capsys.readouterr().out)
-    assert shown == json.loads((dense / "out.plan.json").read_text())
+    saved = json.loads((dense / "out.plan.json").read_text())
+    assert {key: shown[key] for key in saved} == saved
+    assert faults("plan", shown) == []
 
 
 def test_plans_are_compared(
@@ -56,7 +59,9 @@ def test_plans_are_compared(
     assert "/plan_head/MatMul: int8 (layer) -> float (small-product)" in said
     assert "1 differences" in said
     assert command("plan", dense / "dense.onnx", *words, *more, "--json") == 0
-    (found,) = strict(capsys.readouterr().out)
+    document = strict(capsys.readouterr().out)
+    assert faults("plan", document) == []
+    (found,) = document["differences"]
     assert [found[side]["rule"] for side in ("old", "new")] == [
         "layer",
         "small-product",

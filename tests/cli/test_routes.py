@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 from me2e_compress.cli.commands.routes import routes
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.routes import load_routes, save_routes
+from tests.docs.documents import faults
 from tests.simulator.world.driving import route_of
 
 STOP = "VanillaNonSignalizedTurnEncounterStopsign"
@@ -29,6 +30,7 @@ def test_a_fresh_set_is_made_admitted_and_reported(tmp_path: Path) -> None:
     run("-o", other, *asked)
 
     report = json.loads(out)
+    assert faults("routes", report) == []
     assert code == 0
     assert report["admitted"] == 2
     assert report["tried"] == 2 + len(report["scenarios"][0]["refusals"])
@@ -56,7 +58,10 @@ def test_a_route_that_is_too_easy_is_named(tmp_path: Path) -> None:
     assert code != 0
     assert isinstance(error, EvaluationError)
     assert "test: the blind driver commits no infraction at 4 m/s" in str(error)
-    assert list(json.loads(out)["refused"]) == ["test"]
+    found = json.loads(out)
+    assert faults("routes", found) == []
+    assert found["status"] == "refused"
+    assert list(found["refused"]) == ["test"]
 
 
 def test_an_unknown_type_is_named(tmp_path: Path) -> None:

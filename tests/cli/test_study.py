@@ -11,6 +11,7 @@ from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import Study
 from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import Command, write_frames
+from tests.docs.documents import faults
 from tests.evaluators.highway.drivers import CROSSING, straight_on
 from tests.study.conftest import Here
 
@@ -78,7 +79,9 @@ def test_json_is_the_file(
     assert command("study", toml, "-o", out, "--json") == 0
 
     shown = json.loads(capsys.readouterr().out)
-    assert shown == json.loads((out / "study.json").read_text())
+    saved = json.loads((out / "study.json").read_text())
+    assert {key: shown[key] for key in saved} == saved
+    assert faults("study", shown) == []
     assert [each["scheme"] for each in shown["drives"]] == ["float", "exact"]
 
 

@@ -7,7 +7,6 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
-from me2e_compress.errors import FramesError
 from me2e_compress.workflows import calibrate as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -46,8 +45,6 @@ def calibrate(
     A run that was killed goes on from OUTPUT.checkpoint; compress takes the
     ranges by --ranges.
     """
-    if shard is not None and as_json:
-        raise FramesError("a shard has no ranges yet: leave --json to --merge")
     options = workflow.CalibrateOptions(
         recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,
         shard=shard, merge=tuple(merge or ()), imported=imported, threads=threads,

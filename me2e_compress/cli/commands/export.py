@@ -5,10 +5,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from me2e_compress.cli.console import listening, say
-from me2e_compress.graph import file_bytes
+from me2e_compress.cli import arguments as given
+from me2e_compress.cli.console import listening, show
 from me2e_compress.workflows import export as workflow
-from me2e_compress.workflows.result import megabytes
 
 Heads = Annotated[
     Literal["nuscenes", "bench2drive"] | None,
@@ -25,10 +24,11 @@ def export(
     opset: Annotated[int, typer.Option(help="ONNX opset of the file")] = workflow.OPSET,
     heads: Heads = None,
     seed: Seed = None,
+    as_json: given.Json = False,
 ) -> None:
     """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver."""
     options = workflow.ExportOptions(opset, heads, seed)
     with listening() as listener:
         listener.on_progress(f"exporting {stack}", 0, 1, "")
         workflow.export_stack(stack, output, options)
-    say(f"{output}: {stack}, opset {opset}, {megabytes(file_bytes(output))} MB")
+    show(workflow.ExportResult(stack, output, opset), as_json)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from me2e_compress.cli import arguments as given
-from me2e_compress.cli.console import listening, say
+from me2e_compress.cli.console import listening, show
 from me2e_compress.workflows import frames as workflow
 
 Length = Annotated[
@@ -24,6 +24,7 @@ def frames(
     count: Annotated[int, typer.Option("-n", "--count", help="how many")] = 256,
     scene_length: Length = None,
     seed: given.Seed = 0,
+    as_json: given.Json = False,
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
@@ -33,4 +34,4 @@ def frames(
     options = workflow.FramesOptions(count, seed, scene_length)
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)
-    say(f"{output}: {count} frames of {stack}, seed {seed}")
+    show(workflow.FramesResult(stack, output, options), as_json)

@@ -15,9 +15,8 @@ Against = Annotated[
     Path | None, typer.Option(help="a plan or model: compare; float: no overrides")
 ]
 Output = Annotated[Path | None, typer.Option("-o", "--output", help="save it as JSON")]
-Every = Annotated[
-    bool, typer.Option("--all", help="every node, not only what could be int8")
-]
+Nodes = Annotated[bool, typer.Option("--nodes", help="a row a node that could be int8")]
+Every = Annotated[bool, typer.Option("--all", help="a row a node, every node")]
 
 
 def plan(
@@ -29,6 +28,7 @@ def plan(
     set_dim: given.SetDim = None,
     against: Against = None,
     output: Output = None,
+    nodes: Nodes = False,
     every: Every = False,
     as_json: given.Json = False,
 ) -> None:
@@ -37,4 +37,5 @@ def plan(
         scheme, rules, overrides, module_map, sizes(set_dim or ())
     )
     found = workflow.plan(model, output, against, options)
-    show(found, as_json, found.tables(every=every))
+    listed = found.details(every=every) if nodes or every else ()
+    show(found, as_json, (*found.tables(), *listed))

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 
 Stack = Annotated[Literal["highway"], typer.Argument(help="highway")]
@@ -21,6 +22,7 @@ def train(
     output: Output,
     workers: Annotated[int, typer.Option(min=1, help="processes")] = 4,
     small: Small = False,
+    as_json: given.Json = False,
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
     # takes torch seconds to import
@@ -29,4 +31,4 @@ def train(
     with listening(stages=True) as listener:
         options = workflow.TrainOptions(workers, small)
         found = workflow.train(output, options, listener)
-    show(found)
+    show(found, as_json)

@@ -1,0 +1,167 @@
+"""Everything that can be named: ours, and what other packages add by entry point."""
+
+import dataclasses
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import resources
+from importlib.resources.abc import Traversable
+from typing import Any
+
+from me2e_compress import modules, recipe
+from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.driving.latency import LATENCY_SOURCES
+from me2e_compress.driving.policies import POLICIES
+from me2e_compress.errors import RecipeError
+from me2e_compress.evaluators import EVALUATORS
+from me2e_compress.passes import PASSES
+from me2e_compress.quantization.rules import RULE_SETS, RULES
+from me2e_compress.registry import Entry, Option, Registry, describe
+from me2e_compress.targets import TARGETS
+from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.zoo.stacks import STACKS
+
+_OURS = "me2e-compress"
+_COMMENT = re.compile(r"(?:#.*\n)+")
+_SENTENCE = re.compile(r"(.+?\.)(?:\s|$)")
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ListResult(Result):
+    """Names by kind, with what they are.
+
+    Attributes:
+        kinds: entries, by the name of their kind.
+        closely: whether tables tell what each option means.
+    """
+
+    kinds: Mapping[str, tuple[Entry, ...]]
+    closely: bool = False
+
+    @property
+    def headline(self) -> str:
+        """Count the names by kind."""
+        return ", ".join(f"{len(found)} {kind}" for kind, found in self.kinds.items())
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the tables say it."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a table a kind: its names, what they are, their options."""
+        return tuple(
+            table(
+                kind,
+                ("name", "what it is"),
+                [(each.name, _words(each, self.closely)) for each in found],
+                _added_to(kind),
+                words=2,
+            )
+            for kind, found in self.kinds.items()
+        )
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a name."""
+        return [
+            {"kind": kind, "name": each.name, "source": each.source, "doc": each.doc}
+            for kind, found in self.kinds.items()
+            for each in found
+        ]
+
+    def to_json(self) -> object:
+        """Return the entries, by kind."""
+        return self.kinds
+
+
+def _registered(kind: str) -> tuple[Entry, ...]:
+    return describe(REGISTRIES[kind])
+
+
+def _recipes() -> tuple[Entry, ...]:
+    folder = resources.files("me2e_compress") / "recipes"
+    return tuple(_file(folder / f"{name}.toml") for name in recipe.shipped())
+
+
+def _module_maps() -> tuple[Entry, ...]:
+    """Describe the presets: a map by its modules."""
+    maps = [modules.ModuleMap.load(name) for name in (*modules.presets(), "whole")]
+    return tuple(Entry(each.name, _OURS, ", ".join(each.names())) for each in maps)
+
+
+def _stacks() -> tuple[Entry, ...]:
+    trained, drawn = "trained; ships with the package", "weights drawn from a seed"
+    return tuple(
+        Entry(name, _OURS, trained if each.trained else drawn)
+        for name, each in STACKS.items()
+    )
+
+
+def _file(path: Traversable) -> Entry:
+    """Describe a TOML file by the first sentence of the comment at its head."""
+    found = _COMMENT.match(path.read_text(encoding="utf-8"))
+    text = " ".join((found.group() if found else "").replace("#", " ").split())
+    sentence = _SENTENCE.match(text)
+    doc = sentence[1] if sentence else text
+    return Entry(path.name.removesuffix(".toml"), _OURS, doc)
+
+
+REGISTRIES: Mapping[str, Registry[Any]] = {
+    "passes": PASSES,
+    "rules": RULES,
+    "rule-sets": RULE_SETS,
+    "observers": OBSERVERS,
+    "targets": TARGETS,
+    "policies": POLICIES,
+    "latency-sources": LATENCY_SOURCES,
+    "evaluators": EVALUATORS,
+}
+"""To which other packages add."""
+KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
+    **{kind: partial(_registered, kind) for kind in REGISTRIES},
+    "recipes": _recipes,
+    "module-maps": _module_maps,
+    "stacks": _stacks,
+}
+"""What finds the entries of a kind."""
+
+
+def list_entries(kind: str | None = None) -> ListResult:
+    """List what can be named, of one kind or of all.
+
+    Args:
+        kind: one of `KINDS`; its tables tell what every option means. None lists all.
+
+    Raises:
+        RecipeError: no such kind.
+    """
+    if kind is not None and kind not in KINDS:
+        raise RecipeError(f"no kind {kind!r}; there are {', '.join(KINDS)}")
+    chosen = KINDS if kind is None else {kind: KINDS[kind]}
+    return ListResult({name: find() for name, find in chosen.items()}, kind is not None)
+
+
+def _added_to(kind: str) -> str:
+    found = REGISTRIES.get(kind)
+    return "" if found is None else f"others add theirs by entry point: {found.group}"
+
+
+def _words(entry: Entry, closely: bool) -> str:
+    if entry.error:
+        return entry.error
+    theirs = "" if entry.source == _OURS else f" ({entry.source})"
+    said = [entry.doc + theirs]
+    if closely:
+        said += [f"  {_signature(each)} {each.doc}" for each in entry.options]
+    elif entry.options:
+        said.append(f"  {', '.join(map(_assignment, entry.options))}")
+    return "\n".join(said).replace("`", "")
+
+
+def _assignment(option: Option) -> str:
+    """Write an option as in text; one that must be given without a value."""
+    return option.name if option.default is None else f"{option.name}={option.default}"
+
+
+def _signature(option: Option) -> str:
+    default = "" if option.default is None else f" = {option.default}"
+    return f"{option.name}: {option.type}{default}"

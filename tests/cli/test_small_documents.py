@@ -1,0 +1,44 @@
+"""What ``--json`` prints of files that are written."""
+
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.cli.console import show
+from me2e_compress.metrics.scores import score
+from me2e_compress.training.course import RoundResult
+from me2e_compress.workflows.frames import FramesOptions, FramesResult
+from me2e_compress.workflows.train import TrainResult
+from tests.cli.conftest import Command, strict
+from tests.docs.documents import faults
+from tests.metrics.drives import drive
+
+
+def test_an_exported_stack(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "m.onnx"
+
+    assert command("export", "highway", "-o", output, "--json") == 0
+
+    found = strict(capsys.readouterr().out)
+    assert faults("export", found) == []
+    assert found["bytes"] == output.stat().st_size
+
+
+def test_recorded_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    show(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)), as_json=True)
+
+    found = strict(capsys.readouterr().out)
+    assert faults("frames", found) == []
+    assert found["frames"] == 3
+
+
+def test_a_course_of_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = RoundResult(tmp_path / "m.onnx", score((drive(),)), tmp_path / "log")
+
+    show(TrainResult((made,)), as_json=True)
+
+    assert faults("train", strict(capsys.readouterr().out)) == []
