@@ -12,6 +12,7 @@ import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
 from me2e_compress.errors import GraphError
+from me2e_compress.graph import structure
 from me2e_compress.graph.external import data_file, external_tensors, settle
 
 INLINE_LIMIT_BYTES = 1_900_000_000
@@ -39,16 +40,36 @@ def load(path: str | Path) -> ir.Model:
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     try:
-        model = ir.load(path, format="protobuf")
+        proto = onnx.load(path, format="protobuf", load_external_data=False)
     except DecodeError as error:
         raise GraphError(f"{path}: not an ONNX file, or cut short ({error})") from error
-    except (ValueError, TypeError, KeyError) as error:
-        raise GraphError(f"{path}: not a valid ONNX graph ({error})") from error
-    if not model.opset_imports or not model.graph.outputs:
-        raise GraphError(f"{path}: not an ONNX model (no opset, no outputs)")
+    try:
+        model = _built(proto)
+    except GraphError as error:
+        raise GraphError(f"{path}: {error}") from error
+    ir.external_data.set_base_dir(model.graph, path.parent)
     settle(model, path)
     common.RemoveInitializersFromInputsPass()(model)
     model.ir_version = max(model.ir_version, _PLAIN_INITIALIZERS_SINCE_IR)
+    return model
+
+
+def _built(proto: onnx.ModelProto) -> ir.Model:
+    """Check a message and build the graph that it holds, its nodes in order."""
+    in_order = structure.check(proto)
+    proto.graph.name = proto.graph.name or "graph"  # ONNX's checker wants one
+    try:
+        model = ir.serde.deserialize_model(proto)
+        if not in_order:
+            model.graph.sort()
+            for function in model.functions.values():
+                function.graph.sort()
+    except (ir.serde.SerdeError, ValueError) as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        line = " ".join(str(cause).split())[:200]
+        raise GraphError(f"not a valid ONNX graph ({line})") from error
     return model
 
 

@@ -1,7 +1,7 @@
 """When a pass fails: the smallest piece of the graph on which it still fails."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import onnx_ir as ir
@@ -48,8 +48,8 @@ def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
     inputs = {
         value.name: value
         for node in nodes
-        for value in node.inputs
-        if value is not None and id(value) not in made and not value.is_initializer()
+        for value in _read_by(node)
+        if id(value) not in made and not value.is_initializer()
     }
     outputs = {
         value.name: value
@@ -70,6 +70,17 @@ def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
         functions=[function.clone() for function in model.functions.values()],
         metadata_props={"me2e.reproducer": "part of a graph"},
     )
+
+
+def _read_by(node: ir.Node) -> Iterator[ir.Value]:
+    """List what a node reads of its graph, by the graphs inside it too."""
+    yield from filter(None, node.inputs)
+    for attribute in node.attributes.values():
+        if attribute.type == ir.AttributeType.GRAPH:
+            for body in graph.graphs_of(attribute.as_graph()):
+                for inner in body:
+                    reads = (value for value in inner.inputs if value is not None)
+                    yield from (value for value in reads if value.graph is node.graph)
 
 
 def _leaves(value: ir.Value, inside: set[ir.Node]) -> bool:

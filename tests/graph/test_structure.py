@@ -1,0 +1,92 @@
+"""What is refused where a graph is read, each fault in one line that names it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import onnx
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.errors import GraphError
+from tests.fuzz.faults import FAULTS
+from tests.fuzz.graphs import branch_graph, seed_graph
+
+REFUSED = {
+    "cycle": "not a valid ONNX graph .*cycle",
+    "self-loop": "cycle",
+    "output-twice": "'a' is made twice: by node '/backbone/Reshape' and by node",
+    "input-twice": "graph: input 'image' is there twice",
+    "initializer-twice": "initializer 'tokens' is there twice",
+    "input-is-made": "'image' is made twice: .* by an input or initializer",
+    "no-initializer-name": "initializer without a name",
+    "no-op-type": "has no operator or no output",
+    "unknown-input": "node '/backbone/Relu' reads 'nowhere', which nothing makes",
+    "unknown-output": "output 'nowhere': nothing makes it",
+    "sparse": "initializer 's' is sparse",
+    "function-recursive": "function twice calls itself",
+    "functions-in-a-circle": "calls itself, at once or over others",
+    "function-twice": "two of its functions have one name",
+    "opset-negative": "opset -5 of ai.onnx",
+    "ir-0": "IR version 0",
+    "dims-negative": r"initializer 'w' has shape \[-4, 3, 3, 3\]",
+    "dims-huge": "too many elements",
+    "raw-short": "initializer 'w' has 3 bytes, its shape says 432",
+    "two-kinds-of-data": "initializer 'w' holds its data twice",
+    "type-99": "initializer 'w' is of element type 99, which is none",
+    "input-untyped": "'image' is no tensor: its type is missing",
+    "axis-float": "attribute axis is of type FLOAT, it must be INT",
+    "perm-wrong": r"perm \[0, 7, -9\] is none",
+    "attribute-refers": "refers to one of a function, and stands in none",
+    "too-many-inputs": "inputs, at most 3 may be",
+    "no-inputs-of-a-node": "has 0 inputs, at least 2 are needed",
+    "input-left-out": "input X is left out",
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_fault_is_named_where_the_graph_is_read(tmp_path: Path, fault: str) -> None:
+    model = seed_graph()
+    FAULTS[fault](model)
+    (tmp_path / "m.onnx").write_bytes(model.SerializeToString())
+
+    with pytest.raises(GraphError, match=REFUSED[fault]) as caught:
+        graph.load(tmp_path / "m.onnx")
+    assert str(caught.value).startswith(f"{tmp_path}/m.onnx: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", [seed_graph, branch_graph])
+def test_nodes_in_no_order_are_put_in_order(
+    tmp_path: Path, seed: Callable[[], onnx.ModelProto]
+) -> None:
+    model = seed()
+    onnx.save(model, tmp_path / "in-order.onnx")
+    nodes = list(model.graph.node)[::-1]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    onnx.save(model, tmp_path / "reversed.onnx")
+
+    found = graph.load(tmp_path / "reversed.onnx")
+
+    onnx.checker.check_model(ir.to_proto(found))
+    assert {node.name for node in found.graph} == {node.name for node in nodes}
+
+
+def test_a_size_below_zero_is_an_open_one(tmp_path: Path) -> None:
+    model = seed_graph()
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = -1
+    onnx.save(model, tmp_path / "m.onnx")
+
+    loaded = graph.load(tmp_path / "m.onnx")
+
+    assert graph.open_shape(loaded.graph.inputs[0]) == (None, 3, 4, 4)
+
+
+def test_a_plugin_takes_anything(tmp_path: Path) -> None:
+    model = seed_graph()
+    model.graph.node[1].op_type = "RotateTRT2"
+    model.graph.node[1].attribute.add(name="interpolation", type=2, i=1)
+    onnx.save(model, tmp_path / "m.onnx")
+
+    assert graph.node_count(graph.load(tmp_path / "m.onnx")) == 10
