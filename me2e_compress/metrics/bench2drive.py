@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import savgol_filter
 
 from me2e_compress.metrics.efficiency import CHECKPOINTS, OUTLIER_PERCENT, PERCENT
 from me2e_compress.metrics.episode import EgoFrame, Episode
@@ -131,6 +130,8 @@ def _norm(frame: EgoFrame) -> float:
 
 
 def _smoothed(values: Floats, derivative: int = 0) -> Floats:
+    from scipy.signal import savgol_filter  # takes half a second to import
+
     window = min(7, len(values))
     smoothed: Any = savgol_filter(values, window, 2, deriv=derivative, delta=DELTA_S)
     return np.asarray(smoothed, np.float64)

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import savgol_filter
 
 from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure
@@ -84,6 +83,8 @@ def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.b
 
 
 def _filtered(values: Floats, derivative: int = 0) -> Floats:
+    from scipy.signal import savgol_filter  # takes half a second to import
+
     smoothed: Any = savgol_filter(
         values, WINDOW, ORDER, deriv=derivative, delta=FRAME_US / 1e6
     )

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import binomtest, bootstrap
 
 CONFIDENCE = 0.95
 RESAMPLES = 4_000
@@ -55,6 +54,8 @@ def resampled_interval(
         routes: How many routes there are; fewer than two give no interval.
         seed: The same seed gives the same interval.
     """
+    from scipy.stats import bootstrap  # takes a second to import
+
     if routes < 2:
         return None, None
     interval = bootstrap(
@@ -74,6 +75,8 @@ def resampled_interval(
 
 def binomial_interval(successes: int, n: int) -> Interval:
     """Return the exact (Clopper-Pearson) interval of a rate, as a share."""
+    from scipy.stats import binomtest  # takes a second to import
+
     if n == 0:
         return None, None
     interval = binomtest(successes, n).proportion_ci(CONFIDENCE, method="exact")

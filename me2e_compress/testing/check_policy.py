@@ -47,8 +47,9 @@ def check_policy(driver: Driver) -> tuple[Plan, ...]:
 def _plans(driver: Driver, policy: Policy) -> tuple[Plan, ...]:
     """Drive the beginning of the route."""
     # the evaluator needs an extra that the other checks do not need
+    from me2e_compress.evaluators.highway.conditions import Conditions
     from me2e_compress.evaluators.highway.drivers import image_size_of
-    from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
+    from me2e_compress.evaluators.highway.runner import Listeners, drive
     from me2e_compress.simulator.routes import load_routes, pick_routes
     from me2e_compress.simulator.world import World
 

@@ -6,11 +6,11 @@ from typing import Any
 
 from me2e_compress.driving.latency import LatencySource
 from me2e_compress.errors import TrainingError
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.generate import generate
-from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score

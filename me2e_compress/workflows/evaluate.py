@@ -6,6 +6,7 @@ from pathlib import Path
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.evaluation_options import (
     engine_of,
@@ -13,13 +14,11 @@ from me2e_compress.evaluators.highway.evaluation_options import (
     weather_of,
 )
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
-from me2e_compress.evaluators.highway.render import render
 from me2e_compress.evaluators.highway.results import MANIFEST
-from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
-from me2e_compress.simulator.routes import pick_routes
+from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number
@@ -150,8 +149,15 @@ def evaluate(
         listener.on_warning,
     )
     scores = score_episodes(tuple(evaluator.episodes()), set_size)
-    pictures = [file for route in shown for file in render(job, route, output)]
-    return EvaluateResult(policy, output, scores, tuple(pictures))
+    return EvaluateResult(policy, output, scores, _pictures(job, shown, output))
+
+
+def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, ...]:
+    if not routes:
+        return ()
+    from me2e_compress.evaluators.highway.render import render  # imports highway-env
+
+    return tuple(file for route in routes for file in render(job, route, folder))
 
 
 def _job(policy: str, options: EvaluateOptions) -> Job:

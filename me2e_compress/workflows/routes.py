@@ -5,9 +5,9 @@ from pathlib import Path
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.admission import Admission, examine
-from me2e_compress.evaluators.highway.generate import VARIANTS, ScenarioRoutes, generate
+from me2e_compress.evaluators.highway.generate import ScenarioRoutes, generate
 from me2e_compress.simulator.routes import load_routes, pick_routes, save_routes
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
 from me2e_compress.workflows.checks import check_count, check_output
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, table

@@ -221,11 +221,11 @@ def _on_routes(
         EvaluationError: no such route, or the model cannot drive.
     """
     need_closed_loop("what driving a variant needs")
+    from me2e_compress.evaluators.highway.conditions import Conditions
     from me2e_compress.evaluators.highway.drivers import image_size_of
     from me2e_compress.evaluators.highway.engine import LocalEngine
     from me2e_compress.evaluators.highway.evaluation_options import routes_named
     from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
-    from me2e_compress.evaluators.highway.runner import Conditions
     from me2e_compress.evaluators.highway.worker import Job
     from me2e_compress.metrics.scores import score
     from me2e_compress.workflows.evaluate import driver_of

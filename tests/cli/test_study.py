@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.cli.commands import study
+import me2e_compress.study
+from me2e_compress.cli.commands.study import study
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import evaluation_options
 from me2e_compress.simulator.routes import save_routes
@@ -44,7 +45,7 @@ latency = "trace"
 def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     """Drive in this process."""
     engine = Here()
-    monkeypatch.setattr(study, "engine_of", lambda *words: engine)
+    monkeypatch.setattr(evaluation_options, "engine_of", lambda *words: engine)
     return engine
 
 
@@ -132,9 +133,9 @@ def test_a_model_that_ships_is_not_one_where_you_are(
         asked.append(found)
         raise StudyError("seen")
 
-    monkeypatch.setattr(study, "run_study", noted)
+    monkeypatch.setattr(me2e_compress.study, "run_study", noted)
     with pytest.raises(StudyError, match="seen"):
-        study.study(toml, tmp_path / "out")
+        study(toml, tmp_path / "out")
 
     assert asked[0].variants[0].policy == str(shipped("highway"))
 
@@ -146,7 +147,7 @@ def test_an_engine_nobody_knows(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(study, "engine_of", evaluation_options.engine_of)
+    monkeypatch.undo()
 
     assert command("study", toml, "-o", tmp_path / "out", "--engine", "cloud") == 1
     assert "engine 'cloud'" in capsys.readouterr().err

@@ -10,10 +10,9 @@ from me2e_compress.errors import PassError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.modules import ModuleMap
-from me2e_compress.passes import Context
+from me2e_compress.passes import Context, fold_with_onnxsim
 from me2e_compress.passes.fold_with_onnxsim import (
     FoldWithOnnxsim,
-    onnxsim_main,
 )
 
 CONTEXT = Context(
@@ -91,7 +90,7 @@ def test_weights_that_stay_are_shared_with_the_model() -> None:
 def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     script = tmp_path / "stand_in.py"
     script.write_text(code)
-    monkeypatch.setattr(onnxsim_main, "__file__", str(script))
+    monkeypatch.setattr(fold_with_onnxsim, "_WORKER", script)
 
 
 @pytest.mark.parametrize(

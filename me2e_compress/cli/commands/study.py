@@ -7,11 +7,6 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, say, show
-from me2e_compress.evaluators.highway.evaluation_options import engine_of
-from me2e_compress.study import load_study, run_study
-from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-from me2e_compress.study.write import write_study
-from me2e_compress.workflows.checks import check_folder
 
 Routes = Annotated[
     str | None, typer.Option(help="instead of the study's: all, N, ID,ID")
@@ -28,6 +23,13 @@ def study(
     as_json: given.Json = False,
 ) -> None:
     """Drive variants under conditions and compare them; run it again to go on."""
+    # takes highway-env and matplotlib two seconds to import
+    from me2e_compress.evaluators.highway.evaluation_options import engine_of
+    from me2e_compress.study import load_study, run_study
+    from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
+    from me2e_compress.study.write import write_study
+    from me2e_compress.workflows.checks import check_folder
+
     asked = load_study(definition, routes)
     check_folder(output, (definition,), (JSON, MARKDOWN, HTML))
     with listening() as listener:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 from me2e_compress.driving.contract import Policy
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert import Expert
-from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
+from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.routes import Route

@@ -1,4 +1,7 @@
-"""The drivers of this evaluator: the expert, the blind one, an ONNX file."""
+"""The drivers of this evaluator: the expert, the blind one, an ONNX file.
+
+What drives is imported when it is opened: naming a driver takes no simulator.
+"""
 
 import hashlib
 from dataclasses import dataclass
@@ -8,10 +11,6 @@ from typing import ClassVar
 from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.adapter import Adapter
-from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.expert import Expert
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.graph import sha256_of
 
@@ -24,6 +23,8 @@ class ExpertDriver(Driver):
 
     def open(self) -> Policy:
         """Return the expert."""
+        from me2e_compress.evaluators.highway.expert import Expert
+
         return Expert()
 
 
@@ -48,6 +49,8 @@ class BlindDriver(Driver):
 
     def open(self) -> Policy:
         """Return the blind driver."""
+        from me2e_compress.evaluators.highway.blind import Blind
+
         return Blind() if self.speed_mps is None else Blind(self.speed_mps)
 
 
@@ -71,6 +74,9 @@ class OnnxDriver(Driver):
         Raises:
             EvaluationError: No such file, or a model that cannot drive.
         """
+        from me2e_compress.evaluators.highway.adapter import Adapter
+        from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+
         if not self.path.is_file():
             raise EvaluationError(
                 f"policy {self.path}: no such file, and no policy of that name; there"

@@ -10,11 +10,11 @@ from pydantic import TypeAdapter, ValidationError
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
-from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.cameras import Weather

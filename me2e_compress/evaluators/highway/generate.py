@@ -14,10 +14,8 @@ from me2e_compress.evaluators.highway.admission import examine
 from me2e_compress.runtime.parent import end_with_parent
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import stage_of
-from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES
+from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
 
-VARIANTS = 5
-"""Routes of each type, as in Bench2Drive's 220."""
 MOST_TRIES = 8
 """Proposals of a type for every route wanted, before we give up."""
 

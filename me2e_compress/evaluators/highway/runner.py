@@ -3,25 +3,22 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.driving.contract import PLAN_SHAPE, Observation, Policy
-from me2e_compress.driving.latency import FixedLatency, LatencySource
-from me2e_compress.driving.realtime import DT_US, HeldControl
-from me2e_compress.errors import EvaluationError
+from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
-from me2e_compress.metrics.episode import FRAME_US, Ending, Episode, InferenceRecord
+from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
 from me2e_compress.simulator.cameras import (
-    CLEAR,
     CameraRig,
     Cameras,
-    Weather,
     paint_texture,
 )
 from me2e_compress.simulator.pictures import Moment
@@ -30,35 +27,6 @@ from me2e_compress.simulator.scene import Control, Ego, Scene
 from me2e_compress.simulator.world import World
 
 Plan = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """The conditions that a policy drives under.
-
-    Args:
-        latency: What its decisions cost.
-        dt_us: Step of the world, a divisor of 50 ms; for what a finer one changes see
-            `realtime.skipped_decisions`. Frames are recorded every 50 ms all the same.
-        image_size: Rows and columns of each camera.
-        weather: Weather and sensor faults.
-
-    Raises:
-        EvaluationError: 50 ms are not a multiple of the step.
-    """
-
-    latency: LatencySource = field(default_factory=FixedLatency)
-    dt_us: int = DT_US
-    image_size: tuple[int, int] = (96, 160)
-    weather: Weather = CLEAR
-
-    def __post_init__(self) -> None:
-        """Check the step."""
-        if self.dt_us <= 0 or FRAME_US % self.dt_us:
-            raise EvaluationError(
-                f"a step of {self.dt_us / 1e3:g} ms: it must divide "
-                f"{FRAME_US // 1000} ms"
-            )
 
 
 class PolicyFailedError(Exception):

@@ -10,20 +10,18 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.sharedctypes import SynchronizedArray
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import psutil
 
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError, Me2eError
-from me2e_compress.evaluators.highway.episode_recorder import (
-    completion_percent,
-    failed_episode,
-)
-from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import Route
-from me2e_compress.simulator.world import World
+
+if TYPE_CHECKING:  # highway-env takes a second to import: only who drives needs it
+    from me2e_compress.simulator.world import World
 
 POLL_S = 0.05
 FRAME_LIMIT_S = 60.0
@@ -148,6 +146,8 @@ class RouteWorker:
         return f"the policy ended its process with code {code}"
 
     def _lost(self, route: Route, begun: float, failure: str) -> Driven:
+        from me2e_compress.evaluators.highway.episode_recorder import failed_episode
+
         percent = self._heartbeat[1] if self._heartbeat else 0.0
         self.close()
         episode = failed_episode(route, percent, failure)
@@ -165,6 +165,9 @@ def _serve(
     line: Connection[Driven | Me2eError, Route], heartbeat: Heartbeat, job: Job
 ) -> None:
     """Drive the routes that come down the line until its other end closes."""
+    from me2e_compress.evaluators.highway.episode_recorder import completion_percent
+    from me2e_compress.evaluators.highway.runner import Listeners, drive
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     asked = 0
 

@@ -13,12 +13,14 @@ from me2e_compress.errors import PassError
 from me2e_compress.graph import digest, load, node_count, save
 from me2e_compress.graph.restore import restore
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fold_with_onnxsim import onnxsim_main
 from me2e_compress.rewrite import lift_constants, sweep
 
-__all__ = ["FoldWithOnnxsim", "onnxsim_main"]
+__all__ = ["FoldWithOnnxsim"]
 
 _OWN_METADATA = "onnxsim."
+
+_WORKER = Path(__file__).with_name("onnxsim_main.py")
+"""Not imported here: onnxsim imports torch where that is installed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +69,7 @@ class FoldWithOnnxsim(Pass):
 
 
 def _simplify(given: Path, folded: Path, timeout_s: float) -> None:
-    command = [sys.executable, "-P", onnxsim_main.__file__, str(given), str(folded)]
+    command = [sys.executable, "-P", str(_WORKER), str(given), str(folded)]
     try:
         subprocess.run(
             command, check=True, capture_output=True, text=True, timeout=timeout_s

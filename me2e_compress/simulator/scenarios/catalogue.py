@@ -87,6 +87,9 @@ SCENARIO_ABILITIES: dict[str, tuple[str, ...]] = {
 }
 """Scenario type to its one or two abilities, in Bench2Drive's order."""
 
+VARIANTS = 5
+"""Routes of each type, as in Bench2Drive's 220."""
+
 
 DIFFERENCES: dict[str, str] = {
     "ControlLoss": "a slick patch halves the grip before a car that stands across the "

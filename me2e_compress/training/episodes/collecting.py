@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.runner import Conditions, drive
+from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.runtime.atomic import write_bytes

@@ -13,6 +13,7 @@ import pytest
 from me2e_compress.driving.contract import Evaluator
 from me2e_compress.driving.latency import FixedLatency, MeasuredLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
 from me2e_compress.evaluators.highway.durations import EXPERT_S, longest_first
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -21,7 +22,6 @@ from me2e_compress.evaluators.highway.evaluator import (
     HighwayEvaluator,
 )
 from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
-from me2e_compress.evaluators.highway.runner import Conditions
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.simulator.routes import Route, save_routes
@@ -180,7 +180,7 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
         "from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator;"
         "from me2e_compress.evaluators.highway.engine import LocalEngine;"
         "from me2e_compress.evaluators.highway.drivers import BlindDriver;"
-        "from me2e_compress.evaluators.highway.runner import Conditions;"
+        "from me2e_compress.evaluators.highway.conditions import Conditions;"
         "from me2e_compress.evaluators.highway.worker import Job;"
         "routes = load_routes(Path(sys.argv[1]));"
         "job = Job(BlindDriver(5.0), Conditions());"

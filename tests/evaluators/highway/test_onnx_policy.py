@@ -16,9 +16,10 @@ from me2e_compress.evaluators.highway.adapter import (
     ImageNormalization,
 )
 from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.runner import Conditions, drive
+from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.cameras import CameraRig
 from tests.evaluators.highway.drivers import EXIT, PARKED, straight_on

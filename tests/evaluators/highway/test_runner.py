@@ -10,10 +10,11 @@ from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.episode_recorder import junction_m
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.observe import can_bus_of
-from me2e_compress.evaluators.highway.runner import Conditions, Listeners, drive
+from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.pictures import Moment

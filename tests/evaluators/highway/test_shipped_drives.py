@@ -1,7 +1,8 @@
 """The weights that ship, in closed loop; five CPU seconds."""
 
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
-from me2e_compress.evaluators.highway.runner import Conditions, drive
+from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.routes import load_routes, pick_routes

@@ -1,0 +1,41 @@
+"""What a policy drives under: latency, step, cameras, weather.
+
+Apart from the runner, so that naming the conditions does not import highway-env.
+"""
+
+from dataclasses import dataclass, field
+
+from me2e_compress.driving.latency import FixedLatency, LatencySource
+from me2e_compress.driving.realtime import DT_US
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.episode import FRAME_US
+from me2e_compress.simulator.cameras import CLEAR, Weather
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The conditions that a policy drives under.
+
+    Args:
+        latency: What its decisions cost.
+        dt_us: Step of the world, a divisor of 50 ms; for what a finer one changes see
+            `realtime.skipped_decisions`. Frames are recorded every 50 ms all the same.
+        image_size: Rows and columns of each camera.
+        weather: Weather and sensor faults.
+
+    Raises:
+        EvaluationError: 50 ms are not a multiple of the step.
+    """
+
+    latency: LatencySource = field(default_factory=FixedLatency)
+    dt_us: int = DT_US
+    image_size: tuple[int, int] = (96, 160)
+    weather: Weather = CLEAR
+
+    def __post_init__(self) -> None:
+        """Check the step."""
+        if self.dt_us <= 0 or FRAME_US % self.dt_us:
+            raise EvaluationError(
+                f"a step of {self.dt_us / 1e3:g} ms: it must divide "
+                f"{FRAME_US // 1000} ms"
+            )
