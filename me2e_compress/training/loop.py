@@ -9,7 +9,11 @@ import torch
 from torch.multiprocessing.spawn import ProcessException, spawn
 
 from me2e_compress.errors import TrainingError
-from me2e_compress.runtime.parent import end_with_parent
+from me2e_compress.runtime.children import (
+    end_with_parent,
+    killed_on_error,
+    sheltered,
+)
 from me2e_compress.training.checkpoint import TrainingCheckpoint
 from me2e_compress.training.options import difference
 from me2e_compress.training.process import (
@@ -72,9 +76,11 @@ def train(
     task = StageTask(what, config, tuple(files), tuple(held_out), start, folder)
     group = ProcessGroup.of(what.workers, config)
     try:
-        running = spawn(_process, (task, group), what.workers, join=False)
-        while running is not None and not running.join(POLL_S):
-            on_step(group.steps_done(), what.steps)
+        with killed_on_error():
+            with sheltered():
+                running = spawn(_process, (task, group), what.workers, join=False)
+            while running is not None and not running.join(POLL_S):
+                on_step(group.steps_done(), what.steps)
     except ProcessException as error:
         raise TrainingError(f"{folder}: training failed: {_cause(error)}") from error
     on_step(what.steps, what.steps)

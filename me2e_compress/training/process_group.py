@@ -5,9 +5,9 @@ from multiprocessing.synchronize import Barrier
 from typing import Self
 
 import torch
-import torch.multiprocessing as mp
 from torch import Tensor
 
+from me2e_compress.runtime.children import spawn_context
 from me2e_compress.training.losses import LampHead
 from me2e_compress.zoo.highway.config import HighwayConfig
 from me2e_compress.zoo.highway.stack import Highway
@@ -40,7 +40,7 @@ class ProcessGroup:
         size = sum(p.numel() for module in modules for p in module.parameters())
         rows = torch.zeros(workers, size).share_memory_()
         steps = torch.zeros(1, dtype=torch.int64).share_memory_()
-        return cls(rows, mp.get_context("spawn").Barrier(workers), steps)
+        return cls(rows, spawn_context().Barrier(workers), steps)
 
     def average(self, rank: int, mine: Tensor) -> Tensor:
         """Average one flat tensor over the processes; every process must call it."""

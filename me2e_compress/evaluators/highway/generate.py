@@ -2,16 +2,14 @@
 
 import zlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 
 import numpy as np
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.admission import examine
-from me2e_compress.runtime.parent import end_with_parent
+from me2e_compress.runtime.children import pool
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
@@ -107,6 +105,5 @@ def generate(
     if workers == 1:
         yield from map(of_type, scenarios)
         return
-    context = get_context("spawn")
-    with ProcessPoolExecutor(workers, context, end_with_parent) as pool:
-        yield from pool.map(of_type, scenarios)
+    with pool(workers) as processes:
+        yield from processes.map(of_type, scenarios)

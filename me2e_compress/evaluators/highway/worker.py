@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import signal
 import threading
 import time
@@ -18,6 +17,7 @@ from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError, Me2eError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.runtime.children import end_with_parent, spawn_context
 from me2e_compress.simulator.routes import Route
 
 if TYPE_CHECKING:  # highway-env takes a second to import: only who drives needs it
@@ -125,7 +125,7 @@ class RouteWorker:
         self,
     ) -> tuple[SpawnProcess, Heartbeat, Connection[Route, Driven | Me2eError]]:
         if self._process is None or self._heartbeat is None or self._line is None:
-            context = multiprocessing.get_context("spawn")
+            context = spawn_context()
             heartbeat = context.Array("d", 2)
             ours, theirs = context.Pipe()
             process = context.Process(
@@ -168,7 +168,7 @@ def _serve(
     from me2e_compress.evaluators.highway.episode_recorder import completion_percent
     from me2e_compress.evaluators.highway.runner import Listeners, drive
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     asked = 0
 
     def on_query(world: World) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import ClassVar
@@ -14,6 +13,7 @@ from me2e_compress.graph import digest, load, node_count, save
 from me2e_compress.graph.restore import restore
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.rewrite import lift_constants, sweep
+from me2e_compress.runtime.children import run_script
 
 __all__ = ["FoldWithOnnxsim"]
 
@@ -69,11 +69,8 @@ class FoldWithOnnxsim(Pass):
 
 
 def _simplify(given: Path, folded: Path, timeout_s: float) -> None:
-    command = [sys.executable, "-P", str(_WORKER), str(given), str(folded)]
     try:
-        subprocess.run(
-            command, check=True, capture_output=True, text=True, timeout=timeout_s
-        )
+        run_script(_WORKER, (str(given), str(folded)), timeout_s).check_returncode()
     except subprocess.TimeoutExpired as error:
         message = f"fold-with-onnxsim: onnxsim took longer than {timeout_s:g} s"
         raise PassError(message) from error

@@ -2,11 +2,10 @@
 
 import io
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.runtime.parent import end_with_parent
+from me2e_compress.runtime.children import pool
 from me2e_compress.training.episodes.collection import (
     Collection,
     Task,
@@ -119,21 +118,19 @@ def _driven(
             _collect_one(folder, what, student, task)
             yield
         return
-    context = get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, end_with_parent)
     try:
-        jobs = [
-            pool.submit(_collect_one, folder, what, student, task) for task in tasks
-        ]
-        for job in as_completed(jobs):
-            job.result()
-            yield
+        with pool(workers) as processes:
+            jobs = [
+                processes.submit(_collect_one, folder, what, student, task)
+                for task in tasks
+            ]
+            for job in as_completed(jobs):
+                job.result()
+                yield
     except BrokenProcessPool as error:
         raise EvaluationError(
             f"{folder}: a process was killed (out of memory?)"
         ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _collect_one(

@@ -9,8 +9,6 @@ import dataclasses
 import importlib.util
 import json
 import re
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,6 +19,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import GraphError, MissingExtraError, RecipeError
 from me2e_compress.quantization.plan import INT8, QuantPlan, plan_of
+from me2e_compress.runtime.children import run_script
 from me2e_compress.targets.tensorrt.rtx.cut import cut
 
 SM = (75, 80, 86, 89, 120, 121)
@@ -140,12 +139,7 @@ def _ask(
     model, answer, plan = (scratch / name for name in ("m.onnx", "a.json", "plan"))
     graph.save(part, model)
     words = [str(model), str(answer), str(sm), *([str(plan)] if build else [])]
-    done = subprocess.run(
-        [sys.executable, "-m", "me2e_compress.targets.tensorrt.rtx.rtx_main", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_script(Path(__file__).with_name("rtx_main.py"), words)
     if not answer.is_file():
         last = done.stderr.strip().splitlines()[-1:] or ["no message"]
         raise GraphError(

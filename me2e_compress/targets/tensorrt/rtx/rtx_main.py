@@ -1,6 +1,6 @@
 """The part that loads TensorRT-RTX, in a process of its own: its parser may abort.
 
-python -m me2e_compress.targets.tensorrt.rtx.rtx_main MODEL.onnx ANSWER.json SM [PLAN]
+python rtx_main.py MODEL.onnx ANSWER.json SM [PLAN]
 """
 
 import json
