@@ -1,6 +1,18 @@
 """The ``me2e-compress`` command, one short file each; the only room that prints."""
 
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from types import FrameType
+from typing import NoReturn
+
 from me2e_compress.errors import Me2eError
+
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+"""Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
+RESUMES = frozenset({"calibrate", "evaluate", "sensitivity", "study", "train"})
+"""Commands that go on where they were interrupted."""
 
 
 def main() -> int:
@@ -9,6 +21,20 @@ def main() -> int:
     The commands are imported here, not above: the processes that ``evaluate`` spawns
     import this module again, and need none of them.
     """
+    try:
+        with _terminated_in_order():
+            code = _run()
+    except SystemExit as done:
+        code = done.code if isinstance(done.code, int) else int(bool(done.code))
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    if code in (INTERRUPTED, TERMINATED):
+        again = "; run again to go on" if RESUMES & set(sys.argv[1:]) else ""
+        sys.stderr.write(f"me2e-compress: interrupted{again}\n")
+    return code
+
+
+def _run() -> int:
     from rich.markup import escape
 
     from me2e_compress.cli.app import app
@@ -22,9 +48,18 @@ def main() -> int:
         line = " ".join(str(error).split())
         errors.print(f"me2e-compress: {escape(line)}", soft_wrap=True)
         return 1
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else int(bool(done.code))
-    except KeyboardInterrupt:
-        errors.print("me2e-compress: interrupted")
-        return 130
     return 0
+
+
+@contextlib.contextmanager
+def _terminated_in_order() -> Iterator[None]:
+    """Make SIGTERM an exit like Ctrl-C: processes and drafts are cleared away."""
+
+    def leave(number: int, frame: FrameType | None) -> NoReturn:
+        raise SystemExit(TERMINATED)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

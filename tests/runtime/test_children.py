@@ -87,12 +87,14 @@ def family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Family]:
     folder.mkdir()
     for name in TRAPS:
         (folder / f"{name}.py").write_text(TRAP)
-    for name, text in {"parent": SCRIPT, "printer": PRINTER, "sleeper": SLEEPER}.items():
+    scripts = {"parent": SCRIPT, "printer": PRINTER, "sleeper": SLEEPER}
+    for name, text in scripts.items():
         (place / f"{name}.py").write_text(textwrap.dedent(text))
+    ours = str(Path(me2e_compress.__file__).parents[1])
     parent = subprocess.Popen(
         [sys.executable, str(place / "parent.py"), str(place)],
         cwd=folder,
-        env={"HOME": str(home), "PYTHONPATH": str(Path(me2e_compress.__file__).parents[1])},
+        env={"HOME": str(home), "PYTHONPATH": ours},
         stdout=subprocess.PIPE,
         text=True,
     )

@@ -1,0 +1,57 @@
+"""Ctrl-C and SIGTERM: one line, and the exit code that shells know."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+import me2e_compress
+from tests.cli.conftest import Command
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
+@pytest.mark.parametrize(
+    ("name", "words", "said"),
+    [
+        ("calibrate", "in.onnx frames -o out", "interrupted; run again to go on"),
+        ("compare", "in.onnx in.onnx frames", "interrupted"),
+    ],
+)
+def test_it_ends_in_one_line(
+    command: Command,
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    number: signal.Signals,
+    code: int,
+    name: str,
+    words: str,
+    said: str,
+) -> None:
+    def interrupted(path: Path) -> None:
+        os.kill(os.getpid(), number)
+
+    monkeypatch.chdir(files)
+    monkeypatch.setattr("me2e_compress.graph.load", interrupted)
+    before = signal.getsignal(signal.SIGTERM)
+
+    assert command(name, *words.split()) == code
+
+    assert capsys.readouterr().err == f"me2e-compress: {said}\n"
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_processes_are_started_in_one_place_alone() -> None:
+    words = ("get_context(", "subprocess.run(", "Popen(", "ProcessPoolExecutor(")
+    package = Path(me2e_compress.__file__).parent
+
+    found = [
+        str(path.relative_to(package))
+        for path in package.rglob("*.py")
+        if any(word in path.read_text(encoding="utf-8") for word in words)
+    ]
+
+    assert found == [str(Path("runtime", "children.py"))]
