@@ -43,7 +43,7 @@ from me2e_compress.quantization.plan import (
     QuantPlan,
     make_plan,
 )
-from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
+from me2e_compress.quantization.rules.safe_rules import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session, evaluate_constants
@@ -104,7 +104,7 @@ def compare_plans(subject: Subject, theirs: Reads, rounds: int) -> None:
     graph.infer_shapes(model)
     modules = ModuleMap.load(str(subject.map))
     scheme = QuantScheme.named("full", modules)
-    plan = make_plan(model, scheme, TensorRTRules())
+    plan = make_plan(model, scheme, SafeRules())
     differing = [
         each for each in plan.decisions if (each.dtype == INT8) != (each.node in theirs)
     ]
@@ -242,7 +242,7 @@ def time_planning() -> None:
     ready = manager.run(model, Context(modules)).model
     graph.infer_shapes(ready)
     start = process_time()
-    plan = make_plan(ready, QuantScheme.named("feature-ext", modules), TensorRTRules())
+    plan = make_plan(ready, QuantScheme.named("feature-ext", modules), SafeRules())
     spent = process_time() - start
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
     print(f"\n{len(plan.decisions)} nodes planned in {spent:.3f} CPU s: {counts}")

@@ -10,6 +10,10 @@ from me2e_compress import graph
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.modules import ModuleMap
+from me2e_compress.quantization.rules.paper_rules import PaperRules
+
+PAPER = PaperRules()
+"""Rules under which graphs as small as these have int8: no kernel is asked."""
 
 CONV_ATTENTION = """
 <ir_version: 9, opset_import: ["" : 17]>

@@ -15,7 +15,7 @@ Scheme = Annotated[
     str | None, typer.Option(help="int8 modules: feature-ext, prediction or full")
 ]
 Rules = Annotated[
-    str | None, typer.Option(help="of the int8 plan: paper, tensorrt, or see list")
+    str | None, typer.Option(help="of the int8 plan: safe, paper, or see list")
 ]
 Target = Annotated[
     str | None, typer.Option(help="runtime of the int8 graph: tensorrt or onnxruntime")
@@ -43,7 +43,7 @@ Json = Annotated[bool, typer.Option("--json", help="for programs")]
 RecipeOutput = Annotated[Path, typer.Option("-o", "--output", help="the RECIPE.toml")]
 TrialScheme = Annotated[str, typer.Option("--scheme", help="modules that may be int8")]
 TrialRules = Annotated[
-    str, typer.Option("--rules", help="of the int8 plans: paper, tensorrt, or see list")
+    str, typer.Option("--rules", help="of the int8 plans: safe, paper, or see list")
 ]
 JudgedFrames = Annotated[int, typer.Option("-n", "--count", help="frames to judge on")]
 Routes = Annotated[str, typer.Option(help="all, a number, ID,ID or a file of routes")]

@@ -17,7 +17,7 @@ from me2e_compress.quantization.plan import (
     sharing_costs,
     stamp_plan,
 )
-from me2e_compress.quantization.rules import RULE_SETS, RuleSet
+from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.quantized import describe_quantized
@@ -35,16 +35,17 @@ class QuantizeInt8(Pass):
 
     The plan (:mod:`me2e_compress.quantization.plan`) decides which nodes, and says why
     not the others; the graph carries it in its metadata:
-    attention of more than ``attention_limit`` tokens and matrix-vector products stay
-    float. Ranges are measured on the context's frames, or read from a file; there is no
-    calibration on made-up data.
+    geometry, positions, attention weights and matrix-vector products stay float. Ranges
+    are measured on the context's frames, or read from a file; there is no calibration
+    on made-up data.
 
     Attributes:
         scheme: ``feature-ext``, ``prediction`` or ``full``.
         modules: module names instead of a scheme.
-        rules: ``paper``, its two stages alone; ``tensorrt``, with what its kernels
-            and coordinates need besides; a rule set of your own; each with options,
-            ``paper{extra=[my-rule]}``.
+        rules: ``safe`` (also called ``tensorrt``), which keeps geometry, positions,
+            attention weights, ego status and what kernels are too coarse for in float
+            besides; ``paper``, its two stages alone; a rule set of your own; each with
+            options, ``paper{extra=[my-rule]}``.
         without: names of rules that are switched off, e.g. ``gemv``.
         target: who will run the graph.
         attention_limit: longest attention that becomes int8, in tokens; None leaves it
@@ -61,7 +62,7 @@ class QuantizeInt8(Pass):
     reads_ranges: ClassVar[bool] = True
     scheme: str = "full"
     modules: tuple[str, ...] = ()
-    rules: str = "paper"
+    rules: str = DEFAULT_RULES
     without: tuple[str, ...] = ()
     target: str = "tensorrt"
     attention_limit: int | None = None

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress.graph import (
+    WEIGHTED,
     input_at,
     is_standard,
     open_shape,
@@ -158,6 +159,23 @@ def find_attention(
         attention = Attention(*_lengths(queries_by_keys[0].outputs[0]))
         for product in (*queries_by_keys, *_products(weighed, weights)):
             found.setdefault(product, attention)
+    return found
+
+
+def find_attention_weights(
+    model: ir.Model, attention: Collection[ir.Node]
+) -> dict[ir.Node, str]:
+    """Map every product that gives attention weights, or reads them, to the reason.
+
+    Besides both products of an attention: layers that read a softmax, as a mean
+    position over bins does.
+    """
+    found = dict.fromkeys(attention, "gives or reads attention weights")
+    softmaxes = behind(model.graph, _WEIGHTS, lambda node: node.op_type == "Softmax")
+    for node in model.graph:
+        reads = node.inputs[:2] if node.op_type in WEIGHTED else ()
+        if any(each in softmaxes for each in reads if each is not None):
+            found.setdefault(node, "reads the weights that a softmax gives")
     return found
 
 

@@ -49,7 +49,7 @@ class CompressOptions:
     Attributes:
         scheme: int8 after the recipe's passes: ``feature-ext``, ``prediction``,
             ``full``.
-        rules: of the int8 plan: ``paper`` or ``tensorrt``.
+        rules: of the int8 plan: ``safe`` or ``paper``.
         target: runtime of the int8 graph: ``tensorrt`` or ``onnxruntime``.
         overrides: TOML file of exceptions to the int8 plan.
         ranges: file of saved ranges, instead of frames.

@@ -8,7 +8,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
-from me2e_compress.quantization.rules import RULE_SETS
+from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
@@ -35,7 +35,7 @@ class TrialOptions:
     """
 
     scheme: str = "full"
-    rules: str = "paper"
+    rules: str = DEFAULT_RULES
     target: str | None = None
     ranges: str | Path | None = None
     module_map: str | Path | None = None

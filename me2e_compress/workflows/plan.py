@@ -23,6 +23,7 @@ from me2e_compress.quantization.plan import (
     save_plan,
 )
 from me2e_compress.quantization.plan.decision import record
+from me2e_compress.quantization.rules import DEFAULT_RULES
 from me2e_compress.workflows.checks import check_output, model_path
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table, table
@@ -34,7 +35,7 @@ class PlanOptions:
 
     Attributes:
         scheme: ``feature-ext``, ``prediction``; None is ``full``.
-        rules: ``paper`` or ``tensorrt``; None is ``paper``.
+        rules: ``safe``, ``paper``, or a set of yours; None is ``safe``.
         overrides: TOML file of exceptions.
         module_map: preset or TOML file; None finds the preset.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
@@ -152,7 +153,7 @@ def plan(
     read = [_read(path) for path in files]
     _check_options(options, files, read)
     plain = QuantizeInt8(
-        scheme=options.scheme or "full", rules=options.rules or "paper"
+        scheme=options.scheme or "full", rules=options.rules or DEFAULT_RULES
     )
     overrides = None if options.overrides is None else Path(options.overrides)
     chosen = dataclasses.replace(plain, overrides=overrides)

@@ -42,15 +42,15 @@ def dense(files: Path) -> Path:
     """The folder with a model that has a layer to quantize."""
     model = ir.from_onnx_text(
         '<ir_version: 9, opset_import: ["" : 17]>\n'
-        "dense (float[4,4] camera) => (float[4,32] plan) {"
+        "dense (float[4,16] camera) => (float[4,32] plan) {"
         ' ["/backbone/Relu"] a = Relu(camera)\n'
         ' ["/plan_head/MatMul"] plan = MatMul(a, w) }'
     )
-    draws = np.random.default_rng(0).normal(size=(4, 32)).astype(np.float32)
+    draws = np.random.default_rng(0).normal(size=(16, 32)).astype(np.float32)
     weight = rewrite.add_constant(model.graph, draws, "w")
     model.graph[1].replace_input_with(1, weight)
     graph.save(model, files / "dense.onnx")
-    camera = np.random.default_rng(1).normal(size=(4, 4)).astype(np.float32)
+    camera = np.random.default_rng(1).normal(size=(4, 16)).astype(np.float32)
     shutil.rmtree(files / "frames")
     write_frames(files / "frames", camera=camera)
     return files

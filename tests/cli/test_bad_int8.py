@@ -63,7 +63,10 @@ def test_no_frames(refused: Refused, dense: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "shape", "message"),
-    [("radar", (4, 4), "camera is missing"), ("camera", (2, 4), r"\[2, 4\]|\(2, 4\)")],
+    [
+        ("radar", (4, 16), "camera is missing"),
+        ("camera", (2, 16), r"\[2, 16\]|\(2, 16\)"),
+    ],
 )
 def test_frames_of_another_model(
     refused: Refused, dense: Path, name: str, shape: tuple[int, int], message: str
@@ -112,7 +115,7 @@ def test_a_cache_of_other_frames(
 ) -> None:
     saved, map_ = dense / "r.json", ("--map", dense / "map.toml")
     command("calibrate", dense / "dense.onnx", dense / "frames", *map_, "-o", saved)
-    write_frames(dense / "later", camera=np.ones((4, 4), np.float32))
+    write_frames(dense / "later", camera=np.ones((4, 16), np.float32))
     capsys.readouterr()
 
     words = ("--scheme", "full", "--ranges", saved, "--frames", dense / "later")
@@ -185,7 +188,7 @@ def test_a_graph_that_is_quantized_already(
 
 def bare(path: Path) -> None:
     with path.open("wb") as file:
-        np.save(file, np.zeros((4, 4), np.float32))
+        np.save(file, np.zeros((4, 16), np.float32))
 
 
 def cut(path: Path) -> None:

@@ -17,7 +17,7 @@ def folder(dense: Path) -> Path:
     """The dense model, with three scenes of two frames."""
     draws = np.random.default_rng(1)
     frames = [
-        {"camera": draws.normal(size=(4, 4)).astype(np.float32)} for _ in range(6)
+        {"camera": draws.normal(size=(4, 16)).astype(np.float32)} for _ in range(6)
     ]
     record(dense / "scenes", frames, (0, 2, 4))
     return dense

@@ -50,13 +50,13 @@ def test_plans_are_compared(
 ) -> None:
     output = compressed(command, dense)
     capsys.readouterr()
-    words = ("--scheme", "prediction", "--rules", "tensorrt")
+    words = ("--scheme", "feature-ext", "--rules", "paper")
     more = ("--map", dense / "map.toml", "--against", output)
 
     assert command("plan", dense / "dense.onnx", *words, *more) == 0
 
     said = capsys.readouterr().out
-    assert "/plan_head/MatMul: int8 (layer) -> float (small-product)" in said
+    assert "/plan_head/MatMul: int8 (layer) -> float (module)" in said
     assert "1 differences" in said
     assert command("plan", dense / "dense.onnx", *words, *more, "--json") == 0
     document = strict(capsys.readouterr().out)
@@ -64,7 +64,7 @@ def test_plans_are_compared(
     (found,) = document["differences"]
     assert [found[side]["rule"] for side in ("old", "new")] == [
         "layer",
-        "small-product",
+        "module",
     ]
 
 
@@ -87,7 +87,7 @@ def test_what_overrides_change_is_told_against_the_same_model(
     ("words", "option"),
     [
         ("--scheme full", "scheme"),
-        ("--rules tensorrt", "rules"),
+        ("--rules paper", "rules"),
         ("--overrides none.toml", "overrides"),
         ("--overrides none.toml --against dense.onnx", "overrides"),
         ("--scheme full --against out.plan.json", "scheme"),
@@ -148,12 +148,12 @@ def test_options_of_int8_reach_the_pass(
     command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (dense / "o.toml").write_text('[[override]]\nop = "MatMul"\ndtype = "float"\n')
-    more = ("--overrides", dense / "o.toml", "--rules", "tensorrt", "--json")
+    more = ("--overrides", dense / "o.toml", "--rules", "paper", "--json")
 
     compressed(command, dense, *more)
 
     step = json.loads(capsys.readouterr().out)["steps"][-1]
-    assert 'rules="tensorrt"' in step["text"]
+    assert 'rules="paper"' in step["text"]
     assert "0 of 2 nodes int8; by rule: override 1" in step["notes"]
 
 
@@ -169,7 +169,7 @@ def test_options_of_int8_reach_the_pass(
             "no target 'npu'; there are tensorrt",
         ),
         (("--scheme", "int4"), "no scheme int4; there are feature-ext"),
-        (("--scheme", "full", "--rules", "fp8"), "no rule set 'fp8'; there are paper"),
+        (("--scheme", "full", "--rules", "fp8"), "no rule set 'fp8'; there are safe"),
         (("--scheme", "full", "--overrides", "none.toml"), "none.toml: no such file"),
         (("--scheme", "full", "--ranges", "none.json"), "none.json"),
         (("--scheme", "full"), "needs recorded frames (--frames) or saved ranges"),

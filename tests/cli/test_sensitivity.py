@@ -95,7 +95,7 @@ def test_ranges_of_another_tool_are_taken(
 
 
 @pytest.mark.parametrize(
-    ("budget", "int8"), [(("--max-mb", "1"), False), (("--max-mb", "0.0004"), True)]
+    ("budget", "int8"), [(("--max-mb", "1"), False), (("--max-mb", "0.001"), True)]
 )
 def test_search_writes_the_least_int8_that_fits(
     command: Command, dense: Path, budget: tuple[str, str], int8: bool

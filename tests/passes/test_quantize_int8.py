@@ -39,7 +39,7 @@ def test_the_quantized_graph_runs_and_stays_close(
 ) -> None:
     model = conv_attention()
 
-    result = QuantizeInt8().run(model, context)
+    result = QuantizeInt8(rules="paper").run(model, context)
     found = compare(Session(model), Session(result.model), frames)
 
     assert result.changes == 4
@@ -48,7 +48,11 @@ def test_the_quantized_graph_runs_and_stays_close(
 
 
 def test_notes_say_what_was_decided_by_which_rule(context: Context) -> None:
-    notes = QuantizeInt8(attention_limit=8).run(conv_attention(), context).notes
+    notes = (
+        QuantizeInt8(rules="paper", attention_limit=8)
+        .run(conv_attention(), context)
+        .notes
+    )
 
     assert "scheme full: backbone, head" in notes
     assert "2 of 10 nodes int8; by rule: attention-length 2, layer 2" in notes
@@ -67,21 +71,21 @@ def test_notes_say_what_was_decided_by_which_rule(context: Context) -> None:
 def test_schemes_and_modules_choose(
     context: Context, options: dict[str, object], changes: int
 ) -> None:
-    chosen = QuantizeInt8(**options)  # type: ignore[arg-type]
+    chosen = QuantizeInt8(rules="paper", **options)  # type: ignore[arg-type]
 
     assert chosen.run(conv_attention(), context).changes == changes
 
 
 def test_without_frames_there_is_no_calibration() -> None:
     with pytest.raises(FramesError, match=r"needs recorded frames .* never made up"):
-        QuantizeInt8().run(conv_attention(), Context(MODULES))
+        QuantizeInt8(rules="paper").run(conv_attention(), Context(MODULES))
 
 
 def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
-    once = QuantizeInt8().run(conv_attention(), context).model
+    once = QuantizeInt8(rules="paper").run(conv_attention(), context).model
 
     with pytest.raises(PreconditionError) as caught:
-        QuantizeInt8().run(once, context)
+        QuantizeInt8(rules="paper").run(once, context)
 
     assert "quantized already: 7 DequantizeLinear, 5 QuantizeLinear" in str(
         caught.value
@@ -92,24 +96,27 @@ def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
 
 
 def test_the_graph_carries_its_plan(context: Context) -> None:
-    plan = plan_of(QuantizeInt8(rules="tensorrt").run(conv_attention(), context).model)
+    plan = plan_of(QuantizeInt8().run(conv_attention(), context).model)
 
     assert plan is not None
-    assert plan.rules == "tensorrt"
+    assert plan.rules == "safe"
     assert len(plan.decisions) == 10
 
 
-def test_rules_of_tensorrt_keep_small_layers_in_float(context: Context) -> None:
-    notes = QuantizeInt8(rules="tensorrt").run(conv_attention(), context).notes
+def test_the_rules_of_the_default_keep_small_layers_in_float(context: Context) -> None:
+    notes = QuantizeInt8().run(conv_attention(), context).notes
 
-    assert "1 of 10 nodes int8; by rule: layer 1, small-product 3" in notes
+    rules = "attention-weights 2, layer 1, small-product 1"
+    assert f"1 of 10 nodes int8; by rule: {rules}" in notes
 
 
 @pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
 def test_what_was_placed_is_held_against_its_target(
     context: Context, target: str
 ) -> None:
-    notes = QuantizeInt8(target=target).run(conv_attention(), context).notes
+    notes = (
+        QuantizeInt8(rules="paper", target=target).run(conv_attention(), context).notes
+    )
 
     assert notes[-1] == f"lint for {target}: nothing found"
 
@@ -124,13 +131,13 @@ def test_what_the_target_refuses_is_noted(context: Context) -> None:
     """
     model = net(text, {"w": np.ones((8, 3, 1, 1))})
 
-    notes = QuantizeInt8(scheme="feature-ext").run(model, context).notes
+    notes = QuantizeInt8(rules="paper", scheme="feature-ext").run(model, context).notes
 
     assert "TensorRT's parser does not take Det" in notes[-1]
 
 
 def test_a_rule_that_is_switched_off_objects_to_nothing(context: Context) -> None:
-    options = QuantizeInt8(rules="tensorrt", without=("small-product",))
+    options = QuantizeInt8(without=("small-product", "attention-weights"))
 
     notes = options.run(conv_attention(), context).notes
 
@@ -141,13 +148,19 @@ def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> Non
     path = tmp_path / "overrides.toml"
     path.write_text('[[override]]\nmodule = "head"\ndtype = "float"\n')
 
-    notes = QuantizeInt8(overrides=path).run(conv_attention(), context).notes
+    notes = (
+        QuantizeInt8(rules="paper", overrides=path).run(conv_attention(), context).notes
+    )
 
     assert "1 of 10 nodes int8; by rule: layer 1, override 3" in notes
 
 
 def test_close_decisions_are_noted(context: Context) -> None:
-    notes = QuantizeInt8(attention_limit=60).run(conv_attention(), context).notes
+    notes = (
+        QuantizeInt8(rules="paper", attention_limit=60)
+        .run(conv_attention(), context)
+        .notes
+    )
 
     assert (
         "close decisions: /head/QK: 64 queries, 64 keys: close to the limit of 60;"
@@ -164,7 +177,7 @@ def test_close_decisions_are_noted(context: Context) -> None:
         (
             {"rules": "int4"},
             RecipeError,
-            "no rule set 'int4'; there are paper, tensorrt",
+            "no rule set 'int4'; there are safe, paper",
         ),
         ({"target": "qnn"}, RecipeError, "no target 'qnn'; there are tensorrt"),
         ({"overrides": Path("none.toml")}, RecipeError, "none.toml: no such file"),
@@ -185,8 +198,8 @@ def test_saved_ranges_give_the_same_graph_without_frames(
     path = tmp_path / "r.json"
     Calibrator().run(model, TENSORS, frames).save(path)
 
-    measured = QuantizeInt8().run(conv_attention(), context).model
-    read = QuantizeInt8(ranges=path).run(model, Context(MODULES)).model
+    measured = QuantizeInt8(rules="paper").run(conv_attention(), context).model
+    read = QuantizeInt8(rules="paper", ranges=path).run(model, Context(MODULES)).model
 
     assert graph.digest(read) == graph.digest(measured)
 
@@ -198,19 +211,19 @@ def test_ranges_of_another_graph_are_refused(
     Calibrator().run(conv_attention(seed=1), TENSORS, frames).save(path)
 
     with pytest.raises(FramesError, match="ranges are stale: of graph"):
-        QuantizeInt8(ranges=path).run(conv_attention(), Context(MODULES))
+        QuantizeInt8(rules="paper", ranges=path).run(conv_attention(), Context(MODULES))
 
 
 def test_frames_of_another_model_are_refused(tmp_path: Path) -> None:
     other = CalibrationSet(record(tmp_path, [{"lidar": np.zeros(3, np.float32)}]))
 
     with pytest.raises(FramesError, match=r"input image is missing.*lidar"):
-        QuantizeInt8().run(conv_attention(), Context(MODULES, other))
+        QuantizeInt8(rules="paper").run(conv_attention(), Context(MODULES, other))
 
 
 def test_the_same_frames_give_the_same_graph(context: Context) -> None:
     first, again = (
-        graph.digest(QuantizeInt8().run(conv_attention(), context).model)
+        graph.digest(QuantizeInt8(rules="paper").run(conv_attention(), context).model)
         for _ in range(2)
     )
     assert first == again
@@ -219,7 +232,9 @@ def test_the_same_frames_give_the_same_graph(context: Context) -> None:
 def test_what_the_target_keeps_in_float_is_not_counted_as_int8(
     context: Context,
 ) -> None:
-    result = QuantizeInt8(target="onnxruntime").run(conv_attention(), context)
+    result = QuantizeInt8(rules="paper", target="onnxruntime").run(
+        conv_attention(), context
+    )
 
     assert result.changes == len(int8_layers(result.model)) == 2
     assert (
@@ -242,7 +257,7 @@ def test_where_the_target_takes_nothing_nothing_is_int8(context: Context) -> Non
     }
     """
     model = net(text, {"w": np.ones((3, 8, 2, 2))})
-    options = QuantizeInt8(scheme="feature-ext", target="onnxruntime")
+    options = QuantizeInt8(rules="paper", scheme="feature-ext", target="onnxruntime")
 
     result = options.run(model, context)
 

@@ -9,7 +9,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.quantization.plan import Overrides, QuantPlan, make_plan
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, conv_attention
+from tests.nets import MODULES, PAPER, conv_attention
 
 FULL = QuantScheme.named("full", MODULES)
 
@@ -17,7 +17,7 @@ FULL = QuantScheme.named("full", MODULES)
 def planned(text: str, scheme: str = "full") -> QuantPlan:
     overrides = Overrides.parse(text)
     named = QuantScheme.named(scheme, MODULES)
-    return make_plan(conv_attention(), named, overrides=overrides)
+    return make_plan(conv_attention(), named, PAPER, overrides=overrides)
 
 
 def chosen(plan: QuantPlan) -> list[str]:
@@ -69,7 +69,7 @@ def test_names_of_the_source_file_match_too() -> None:
     provenance.stamp(node, Provenance("backbone", ("/stem/conv", "/stem/bn"), ("x",)))
     overrides = Overrides.parse('[[override]]\nnodes = "/stem/*"\ndtype = "float"')
 
-    plan = make_plan(model, FULL, overrides=overrides)
+    plan = make_plan(model, FULL, PAPER, overrides=overrides)
 
     assert plan.decisions[0].rule == "override"
 

@@ -6,10 +6,10 @@ from me2e_compress.errors import ModuleMapError, RecipeError
 from me2e_compress.quantization.plan import Decision, make_plan, tensors_of
 from me2e_compress.quantization.rules.base import RuleSet
 from me2e_compress.quantization.rules.paper_rules import PaperRules
-from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
+from me2e_compress.quantization.rules.safe_rules import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.calls import calls
-from tests.nets import MODULES, conv_attention, net
+from tests.nets import MODULES, PAPER, conv_attention, net
 
 HEAD = QuantScheme.of(("head",), MODULES)
 
@@ -47,7 +47,7 @@ VARIANTS = {
 
 
 def products(model: ir.Model) -> list[Decision]:
-    plan = make_plan(model, HEAD)
+    plan = make_plan(model, HEAD, PAPER)
     return [each for each in plan.decisions if each.op in ("MatMul", "Einsum")]
 
 
@@ -152,7 +152,7 @@ def test_gemm_counts_rows_of_what_it_multiplies(
         y = Gemm<transB={flip}>(x, w)
     }}
     """
-    plan = make_plan(net(text, {"w": np.ones(shape)}), HEAD)
+    plan = make_plan(net(text, {"w": np.ones(shape)}), HEAD, PAPER)
 
     assert plan.decisions[0].rule == rule
 
@@ -180,7 +180,7 @@ def test_a_constant_on_the_left_is_coordinate_arithmetic() -> None:
 def test_every_node_has_a_decision_a_module_and_a_reason() -> None:
     model = conv_attention()
 
-    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
 
     assert [each.node for each in plan.decisions] == [node.name for node in model.graph]
     assert all(each.reason and each.module for each in plan.decisions)
@@ -199,7 +199,7 @@ def test_every_node_has_a_decision_a_module_and_a_reason() -> None:
     ],
 )
 def test_schemes_go_by_the_role_of_modules(scheme: str, nodes: list[str]) -> None:
-    plan = make_plan(conv_attention(), QuantScheme.named(scheme, MODULES))
+    plan = make_plan(conv_attention(), QuantScheme.named(scheme, MODULES), PAPER)
 
     assert [each.node for each in plan.chosen] == nodes
 
@@ -229,7 +229,7 @@ def diamonds(count: int) -> ir.Model:
     return net(ATTENTION % {"q": 16, "k": 16, "body": "\n".join(body)}, {})
 
 
-@pytest.mark.parametrize("rules", [PaperRules(), TensorRTRules()])
+@pytest.mark.parametrize("rules", [PaperRules(), SafeRules()])
 def test_planning_is_linear_on_diamonds_and_on_many_softmaxes(rules: RuleSet) -> None:
     few, many = diamonds(100), diamonds(800)
 
@@ -262,6 +262,6 @@ batch (float[N,%s,8] a, float[N,8,%s] b, float[N,%s,8] c) => (float[N,%s,8] y) {
 def test_an_open_batch_changes_no_decision(
     sizes: tuple[int | str, ...], rule: str
 ) -> None:
-    plan = make_plan(net(OPEN % sizes, {}), HEAD)
+    plan = make_plan(net(OPEN % sizes, {}), HEAD, PAPER)
 
     assert [each.rule for each in plan.decisions if each.op == "MatMul"] == [rule] * 2

@@ -17,13 +17,13 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules.paper_rules import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, conv_attention
+from tests.nets import MODULES, PAPER, conv_attention
 
 FULL = QuantScheme.named("full", MODULES)
 
 
 def test_a_saved_plan_reads_back_the_same(tmp_path: Path) -> None:
-    plan = make_plan(conv_attention(), FULL)
+    plan = make_plan(conv_attention(), FULL, PAPER)
 
     save_plan(plan, tmp_path / "plan.json")
 
@@ -32,7 +32,7 @@ def test_a_saved_plan_reads_back_the_same(tmp_path: Path) -> None:
 
 def test_a_model_carries_its_plan_through_a_file(tmp_path: Path) -> None:
     model = conv_attention()
-    plan = make_plan(model, FULL)
+    plan = make_plan(model, FULL, PAPER)
 
     stamp_plan(model, plan)
     graph.save(model, tmp_path / "m.onnx")
@@ -47,7 +47,7 @@ def test_a_model_without_a_plan_has_none() -> None:
 def test_differences_name_what_changed_and_by_which_rule() -> None:
     model = conv_attention()
     overrides = Overrides.parse('[[override]]\nop = "Conv"\ndtype = "float"')
-    old = make_plan(model, FULL)
+    old = make_plan(model, FULL, PAPER)
     new = make_plan(model, FULL, PaperRules(attention_limit=8), overrides)
 
     assert [str(each) for each in differences(old, new)] == [
@@ -60,9 +60,9 @@ def test_differences_name_what_changed_and_by_which_rule() -> None:
 
 def test_nodes_that_only_one_plan_has_are_differences() -> None:
     model = conv_attention()
-    old = make_plan(model, FULL)
+    old = make_plan(model, FULL, PAPER)
     model.graph[0].outputs[0].name = "renamed"
-    new = make_plan(model, FULL)
+    new = make_plan(model, FULL, PAPER)
 
     assert [str(each) for each in differences(old, new)] == [
         "/backbone/Conv: none -> int8 (layer)",

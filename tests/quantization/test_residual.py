@@ -17,7 +17,7 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, net
+from tests.nets import MODULES, PAPER, net
 
 FULL = QuantScheme.named("full", MODULES)
 
@@ -57,7 +57,7 @@ def addition(plan: QuantPlan) -> Decision:
 def test_the_residual_branch_is_read_as_int8(
     branch: str, operands: str, residual: int
 ) -> None:
-    found = addition(make_plan(block(branch, operands), FULL))
+    found = addition(make_plan(block(branch, operands), FULL, PAPER))
 
     assert (found.dtype, found.rule) == ("int8", "residual")
     assert found.activations == (residual,)
@@ -73,7 +73,7 @@ def test_the_residual_branch_is_read_as_int8(
     ],
 )
 def test_other_adds_stay_float(branch: str, operands: str) -> None:
-    found = addition(make_plan(block(branch, operands), FULL))
+    found = addition(make_plan(block(branch, operands), FULL, PAPER))
 
     assert (found.dtype, found.rule) == ("float", "operator")
 
@@ -86,13 +86,13 @@ def test_an_add_of_a_constant_is_no_residual() -> None:
     model.graph.register_initializer(value)
     node.replace_input_with(1, value)
 
-    assert addition(make_plan(model, FULL)).dtype == "float"
+    assert addition(make_plan(model, FULL, PAPER)).dtype == "float"
 
 
 def test_a_batch_normalization_does_not_hide_the_convolution() -> None:
     branch = "n = BatchNormalization(main, b, b, b, b)"
 
-    found = addition(make_plan(block(branch, "n, x"), FULL))
+    found = addition(make_plan(block(branch, "n, x"), FULL, PAPER))
 
     assert (found.rule, found.activations) == ("residual", (1,))
 
@@ -100,7 +100,9 @@ def test_a_batch_normalization_does_not_hide_the_convolution() -> None:
 def test_the_add_goes_with_its_convolution() -> None:
     overrides = Overrides.parse('[[override]]\nnodes = "/backbone/3"\ndtype = "float"')
 
-    plan = make_plan(block("i = Identity(x)", "main, x"), FULL, overrides=overrides)
+    plan = make_plan(
+        block("i = Identity(x)", "main, x"), FULL, PAPER, overrides=overrides
+    )
 
     assert addition(plan).dtype == "float"
 
@@ -108,14 +110,16 @@ def test_the_add_goes_with_its_convolution() -> None:
 def test_the_add_alone_can_be_kept_in_float() -> None:
     overrides = Overrides.parse('[[override]]\nop = "Add"\ndtype = "float"')
 
-    plan = make_plan(block("i = Identity(x)", "main, x"), FULL, overrides=overrides)
+    plan = make_plan(
+        block("i = Identity(x)", "main, x"), FULL, PAPER, overrides=overrides
+    )
 
     assert (addition(plan).dtype, addition(plan).rule) == ("float", "override")
     assert plan.counts() == {"layer": 2}
 
 
 def test_readers_of_a_tensor_are_a_group() -> None:
-    plan = make_plan(block("down = Conv(x, w3)", "main, down"), FULL)
+    plan = make_plan(block("down = Conv(x, w3)", "main, down"), FULL, PAPER)
 
     (group,) = plan.groups
     assert (group.kind, group.tensors) == ("shared-input", ("x",))

@@ -23,7 +23,7 @@ HEAD = QuantScheme.of(("head",), MODULES)
 OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
 
 
-def planned(model: ir.Model, rules: str = "tensorrt") -> QuantPlan:
+def planned(model: ir.Model, rules: str = "safe") -> QuantPlan:
     return make_plan(model, HEAD, RULE_SETS.parse(rules))
 
 
@@ -32,16 +32,17 @@ def by_output(plan: QuantPlan) -> dict[str, Decision]:
 
 
 def test_no_such_rule_set() -> None:
-    with pytest.raises(RecipeError, match="no rule set 'nvidia'; there are paper"):
+    with pytest.raises(RecipeError, match="no rule set 'nvidia'; there are safe"):
         RULE_SETS.parse("nvidia")
 
 
 def test_rules_can_be_switched_off_one_by_one() -> None:
-    left = RULE_SETS.parse("tensorrt{without=[gemv, coordinates]}")
+    left = RULE_SETS.parse("safe{without=[gemv, coordinates]}")
 
     assert [rule.name for rule in left.rules()] == [
-        "operator", "module", "weight", "attention-length", "small-product",
-        "narrow-convolution", "cost",
+        "operator", "module", "weight", "geometry", "ego-input", "attention-length",
+        "attention-weights", "small-product", "narrow-convolution",
+        "cost",
     ]  # fmt: skip
 
 
@@ -243,7 +244,7 @@ def test_borderline_attention_is_reported(queries: int, keys: int, remark: str) 
         f" => (float[{queries},32] y)"
         " { s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v) }"
     )
-    plan = make_plan(net(text, {}), HEAD, RULE_SETS.parse("tensorrt"))
+    plan = make_plan(net(text, {}), HEAD, RULE_SETS.parse("safe"))
 
     assert [remark in each.borderline for each in plan.decisions] == [
         True, not remark, True,
@@ -303,3 +304,43 @@ def test_a_set_of_another_package_decides(
     assert planned(model, "no-rules").counts()["layer"] == 2
     with pytest.raises(RecipeError, match="no-rules has no option 'attention_limit'"):
         QuantizeInt8(rules="no-rules", attention_limit=8).plan(model, Context(MODULES))
+
+
+ATTENTION = (
+    OPSETS
+    + """
+attention (float[1,64,32] q, float[1,32,64] k, float[1,64,32] v, float[32,32] w)
+    => (float[1,64,32] y) {
+    s = MatMul(q, k) p = Softmax(s) m = MatMul(p, v) y = MatMul(m, w)
+}"""
+)
+
+
+def test_attention_weights_are_read_in_float() -> None:
+    model = net(ATTENTION, {"w": np.ones((32, 32))})
+
+    paper, safe = by_output(planned(model, "paper")), by_output(planned(model))
+
+    assert (paper["s"].rule, paper["m"].rule) == ("attention", "attention")
+    assert (safe["s"].rule, safe["m"].rule) == ("attention-weights",) * 2
+    assert safe["y"].rule == "layer"
+
+
+def test_a_layer_that_averages_by_a_softmax_reads_it_in_float() -> None:
+    text = OPSETS + (
+        "bins (float[64,32] x, float[32,32] w) => (float[64,32] y)"
+        " { p = Softmax(x) d = Identity(p) y = MatMul(d, w) }"
+    )
+    model = net(text, {"w": np.ones((32, 32))})
+
+    assert by_output(planned(model, "paper"))["y"].rule == "layer"
+    assert by_output(planned(model))["y"].rule == "attention-weights"
+
+
+def test_tensorrt_is_a_name_of_the_default() -> None:
+    model = net(SAMPLING % ONNX, {n: np.ones(s) for n, s in SIZES.items()})
+
+    safe, alias = planned(model, "safe"), planned(model, "tensorrt")
+
+    assert safe.decisions == alias.decisions == make_plan(model, HEAD).decisions
+    assert safe.groups == alias.groups

@@ -83,7 +83,7 @@ def trials(tmp_path: Path, bad: int) -> Trials:
     model = delicate(bad)
     target = TARGETS.parse("tensorrt")
     rules = RULE_SETS.parse("paper")
-    everything = QuantizeInt8(scheme="full").plan(model, Context(MODULES))
+    everything = QuantizeInt8(rules="paper").plan(model, Context(MODULES))
     ranges = Calibrator(threads=1).run(
         model, target.tensors(everything, model), recording
     )

@@ -21,6 +21,7 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import make_plan, tensors_of
+from me2e_compress.quantization.rules.paper_rules import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
@@ -94,7 +95,7 @@ def ranges(
     """Ranges of everything that any scheme quantizes, measured once."""
     model = folded.clone()
     graph.infer_shapes(model)
-    plan = make_plan(model, QuantScheme.named("full", context.modules))
+    plan = make_plan(model, QuantScheme.named("full", context.modules), PaperRules())
     assert context.frames is not None
     path = tmp_path_factory.mktemp("ranges") / "ranges.json"
     tensors = (
@@ -158,7 +159,7 @@ def test_the_cpu_runs_every_convolution_and_most_products_in_int8(
     ranges: Path,
     tmp_path: Path,
 ) -> None:
-    options = QuantizeInt8(target="onnxruntime", ranges=ranges)
+    options = QuantizeInt8(rules="paper", target="onnxruntime", ranges=ranges)
     result = options.run(folded.clone(), context).model
 
     rewritten = tmp_path / "rewritten.onnx"
@@ -193,7 +194,7 @@ def test_close_layers_are_decided_as_they_should(
     folded: ir.Model, context: Context
 ) -> None:
     """The traps of this stack: long attention, one ego query, sampling offsets."""
-    options = QuantizeInt8(rules="tensorrt")
+    options = QuantizeInt8()
     plan = options.plan(folded, context)
     rules = {each.node.removeprefix("/pts_bbox_head/"): each for each in plan.decisions}
 

@@ -62,11 +62,11 @@ CASES: dict[str, tuple[str, Call]] = {
         ),
     ),
     "plan": (
-        "plan dense.onnx -o p.json --map map.toml --rules tensorrt",
+        "plan dense.onnx -o p.json --map map.toml --rules paper",
         lambda: me2e.plan(
             "dense.onnx",
             "p.json",
-            options=me2e.PlanOptions(rules="tensorrt", module_map=MAP),
+            options=me2e.PlanOptions(rules="paper", module_map=MAP),
         ),
     ),
     "compare": (
@@ -91,12 +91,12 @@ CASES: dict[str, tuple[str, Call]] = {
         ),
     ),
     "search": (
-        "search dense.onnx frames -o s.toml --map map.toml --max-mb 0.0004",
+        "search dense.onnx frames -o s.toml --map map.toml --max-mb 0.001",
         lambda: me2e.search(
             "dense.onnx",
             "frames",
             "s.toml",
-            me2e.SearchOptions(max_mb=0.0004, module_map=MAP),
+            me2e.SearchOptions(max_mb=0.001, module_map=MAP),
         ),
     ),
     "export": (

@@ -21,7 +21,7 @@ def search(
     max_mb: MaxMb = None,
     max_ms: MaxMs = None,
     scheme: given.TrialScheme = "full",
-    rules: given.TrialRules = "paper",
+    rules: given.TrialRules = "safe",
     target: given.Target = None,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,

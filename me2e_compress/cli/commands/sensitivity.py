@@ -28,7 +28,7 @@ def sensitivity(
     frames: given.Recording,
     output: given.RecipeOutput,
     scheme: given.TrialScheme = "full",
-    rules: given.TrialRules = "paper",
+    rules: given.TrialRules = "safe",
     target: given.Target = None,
     limit: Limit = 0.1,
     drive: Drive = None,

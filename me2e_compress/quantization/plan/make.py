@@ -24,7 +24,13 @@ from me2e_compress.quantization.plan.decision import (
 )
 from me2e_compress.quantization.plan.groups import find_groups
 from me2e_compress.quantization.plan.overrides import NONE, Overrides, Pins
-from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
+from me2e_compress.quantization.rules import (
+    DEFAULT_RULES,
+    RULE_SETS,
+    Rule,
+    RuleFacts,
+    RuleSet,
+)
 from me2e_compress.quantization.scheme import QuantScheme
 
 
@@ -43,14 +49,14 @@ def make_plan(
     Args:
         model: the float graph: modules stamped on its nodes, shapes inferred.
         scheme: which modules are to be int8.
-        rules: asked in order; None for the set ``paper``.
+        rules: asked in order; None for the set ``safe``.
         overrides: what the user has decided; it beats every rule that is not firm.
         costs: estimates what int8 saves and costs on the target, for rules that ask.
 
     Raises:
         RecipeError: an override matches no node, or wants int8 where it cannot be.
     """
-    asked = RULE_SETS.parse("paper") if rules is None else rules
+    asked = RULE_SETS.parse(DEFAULT_RULES) if rules is None else rules
     in_order = asked.rules()
     facts = RuleFacts(model, scheme.modules, costs)
     pins = overrides.bind(model)

@@ -4,6 +4,7 @@ To add a rule or a set of rules: write its class, then add it to its table in ``
 """
 
 from me2e_compress.quantization.rules.base import (
+    DEFAULT_RULES,
     RULE_SETS,
     RULES,
     Rule,
@@ -12,6 +13,7 @@ from me2e_compress.quantization.rules.base import (
 )
 
 __all__ = [
+    "DEFAULT_RULES",
     "RULES",
     "RULE_SETS",
     "Rule",

@@ -12,7 +12,13 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.quantization.coordinates import find_coordinates
 from me2e_compress.quantization.costs import CostsOf
-from me2e_compress.quantization.find_attention import Attention, find_attention
+from me2e_compress.quantization.ego_inputs import find_ego_layers
+from me2e_compress.quantization.find_attention import (
+    Attention,
+    find_attention,
+    find_attention_weights,
+)
+from me2e_compress.quantization.geometry import find_geometry
 from me2e_compress.registry import Registry
 
 
@@ -48,6 +54,21 @@ class RuleFacts:
     def attention(self) -> Mapping[ir.Node, Attention]:
         """The nodes that take part in an attention, each with that attention."""
         return find_attention(self.model, self.constants)
+
+    @functools.cached_property
+    def attention_weights(self) -> Mapping[ir.Node, str]:
+        """The products that read attention weights or give them, with the reason."""
+        return find_attention_weights(self.model, self.attention)
+
+    @functools.cached_property
+    def geometry(self) -> Mapping[ir.Node, str]:
+        """The products that geometry goes through, each with the reason."""
+        return find_geometry(self.model, self.constants)
+
+    @functools.cached_property
+    def ego_layers(self) -> Mapping[ir.Node, str]:
+        """The layers that see only the ego car's status, each with that input."""
+        return find_ego_layers(self.model, self.constants)
 
     @functools.cached_property
     def coordinates(self) -> Mapping[ir.Node, str]:
@@ -102,9 +123,12 @@ RULES: Registry[Rule] = Registry(
         "weight": f"{_HERE}.paper_rules:WeightOperand",
         "attention-length": f"{_HERE}.paper_rules:AttentionLength",
         "gemv": f"{_HERE}.paper_rules:MatrixVector",
-        "small-product": f"{_HERE}.tensorrt_rules:SmallProduct",
-        "narrow-convolution": f"{_HERE}.tensorrt_rules:NarrowConvolution",
-        "coordinates": f"{_HERE}.tensorrt_rules:Coordinates",
+        "geometry": f"{_HERE}.safe_rules:Geometry",
+        "coordinates": f"{_HERE}.safe_rules:Coordinates",
+        "ego-input": f"{_HERE}.safe_rules:EgoInput",
+        "attention-weights": f"{_HERE}.safe_rules:AttentionWeights",
+        "small-product": f"{_HERE}.kernel_rules:SmallProduct",
+        "narrow-convolution": f"{_HERE}.kernel_rules:NarrowConvolution",
         "cost": f"{_HERE}.cost_rule:CostGate",
     },
 )
@@ -155,7 +179,11 @@ RULE_SETS: Registry[RuleSet] = Registry(
     "me2e_compress.rule_sets",
     RecipeError,
     {
+        "safe": f"{_HERE}.safe_rules:SafeRules",
         "paper": f"{_HERE}.paper_rules:PaperRules",
-        "tensorrt": f"{_HERE}.tensorrt_rules:TensorRTRules",
+        "tensorrt": f"{_HERE}.safe_rules:TensorRTRules",
     },
 )
+
+DEFAULT_RULES = "safe"
+"""The rule set of every plan for which none is named, whatever its target."""

@@ -19,7 +19,7 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.frames import record
-from tests.nets import MODULES, net
+from tests.nets import MODULES, PAPER, net
 
 Floats = npt.NDArray[np.float32]
 Feeds = Mapping[str, Floats]
@@ -93,7 +93,7 @@ TOKENS = feeds(1, x=(2, 12, 8), t=(6, 5))
 
 def lowered(model: ir.Model, reach: float = 3.0) -> ir.Model:
     """Lower with one range for all."""
-    plan = make_plan(model, FULL)
+    plan = make_plan(model, FULL, PAPER)
     ends = dict.fromkeys(OnnxRuntime().tensors(plan, model), (-reach, reach))
     return OnnxRuntime().place(model, plan, Ranges(ends, "max-min", 1, "", ""))
 
@@ -107,7 +107,7 @@ def measured(model: ir.Model, tensors: tuple[str, ...], feeds: Feeds) -> Ranges:
 
 def calibrated(model: ir.Model, feeds: Feeds) -> ir.Model:
     """Lower with the ranges of one frame."""
-    plan = make_plan(model, FULL)
+    plan = make_plan(model, FULL, PAPER)
     return OnnxRuntime().place(
         model, plan, measured(model, OnnxRuntime().tensors(plan, model), feeds)
     )

@@ -8,7 +8,7 @@ from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import conv_attention
+from tests.nets import PAPER, conv_attention
 from tests.targets.onnxruntime.lowered import (
     FULL,
     IMAGE,
@@ -45,7 +45,7 @@ foreign (float[4,6] x) => (float[4,3] y)
 
 
 def placed(model: ir.Model, fed: Feeds) -> ir.Model:
-    plan = make_plan(model, FULL)
+    plan = make_plan(model, FULL, PAPER)
     ranges = measured(model, TensorRT().tensors(plan, model), fed)
     return TensorRT().place(model, plan, ranges)
 

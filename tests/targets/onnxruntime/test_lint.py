@@ -7,7 +7,7 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.nets import MODULES, conv_attention, net
+from tests.nets import MODULES, PAPER, conv_attention, net
 
 LAYER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -73,7 +73,7 @@ def test_opsets_nobody_has_released() -> None:
 
 def test_what_we_place_for_it_has_no_findings() -> None:
     model = conv_attention()
-    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
     target = TARGETS.parse("onnxruntime")
     ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
 
@@ -92,7 +92,7 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
     }
     """
     model = net(text, {"w": np.ones((8, 8, 1, 1)), "t": np.ones((8, 8, 2, 2))})
-    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
     target = TARGETS.parse("onnxruntime")
     ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
 

@@ -9,7 +9,7 @@ from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers
-from tests.nets import conv_attention
+from tests.nets import PAPER, conv_attention
 from tests.targets.onnxruntime.lowered import (
     FULL,
     IMAGE,
@@ -96,7 +96,7 @@ def test_tensors_without_sign_use_the_whole_grid() -> None:
 def test_what_only_moves_elements_shares_the_grid_of_what_it_moves() -> None:
     model = block()
 
-    assert OnnxRuntime().tensors(make_plan(model, FULL), model) == (
+    assert OnnxRuntime().tensors(make_plan(model, FULL, PAPER), model) == (
         "x", "a1", "a2", "a3", "z3", "y",
     )  # fmt: skip
 
@@ -140,7 +140,7 @@ def test_opset_12_is_refused() -> None:
 
 def test_a_missing_range_is_named() -> None:
     model = block()
-    plan = make_plan(model, FULL)
+    plan = make_plan(model, FULL, PAPER)
     some = Ranges({"x": (-1.0, 1.0), "a1": (0.0, 1.0)}, "max-min", 1, "", "")
 
     with pytest.raises(FramesError, match=r"4 tensors have no range.* a2.*calibrated"):
@@ -196,7 +196,7 @@ kept (float[1,8,4,4] x, float[8,8,1,1] w, float[8,8,2,2] up, float[8,4,4] many)
 
 def test_what_the_kernels_do_not_take_is_listed_with_the_reason() -> None:
     model = drawn(KEPT, {"w": (8, 8, 1, 1), "up": (8, 8, 2, 2), "many": (8, 4, 4)})
-    plan = make_plan(model, FULL)
+    plan = make_plan(model, FULL, PAPER)
 
     found = {each.output: each.reason for each in OnnxRuntime().kept_float(plan, model)}
 
@@ -211,6 +211,6 @@ def test_what_the_kernels_do_not_take_is_listed_with_the_reason() -> None:
 def test_attention_products_are_listed_as_float() -> None:
     model = conv_attention()
 
-    found = OnnxRuntime().kept_float(make_plan(model, FULL), model)
+    found = OnnxRuntime().kept_float(make_plan(model, FULL, PAPER), model)
 
     assert [each.node for each in found] == ["/head/QK", "/head/AV"]

@@ -4,7 +4,7 @@ import pytest
 
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.nets import net
+from tests.nets import PAPER, net
 from tests.targets.onnxruntime.lowered import (
     FULL,
     calibrated,
@@ -97,7 +97,7 @@ def test_a_relu_in_a_body_is_no_part_of_the_convolution_before_it() -> None:
     weights = {name: generator.standard_normal(size) for name, size in shapes.items()}
     model, fed = net(BODY, weights), feeds(3, fine=(1, 4, 8, 8))
 
-    assert OnnxRuntime().tensors(make_plan(model, FULL), model) == (
+    assert OnnxRuntime().tensors(make_plan(model, FULL, PAPER), model) == (
         "fine",
         "chosen",
         "c",

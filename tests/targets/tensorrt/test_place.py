@@ -11,12 +11,12 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.rules.tensorrt_rules import TensorRTRules
+from me2e_compress.quantization.rules.safe_rules import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.weights import quantize_weight
-from tests.nets import MODULES, conv_attention, net
+from tests.nets import MODULES, PAPER, conv_attention, net
 
 FULL = QuantScheme.named("full", MODULES)
 
@@ -47,7 +47,7 @@ def layers(seed: int = 0, opset: int = 17) -> ir.Model:
 
 
 def placed(model: ir.Model, reach: float = 3.0) -> ir.Model:
-    plan = make_plan(model, FULL)
+    plan = make_plan(model, FULL, PAPER)
     tensors = dict.fromkeys(tensors_of(plan, model), (-reach, reach / 2))
     return TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
 
@@ -248,7 +248,7 @@ def test_what_a_concat_joins_is_on_one_scale() -> None:
     }
     """
     model = net(text, {"w": np.ones((16, 16)), "v": np.ones((32, 16))})
-    plan = make_plan(model, FULL, TensorRTRules())
+    plan = make_plan(model, FULL, SafeRules())
     tensors = {"a": (-1.0, 1.0), "ab": (-1.0, 4.0)}
 
     result = TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))

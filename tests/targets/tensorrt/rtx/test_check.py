@@ -12,7 +12,7 @@ from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx import check
-from tests.nets import MODULES, conv_attention, net
+from tests.nets import MODULES, PAPER, conv_attention, net
 from tests.targets.tensorrt.test_place import layers
 
 RTX = pytest.mark.skipif(
@@ -21,7 +21,7 @@ RTX = pytest.mark.skipif(
 
 
 def quantized(model: ir.Model) -> ir.Model:
-    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
     ranges = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
     placed = TensorRT().place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
     stamp_plan(placed, plan)
@@ -71,7 +71,7 @@ def test_a_float_graph_has_no_int8_kernel() -> None:
 @RTX
 def test_a_plan_that_the_graph_does_not_keep_is_found_out() -> None:
     model = conv_attention()
-    plan = make_plan(model, QuantScheme.named("full", MODULES))
+    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
     stamp_plan(model, plan)
 
     found = check(model)

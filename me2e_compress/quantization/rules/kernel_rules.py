@@ -1,4 +1,4 @@
-"""The rule set for TensorRT: what its int8 kernels are too coarse for, coordinates.
+"""Rules of int8 kernels: what they are too coarse for.
 
 Bounds are those of NVIDIA's own quantizer (ModelOpt 0.47,
 ``modelopt/onnx/quantization/graph_utils.py``): int8 tensor cores work on tiles of 16
@@ -14,8 +14,6 @@ import onnx_ir as ir
 from me2e_compress.graph import CONVOLUTIONS, static_shape
 from me2e_compress.graph.shapes import extent
 from me2e_compress.quantization.rules.base import Rule, RuleFacts
-from me2e_compress.quantization.rules.cost_rule import CostGate
-from me2e_compress.quantization.rules.paper_rules import PaperRules
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,38 +81,3 @@ class NarrowConvolution(Rule):
             f"{inputs} to {outputs} channels in {group} groups, kernel {list(kernel)}:"
             " too narrow for int8 kernels"
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class Coordinates(Rule):
-    """Layers that positions come from stay float: offsets, reference points.
-
-    A position is right to a fraction of a cell or wrong; 8 bits over a map of 100
-    cells leave half a cell. Sampling weights that read the same tensor as the offsets
-    go with them: neither then needs it in int8.
-    """
-
-    name: ClassVar[str] = "coordinates"
-
-    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Object to what :func:`~me2e_compress.quantization.coordinates` found."""
-        return facts.coordinates.get(node)
-
-
-@dataclasses.dataclass(frozen=True)
-class TensorRTRules(PaperRules):
-    """The paper's rules, and what TensorRT's kernels and coordinates need beyond them.
-
-    Attributes:
-        attention_limit: longest attention that becomes int8, in tokens.
-        without: names of rules that are switched off, e.g. ``gemv``.
-        extra: more rules, asked last.
-    """
-
-    name: ClassVar[str] = "tensorrt"
-    share_concat: ClassVar[bool] = True
-
-    def own_rules(self) -> tuple[Rule, ...]:
-        """Return those of the paper and four more, that of costs last."""
-        more = (SmallProduct(), NarrowConvolution(), Coordinates(), CostGate())
-        return (*super().own_rules(), *more)

@@ -1,0 +1,241 @@
+"""Find the products that geometry goes through: camera matrices, points, pixels."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Collection, Iterable, Mapping
+
+import onnx_ir as ir
+
+from me2e_compress.graph import input_at, is_standard, open_shape
+from me2e_compress.graph.shapes import extent
+
+MATRICES = frozenset({(3, 3), (3, 4), (4, 4)})
+"""Sizes of rotations, camera intrinsics, projections and rigid transforms."""
+
+MOST_MATRICES = 64
+"""In one input: cameras times frames. An input of more is a feature map."""
+
+WIDEST = 4
+"""Numbers that say a point: homogeneous coordinates in space."""
+
+_NAMED = re.compile(
+    r"2(img|image|cam|camera|ego|lidar|global|world)(?![a-z])"
+    r"|(ego|cam|camera|lidar|sensor)_?pose|intrinsic|extrinsic|projection_mat"
+    r"|l2g_|ref(erence)?_(pts|points)",
+    re.IGNORECASE,
+)
+"""What the inputs of driving stacks call matrices, poses and reference points, for
+those whose shape is not known: lidar2img, ego_pose, l2g_r_mat, ref_pts."""
+
+_ARITHMETIC = frozenset(
+    {
+        "Abs", "Add", "BatchNormalization", "Cast", "Ceil", "Clip", "Concat", "Div",
+        "Dropout", "Exp", "Expand", "Flatten", "Floor", "Gather", "GatherElements",
+        "GatherND", "Identity", "InstanceNormalization", "Inverse", "InversePlugin",
+        "InverseTRT", "LayerNormalization", "Log", "Max", "Min", "Mod", "Mul", "Neg",
+        "Pad", "Pow", "Reciprocal", "ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin",
+        "ReduceSum", "Relu", "Reshape", "Round", "ScatterElements", "ScatterND",
+        "Sigmoid", "Slice", "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Tile",
+        "Transpose", "Unsqueeze", "Where",
+    }
+)  # fmt: skip
+"""What points stay points through: no product, no comparison, no sine or cosine (an
+embedding, as fine as its 8 bits), no softmax, no sampler."""
+
+_DATA: Mapping[str, tuple[int, ...]] = {
+    "BatchNormalization": (0,), "Clip": (0,), "Expand": (0,), "Gather": (0,),
+    "GatherElements": (0,), "GatherND": (0,), "InstanceNormalization": (0,),
+    "LayerNormalization": (0,), "Pad": (0,), "ReduceL2": (0,), "ReduceMax": (0,),
+    "ReduceMean": (0,), "ReduceMin": (0,), "ReduceSum": (0,), "Reshape": (0,),
+    "ScatterElements": (0, 2), "ScatterND": (0, 2), "Slice": (0,), "Split": (0,),
+    "Squeeze": (0,), "Tile": (0,), "Unsqueeze": (0,), "Where": (1, 2),
+}  # fmt: skip
+"""Inputs that hold data: the others are shapes, indices, bounds and conditions."""
+
+_PRODUCTS = ("Conv", "ConvTranspose", "Einsum", "Gemm", "MatMul")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Source:
+    """The input that a value comes from, and whether it is made of matrices alone."""
+
+    name: str
+    is_matrix: bool
+
+
+def find_geometry(
+    model: ir.Model, constants: Collection[ir.Value]
+) -> dict[ir.Node, str]:
+    """Map every product that geometry goes through to the input that it comes from.
+
+    Geometry begins at inputs that are matrices (``lidar2img`` [1, 6, 4, 4], poses,
+    intrinsics), or are named like matrices and reference points. It goes through
+    arithmetic and changes of layout, however the product is batched: what multiplies a
+    matrix by points gives points, be they constant or computed, columns or rows.
+
+    Geometry ends at the first product with a learned weight (more than 4 numbers in or
+    out), which reads coordinates and is the last to be mapped; at sines and cosines,
+    comparisons and samplers; and where it is added to, or multiplied by, features of
+    more than 4 numbers. Layers behind these are layers like any other.
+
+    One sweep, linear in the graph.
+
+    Args:
+        model: the graph, in topological order.
+        constants: values that no input changes.
+    """
+    flow = _Flow(constants)
+    for value in model.graph.inputs:
+        source = _source(value)
+        if source is not None and value not in constants:
+            flow.sources[value] = source
+    for node in model.graph if flow.sources else ():
+        flow.enter(node)
+    return flow.found
+
+
+class _Flow:
+    """Geometry on its way through a graph.
+
+    Attributes:
+        sources: of the values that are geometry.
+        found: the products that it went through.
+    """
+
+    def __init__(self, constants: Collection[ir.Value]) -> None:
+        self.sources: dict[ir.Value, _Source] = {}
+        self.found: dict[ir.Node, str] = {}
+        self._constants = constants
+        self._learned: set[ir.Value] = set()
+
+    def enter(self, node: ir.Node) -> None:
+        """Follow geometry, and what is learned, through one node."""
+        product = node.op_type in _PRODUCTS and is_standard(node)
+        reads = node.inputs if product else _data(node)
+        met = [self.sources[each] for each in reads if each in self.sources]
+        goes_on = False
+        if met and product:
+            self.found[node] = f"multiplies what comes from the input {met[0].name}"
+            goes_on = self._passes(node)
+        elif met and node.op_type in _ARITHMETIC:
+            goes_on = self._remains(node, reads)
+        if goes_on:
+            matrix = all(each.is_matrix for each in met) and self._alone(reads)
+            if product:
+                matrix = matrix and _is_small(node.outputs[0])
+            source = _Source(met[0].name, matrix)
+            self.sources.update(dict.fromkeys(node.outputs, source))
+        elif product or any(each in self._learned for each in node.inputs):
+            self._learned.update(node.outputs)
+
+    def _alone(self, reads: Iterable[ir.Value | None]) -> bool:
+        """Return whether only geometry and constants are read."""
+        return all(
+            each is None or each in self.sources or each in self._constants
+            for each in reads
+        )
+
+    def _remains(self, node: ir.Node, reads: Iterable[ir.Value | None]) -> bool:
+        """Return whether arithmetic on geometry gives geometry."""
+        if not any(each in self._learned for each in reads):
+            return True
+        shape = open_shape(node.outputs[0])
+        return shape is not None and shape[-1:] != () and _few(shape[-1])
+
+    def _passes(self, product: ir.Node) -> bool:
+        """Return whether a product gives points or matrices, not features."""
+        left, right = product.inputs[0], product.inputs[1]
+        if left in self.sources and right in self.sources:
+            return True
+        if not _few(_depth(product)):
+            return False
+        one = left if left in self.sources else right
+        if one is not None and one in self.sources and self.sources[one].is_matrix:
+            return _is_stacked(one) or _is_small(product.outputs[0])
+        return _few(_width(product, flipped=one is right))
+
+
+def _width(product: ir.Node, *, flipped: bool) -> int | None:
+    """Return how many numbers a product gives for each point.
+
+    Args:
+        product: a convolution, or a product of matrices.
+        flipped: whether points are its right operand, one a column.
+    """
+    shape = open_shape(product.outputs[0])
+    if shape is None or len(shape) < 2:
+        return None
+    if product.op_type in ("Conv", "ConvTranspose"):
+        return shape[1]
+    return shape[-2] if flipped else shape[-1]
+
+
+def _source(value: ir.Value) -> _Source | None:
+    if value.dtype is not None and not value.dtype.is_floating_point():
+        return None
+    name, shape = str(value.name), open_shape(value)
+    if shape is not None and shape[-2:] in MATRICES:
+        many = math.prod(dim for dim in shape[:-2] if dim is not None)
+        return _Source(name, True) if many <= MOST_MATRICES else None
+    if _NAMED.search(name) is None:
+        return None
+    return _Source(name, shape is None or shape[-2:].count(None) > 0)
+
+
+def _data(node: ir.Node) -> list[ir.Value | None]:
+    """Return the inputs of a node that hold data."""
+    indices = _DATA.get(node.op_type)
+    if indices is None:
+        return list(node.inputs)
+    return [input_at(node, index) for index in indices]
+
+
+def _few(size: int | None) -> bool:
+    return size is not None and size <= WIDEST
+
+
+def _is_small(value: ir.Value) -> bool:
+    """Return whether a value is a batch of matrices of a few rows and columns."""
+    shape = open_shape(value)
+    return shape is not None and len(shape) > 1 and all(map(_few, shape[-2:]))
+
+
+def _is_stacked(value: ir.Value) -> bool:
+    """Return whether a value is a batch of matrices, or matrices one below the other.
+
+    Parts of matrices, say translations [cameras, 3], are not: a weight may follow.
+    """
+    shape = open_shape(value)
+    if shape is None or len(shape) < 2:
+        return True
+    rows, columns = shape[-2:]
+    if _few(rows) and _few(columns):
+        return columns in (3, 4) and rows in (2, 3, 4)
+    return 4 in (rows, columns) and (rows or 0) % 4 == 0 and (columns or 0) % 4 == 0
+
+
+def _depth(product: ir.Node) -> int | None:
+    """Return how many numbers a product sums over for each that it gives."""
+    if product.op_type in ("Gemm", "MatMul"):
+        return extent(product, weight=False).depth
+    if product.op_type == "Einsum":
+        return _contracted(product)
+    shape = open_shape(product.inputs[1])
+    return None if shape is None else shape[1 if product.op_type == "Conv" else 0]
+
+
+def _contracted(einsum: ir.Node) -> int | None:
+    """Return the product of the sizes of the labels that an Einsum sums over."""
+    equation = einsum.attributes.get_string("equation", "").replace(" ", "")
+    terms, _, result = equation.partition("->")
+    sizes: dict[str, int | None] = {}
+    for term, value in zip(terms.split(","), einsum.inputs, strict=False):
+        shape = open_shape(value) or ()
+        front, _, back = term.partition("...")
+        sizes.update(zip(front, shape, strict=False))
+        if back:
+            sizes.update(zip(reversed(back), reversed(shape), strict=False))
+    summed = [size for label, size in sizes.items() if label not in result]
+    known = [size for size in summed if size is not None]
+    return math.prod(known) if known and len(known) == len(summed) else None

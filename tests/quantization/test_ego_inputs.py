@@ -1,0 +1,60 @@
+"""Encoders of the ego car's status are known, and stay float by default."""
+
+import numpy as np
+import pytest
+
+from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.rules import RULE_SETS
+from me2e_compress.quantization.scheme import QuantScheme
+from tests.nets import MODULES, net
+
+HEAD = QuantScheme.of(("head",), MODULES)
+NET = """<ir_version: 9, opset_import: ["" : 17]>
+ego (float[3,18] can_bus, float[1,3,%d,32] image, float[3,32] memory,
+     float[18,32] a, float[32,32] b, float[32,64] c, float[64,32] d,
+     float[500,32] grid) => (float y, float z, float memory_out)
+    <int64[2] rows = {3, 32}, int64[2] cells = {32, -1}> {
+    e = MatMul(can_bus, a)
+    r = Relu(e)
+    f = MatMul(r, b)
+    m = MatMul(memory, b)
+    memory_out = Identity(m)
+    pixels = Reshape(image, cells)
+    s = MatMul(f, pixels)
+    first = ReduceMean<axes = [0], keepdims = 1>(f)
+    map = Add(first, grid)
+    y = MatMul(map, c)
+    i = ReduceMean<axes = [2, 3], keepdims = 0>(image)
+    t = ReduceMean<keepdims = 1>(i)
+    k = Add(f, t)
+    z = MatMul(k, c)
+}"""
+SIZES = {"a": (18, 32), "b": (32, 32), "c": (32, 64), "d": (64, 32), "grid": (500, 32)}
+
+
+def rules(height: int, rule_set: str) -> dict[str, str]:
+    model = net(NET % height, {name: np.ones(size) for name, size in SIZES.items()})
+    plan = make_plan(model, HEAD, RULE_SETS.parse(rule_set))
+    return {each.output: each.rule for each in plan.decisions}
+
+
+def test_layers_that_see_the_status_alone_stay_float() -> None:
+    found = rules(32, "safe")
+
+    assert (found["e"], found["f"]) == ("ego-input", "ego-input")
+
+
+@pytest.mark.parametrize(
+    ("output", "why"),
+    [
+        ("m", "a memory is no status"),
+        ("y", "a map that the status was added to is a map"),
+        ("z", "it sees the image too"),
+    ],
+)
+def test_other_layers_do_not(output: str, why: str) -> None:
+    assert rules(32, "safe")[output] == "layer", why
+
+
+def test_a_graph_without_sensors_has_no_status() -> None:
+    assert rules(1, "safe")["e"] == "layer"

@@ -1,0 +1,203 @@
+"""Geometry stays float, however its products are batched, and ends where it ends."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
+from me2e_compress.quantization.rules import RULE_SETS
+from me2e_compress.quantization.rules.safe_rules import Geometry
+from me2e_compress.quantization.scheme import QuantScheme
+from tests.nets import MODULES, net
+
+HEAD = QuantScheme.of(("head",), MODULES)
+OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
+ALONE = "paper{extra=[geometry], without=[gemv]}"
+"""Neither gemv nor small-product takes the product before geometry can."""
+
+
+def planned(text: str, shapes: Mapping[str, tuple[int, ...]], rules: str) -> QuantPlan:
+    weights = {name: np.ones(shape) for name, shape in shapes.items()}
+    return make_plan(net(OPSETS + text, weights), HEAD, RULE_SETS.parse(rules))
+
+
+def by_output(plan: QuantPlan) -> dict[str, Decision]:
+    return {each.output: each for each in plan.decisions}
+
+
+PROJECTIONS = {
+    "batched": (
+        "c (float[6,4,4] lidar2img, float[6,4,200] points) => (float[6,4,200] p)"
+        " { p = MatMul(lidar2img, points) }",
+        {"points": (6, 4, 200)},
+    ),
+    "one column a point": (
+        "c (float[1,6,1,4,4] lidar2img, float[50,4,1] points)"
+        " => (float[1,6,50,4,1] p) { p = MatMul(lidar2img, points) }",
+        {"points": (50, 4, 1)},
+    ),
+    "expanded": (
+        "c (float[1,6,4,4] lidar2img, float[1,6,50,4,1] points)"
+        " => (float[1,6,50,4,1] p)"
+        " <int64[1] two = {2}, int64[5] all = {1, 6, 50, 4, 4}> {"
+        " u = Unsqueeze(lidar2img, two) e = Expand(u, all) p = MatMul(e, points) }",
+        {"points": (1, 6, 50, 4, 1)},
+    ),
+    "cameras stacked in rows": (
+        "c (float[1,6,4,4] lidar2img, float[4,200] points) => (float[24,200] p)"
+        " <int64[2] flat = {24, 4}> { m = Reshape(lidar2img, flat)"
+        " p = MatMul(m, points) }",
+        {"points": (4, 200)},
+    ),
+    "transposed": (
+        "c (float[6,4,4] lidar2img, float[6,4,4] ego) => (float[6,4,4] p) {"
+        " t = Transpose<perm = [0,2,1]>(lidar2img) p = MatMul(t, ego) }",
+        {"ego": (6, 4, 4)},
+    ),
+    "of many points": (
+        "c (float[6,4,4] lidar2img, float[4,40000] points) => (float[6,4,40000] p)"
+        " { p = MatMul(lidar2img, points) }",
+        {"points": (4, 40000)},
+    ),
+    "as Gemm": (
+        "c (float[4,4] ego_pose, float[200,4] points) => (float[4,200] p)"
+        " { p = Gemm<transB = 1>(ego_pose, points) }",
+        {"points": (200, 4)},
+    ),
+    "of an open number of cameras": (
+        "c (float[C,4,4] lidar2img, float[4,200] points) => (float[C,4,200] p)"
+        " { p = MatMul(lidar2img, points) }",
+        {"points": (4, 200)},
+    ),
+    "of an unknown shape": (
+        "c (float lidar2img, float[4,200] points) => (float p)"
+        " { p = MatMul(lidar2img, points) }",
+        {"points": (4, 200)},
+    ),
+    "inverted": (
+        "c (float[6,4,4] lidar2img, float[4,200] points) => (float p)"
+        " { i = trt.InverseTRT(lidar2img) p = MatMul(i, points) }",
+        {"points": (4, 200)},
+    ),
+    "after an Einsum": (
+        "c (float[6,4,4] lidar2img, float[4,4] ego, float[4,200] points) => (float p)"
+        ' { e = Einsum<equation = "nij,jk->nik">(lidar2img, ego)'
+        " p = MatMul(e, points) }",
+        {"ego": (4, 4), "points": (4, 200)},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", PROJECTIONS)
+def test_a_projection_stays_float_however_it_is_batched(case: str) -> None:
+    text, shapes = PROJECTIONS[case]
+
+    before = by_output(planned(text, shapes, "paper{without=[gemv]}"))["p"]
+    found = by_output(planned(text, shapes, ALONE))["p"]
+
+    assert before.dtype == "int8"
+    assert (found.dtype, found.rule) == ("float", "geometry")
+    assert "the input " in found.reason
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_batching_of_a_projection_is_int8(seed: int) -> None:
+    """Cameras, points, axes in between and sides drawn at random."""
+    draw = np.random.default_rng(seed)
+    cameras, points = int(draw.integers(1, 9)), int(draw.integers(1, 5000))
+    ones = [1] * int(draw.integers(0, 3))
+    matrix, columns = [cameras, *ones, 4, 4], [4, points]
+    if draw.random() < 0.5:
+        columns = [cameras, *ones, *columns]
+    text = (
+        f"c (float{matrix} camera, float{columns} points) => (float p)"
+        " { m = Identity(camera) p = MatMul(m, points) }"
+    )
+    found = by_output(planned(text, {"points": tuple(columns)}, ALONE))["p"]
+
+    assert (found.dtype, found.rule) == ("float", "geometry")
+
+
+BEHIND = """c (float[1,6,4,4] lidar2img, float[1,6,32,9,9] image, float[4,200] points,
+    float[32,32] w, float[32,32] v, float[2,32] embed) => (float y, float s)
+    <int64[1] first = {0}, int64[1] second = {2}, int64[1] axis = {2},
+     int64[4] map = {6, 32, 9, 9}, int64[4] cells = {6, 10, 20, 2}> {
+    p = MatMul(lidar2img, points)
+    pixels = Slice(p, first, second, axis)
+    places = Transpose<perm = [0,1,3,2]>(pixels)
+    grid = Reshape(places, cells)
+    features = Reshape(image, map)
+    sampled = GridSample(features, grid)
+    rows = Transpose<perm = [0,2,3,1]>(sampled)
+    h = MatMul(rows, w)
+    e = MatMul(places, embed)
+    r = Relu(e)
+    y = MatMul(r, v)
+    waves = Sin(places)
+    s = MatMul(waves, embed)
+}"""
+LEARNED = {"points": (4, 200), "w": (32, 32), "v": (32, 32), "embed": (2, 32)}
+
+
+def test_layers_on_sampled_or_embedded_features_are_no_geometry() -> None:
+    found = by_output(planned(BEHIND, LEARNED, ALONE))
+
+    rules = {name: found[name].rule for name in ("p", "h", "e", "y", "s")}
+    assert rules == {
+        "p": "geometry",  # the projection
+        "h": "layer",  # reads what was sampled there
+        "e": "geometry",  # reads pixels
+        "y": "layer",  # reads what the layer before made of them
+        "s": "layer",  # reads sines
+    }
+
+
+def test_an_encoder_of_flat_matrices_is_the_last_to_read_them() -> None:
+    text = """c (float[6,4,4] lidar2img, float[16,64] w, float[64,64] v) => (float y)
+        <int64[2] flat = {6, 16}> {
+        f = Reshape(lidar2img, flat) a = MatMul(f, w) r = Relu(a) y = MatMul(r, v)
+    }"""
+    found = by_output(planned(text, {"w": (16, 64), "v": (64, 64)}, ALONE))
+
+    assert (found["a"].rule, found["y"].rule) == ("geometry", "layer")
+
+
+def test_learned_points_become_pixels_and_end_in_the_layer_that_reads_them() -> None:
+    text = """c (float[6,4,4] lidar2img, float[6,50,32] query, float[32,3] to_points,
+        float[6,50,1] one, float[4,32] embed, float[32,32] w) => (float y) {
+        l = MatMul(query, to_points) h = Concat<axis = 2>(l, one)
+        t = Transpose<perm = [0,2,1]>(h) p = MatMul(lidar2img, t)
+        rows = Transpose<perm = [0,2,1]>(p) e = MatMul(rows, embed)
+        both = Add(e, query) y = MatMul(both, w)
+    }"""
+    shapes = {"to_points": (32, 3), "embed": (4, 32), "w": (32, 32)}
+    found = by_output(planned(text, shapes, ALONE))
+
+    rules = {name: found[name].rule for name in ("l", "p", "e", "y")}
+    assert rules == {"l": "layer", "p": "weight", "e": "geometry", "y": "layer"}
+
+
+@pytest.mark.parametrize(
+    "input_", ["float[1,256,4,4] memory", "float[6,4,40] camera", "int64[6,4,4] ids"]
+)
+def test_other_inputs_are_no_matrices(input_: str) -> None:
+    kind, name = input_.split()
+    columns = kind.rstrip("]").split(",")[-1]
+    text = (
+        f"c ({input_}, float[{columns},200] w) => (float y)"
+        f" {{ f = Cast<to = 1>({name}) y = MatMul(f, w) }}"
+    )
+    found = by_output(planned(text, {"w": (int(columns), 200)}, ALONE))
+
+    assert found["y"].rule == "layer"
+
+
+def test_the_default_keeps_geometry_in_float() -> None:
+    rules = RULE_SETS.parse("safe").rules()
+
+    assert Geometry() in rules
+    text, shapes = PROJECTIONS["batched"]
+    weights = {name: np.ones(shape) for name, shape in shapes.items()}
+    plan = make_plan(net(OPSETS + text, weights), HEAD)
+    assert (plan.rules, by_output(plan)["p"].rule) == ("safe", "geometry")
