@@ -54,12 +54,9 @@ PEERS = {
     "ModelOpt": "modelopt",
 }
 OURS: dict[str, tuple[str, Pass]] = {
-    "ours for TensorRT": (FLOAT, QuantizeInt8()),
+    "ours for TensorRT, rules paper": (FLOAT, QuantizeInt8(rules="paper")),
     "ours": (FLOAT, QuantizeInt8(target="onnxruntime")),
-    "ours, rules tensorrt": (
-        FLOAT,
-        QuantizeInt8(target="onnxruntime", rules="tensorrt"),
-    ),
+    "ours, rules paper": (FLOAT, QuantizeInt8(target="onnxruntime", rules="paper")),
     "ModelOpt, lowered": ("ModelOpt", LowerInt8()),
 }
 """What each is made of, and how."""

@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=options.out) as folder:
         for scheme in PAPER_MB:
-            for rules in RULE_SETS.names():
+            for rules in ("safe", "paper"):
                 for target in TARGETS.names():
                     made = placed(model, scheme, rules, target)
                     saved = Path(folder) / "placed.onnx"

@@ -35,7 +35,7 @@ compress highway -r feature-ext --frames frames -o feature-ext.onnx
 compress highway -r full --target onnxruntime --frames frames -o full.onnx
 compress highway -r minus-occ --frames frames -o minus-occ.onnx
 compress seven.onnx -r exact -o seven.exact.onnx
-compress seven.onnx -r full --rules tensorrt --frames seven -o seven.full.onnx
+compress seven.onnx -r full --frames seven -o seven.full.onnx
 calibrate seven.onnx seven -o seven.ranges.json --method percentile:99.9
 compress seven.onnx --scheme full --ranges seven.ranges.json --method percentile:99.9 \
 -o seven.ranges.onnx
