@@ -26,7 +26,7 @@ def by_output(plan: QuantPlan) -> dict[str, Decision]:
     return {each.output: each for each in plan.decisions}
 
 
-PROJECTIONS = {
+PROJECTIONS: dict[str, tuple[str, dict[str, tuple[int, ...]]]] = {
     "batched": (
         "c (float[6,4,4] lidar2img, float[6,4,200] points) => (float[6,4,200] p)"
         " { p = MatMul(lidar2img, points) }",
