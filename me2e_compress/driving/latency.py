@@ -238,23 +238,22 @@ def parse_latency(
 
     Args:
         text: Name and options, see `LATENCY_SOURCES`.
-        in_order: These three where the source has such an option; one at its default
-            leaves what the text says.
+        in_order: One of these three at its default leaves what the text says.
         scale: Positive, whatever the source.
-        seed: 0 or more.
+        seed: 0 or more; a source that draws nothing has no use for it.
 
     Raises:
-        EvaluationError: No such source, or an option that it refuses.
+        EvaluationError: No such source, or an option that it refuses or has not.
     """
     _check_positive("scale", scale)
     source = LATENCY_SOURCES.parse(text)
     given = {"in_order": in_order, "scale": scale, "seed": seed}
     default = {"in_order": False, "scale": 1.0, "seed": 0}
     options: dict[str, object] = {
-        option: value
-        for option, value in given.items()
-        if option in type(source).__dataclass_fields__ and value != default[option]
+        option: value for option, value in given.items() if value != default[option]
     }
+    if "seed" not in type(source).__dataclass_fields__:
+        options.pop("seed", None)
     return LATENCY_SOURCES.with_options(source, options) if options else source
 
 

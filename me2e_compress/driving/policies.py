@@ -76,6 +76,7 @@ POLICIES: Registry[Driver] = Registry(
         "expert": f"{_HIGHWAY}:ExpertDriver",
         "blind": f"{_HIGHWAY}:BlindDriver",
         "onnx": f"{_HIGHWAY}:OnnxDriver",
+        "highway": "me2e_compress.workflows.shipped_driver:ShippedDriver",
     },
 )
 
@@ -87,8 +88,9 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
     """Build the driver of a text: a policy with its options, or an ONNX file's path.
 
     Args:
-        text: ``expert``, ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``, the name
-            of another package's policy, or else a path.
+        text: ``expert``, ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``,
+            ``highway`` for the driver that ships, the name of another package's policy,
+            or else a path.
         adapter: TOML file that adapts a model; a policy without models ignores it.
 
     Raises:

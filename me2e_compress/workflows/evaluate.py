@@ -23,6 +23,7 @@ from me2e_compress.workflows.checks import check_folder, check_number, model_pat
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number
 from me2e_compress.workflows.score import driving_score, score_records, scores_table
+from me2e_compress.zoo.shipped import SHIPPED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,6 +188,8 @@ def driver_of(text: str, adapter: str | Path | None = None) -> Driver:
     Raises:
         EvaluationError: none of them.
     """
+    if text in SHIPPED:  # by its path, which a file of that name may be instead
+        text = str(model_path(text))
     driver = driver_named(text, None if adapter is None else Path(adapter))
     if not isinstance(driver, OnnxDriver):
         return driver

@@ -1,9 +1,11 @@
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from me2e_compress.driving.latency import (
+    FrameRate,
     LatencySource,
     MeasuredLatency,
     NoLatency,
@@ -96,6 +98,25 @@ def test_other_words_are_refused_on_one_line(text: str, words: str) -> None:
     with pytest.raises(EvaluationError, match=words) as caught:
         parse_latency(text)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("none", {"scale": 2.0}, "none has no option 'scale'; it has none"),
+        ("fps:10", {"scale": 2.0}, "fps has no option 'scale'; it has fps"),
+        ("measured", {"in_order": True}, "measured has no option 'in_order'"),
+    ],
+)
+def test_an_option_that_a_source_has_not_is_refused(
+    text: str, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(EvaluationError, match=words):
+        parse_latency(text, **options)
+
+
+def test_a_seed_is_of_everything_and_harms_no_source_without() -> None:
+    assert parse_latency("fps:10", seed=3) == FrameRate(10.0)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
