@@ -14,6 +14,7 @@ from google.protobuf.message import DecodeError
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
 from me2e_compress.graph.external import data_file, external_tensors, settle
+from me2e_compress.graph.opset import lower
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
@@ -30,11 +31,13 @@ def load(path: str | Path) -> ir.Model:
 
     Initializers that the exporter also listed as inputs
     (``keep_initializers_as_inputs``) stop being inputs, which is valid from IR version
-    4 on: older models are raised to that.
+    4 on: older models are raised to that. Newer ones than onnxruntime reads are
+    written down to what it does (:func:`~me2e_compress.graph.opset.lowered` says so).
 
     Raises:
         GraphError: no such file, not an ONNX model, cut short, or its data file is
-            missing, shorter than the model says or not in the model's folder.
+            missing, shorter than the model says or not in the model's folder; or it
+            is newer than onnxruntime and cannot be written as an older one.
     """
     path = Path(path)
     if not path.is_file():
@@ -49,6 +52,7 @@ def load(path: str | Path) -> ir.Model:
         raise GraphError(f"{path}: {error}") from error
     ir.external_data.set_base_dir(model.graph, path.parent)
     settle(model, path)
+    lower(model, path)
     common.RemoveInitializersFromInputsPass()(model)
     model.ir_version = max(model.ir_version, _PLAIN_INITIALIZERS_SINCE_IR)
     return model

@@ -19,6 +19,7 @@ from me2e_compress.errors import (
     VerificationError,
 )
 from me2e_compress.graph import provenance
+from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -63,7 +64,8 @@ class PassManager:
             VerificationError: a pass broke the contract or changed the outputs.
         """
         with collector_paused():
-            return self._run(model.clone(), context, progress or _silent)
+            report = self._run(model.clone(), context, progress or _silent)
+            return dataclasses.replace(report, read_as=lowered(model))
 
     def _run(self, model: ir.Model, context: Context, progress: Progress) -> Report:
         graph.infer_shapes(model)

@@ -96,6 +96,7 @@ class Report(Displayed):
         steps: pass by pass.
         verifications: the numeric checks, in order.
         lossy: the passes that are not exact, in order, to be judged by what they did.
+        read_as: what was changed when the file was read; empty if nothing was.
     """
 
     model: ir.Model
@@ -103,6 +104,7 @@ class Report(Displayed):
     steps: tuple[Step, ...]
     verifications: tuple[Verification, ...]
     lossy: tuple[LossyPass, ...] = ()
+    read_as: str = ""
 
     @property
     def headline(self) -> str:
@@ -124,7 +126,11 @@ class Report(Displayed):
             output: the file that was written; both are hashed as they are on disk.
         """
         return {
-            "source": {"file": source.name, "sha256": graph.sha256_of(source)},
+            "source": {
+                "file": source.name,
+                "sha256": graph.sha256_of(source),
+                "read_as": self.read_as,
+            },
             "output": {"file": output.name, "sha256": graph.sha256_of(output)},
             "pipeline": self.pipeline,
             "steps": [dataclasses.asdict(step) for step in self.steps],

@@ -27,6 +27,7 @@ from me2e_compress.workflows.checks import (
     check_folder,
     check_output,
     model_path,
+    read_graph,
 )
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -177,7 +178,7 @@ def calibrate(
     checkpoint = output.with_name(output.name + ".checkpoint")
     _check_outputs(source, frames, (output, checkpoint), options)
     passes = with_sizes(recipe.load(options.recipe), options.dims)
-    loaded = graph.load(source)
+    loaded = read_graph(source, listener)
     part = None if frames is None else _part(loaded, Path(frames), options)
     ready = PreparedGraph.of(source, loaded, options.module_map, passes)
     tensors = ready.tensors()

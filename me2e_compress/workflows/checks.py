@@ -9,7 +9,9 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.graph.opset import lowered
 from me2e_compress.modules import ModuleMap, map_of
+from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 Given: TypeAlias = str | Path | None
@@ -36,6 +38,18 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
     if str(text) in SHIPPED:
         return shipped(str(text))
     raise GraphError(f"{text}: no such file; models that ship: {', '.join(SHIPPED)}")
+
+
+def read_graph(path: Path, listener: Listener) -> ir.Model:
+    """Read a graph, and warn of what was changed so that onnxruntime reads it.
+
+    Raises:
+        GraphError: not a graph.
+    """
+    model = graph.load(path)
+    if said := lowered(model):
+        listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
+    return model
 
 
 def load_map(named: str | Path | None, model: ir.Model) -> ModuleMap:

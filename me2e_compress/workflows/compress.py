@@ -27,6 +27,7 @@ from me2e_compress.workflows.checks import (
     check_output,
     load_map,
     model_path,
+    read_graph,
 )
 from me2e_compress.workflows.compress_fidelity import (
     MeasuredLoss,
@@ -178,7 +179,7 @@ def compress(
     check_output(_written(output), (source, named, frames, options.module_map, *read))
     start = process_time()
     with collector_paused():
-        loaded = graph.load(source)
+        loaded = read_graph(source, listener)
         modules = load_map(options.module_map, loaded)
         frames_of = _split(source, loaded, frames, passes, options)
         context = Context(modules, frames_of.calibration, options.seed)

@@ -10,6 +10,7 @@ import onnx_ir as ir
 from me2e_compress import graph, recipe
 from me2e_compress.graph import Port, provenance
 from me2e_compress.graph.macs import why_uncounted
+from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
@@ -39,6 +40,7 @@ class InspectResult(Result):
         file: its name.
         file_bytes: with the weights beside it.
         opset: of the default domain.
+        lowered: what was changed so that onnxruntime reads it; empty if nothing was.
         domains: further operator domains.
         map: the module map that was used.
         inputs: what it takes.
@@ -65,12 +67,15 @@ class InspectResult(Result):
     unknown_macs_nodes: int
     uncounted: dict[str, int]
     open_dimensions: tuple[str, ...]
+    lowered: str = ""
 
     @property
     def headline(self) -> str:
         """File, size, opset."""
         more = f" and {', '.join(self.domains)}" if self.domains else ""
-        return f"{self.file}: {megabytes(self.file_bytes)} MB, opset {self.opset}{more}"
+        read = f" ({self.lowered})" if self.lowered else ""
+        size = f"{megabytes(self.file_bytes)} MB"
+        return f"{self.file}: {size}, opset {self.opset}{more}{read}"
 
     def tables(self) -> tuple[Table, ...]:
         """Return the interface, and the modules."""
@@ -165,6 +170,7 @@ def inspect(
         unknown,
         _uncounted(folded),
         open_dimensions(loaded),
+        lowered(loaded),
     )
 
 
