@@ -111,33 +111,55 @@ def say(line: str) -> None:
 
 
 def print_table(content: Table) -> None:
-    """Print a table and its note; intervals too, if the terminal is wide enough.
+    """Print a table and its note; intervals too, where they fit.
 
     Where its words do not fit side by side, a row is a few lines: no name is broken.
     """
-    widths = _widths(content)
+    intervals = _is_wide() or _room(content, intervals=True) >= 0
+    widths = _widths(content, intervals)
     if widths is None:
         _print_rows(content)
     else:
-        console.print(_grid(content, widths))
+        console.print(_grid(content, widths, intervals))
     if content.note:
         console.print(Text(content.note, "dim"))
+    if not intervals and any(cell.detail for row in content.rows for cell in row):
+        console.print(Text(f"Intervals: in a terminal of {WIDE} columns.", "dim"))
     if content.details and is_verbose():
         console.print(Text(content.details, "dim"), soft_wrap=True)
 
 
-def _widths(content: Table) -> list[int] | None:
-    """Share the terminal among columns so that no word breaks; None if it is narrow."""
+def _room(content: Table, *, intervals: bool) -> int:
+    """Return how many columns of the terminal a table leaves; below 0: too few."""
+    return console.width - _frame(content) - sum(_longest(content, intervals, False))
+
+
+def _frame(content: Table) -> int:
     count = len(content.columns)
+    return 3 * count + 1 if _is_wide() else 3 * (count - 1)
+
+
+def _longest(content: Table, intervals: bool, words: bool) -> list[int]:
+    """Return the longest line, or word, of every column."""
     columns = [
-        [name, *(_text(row[at], _is_wide()).plain for row in content.rows)]
+        [name, *(_text(row[at], intervals).plain for row in content.rows)]
         for at, name in enumerate(content.columns)
     ]
-    words = [[len(w) for text in texts for w in text.split()] for texts in columns]
-    lines = [[len(w) for text in texts for w in text.splitlines()] for texts in columns]
-    least, most = ([max(each, default=1) for each in of] for of in (words, lines))
-    frame = 3 * count + 1 if _is_wide() else 3 * (count - 1)
-    spare, wanted = console.width - frame - sum(least), sum(most) - sum(least)
+    return [
+        max(
+            (len(w) for t in texts for w in (t.split() if words else t.splitlines())),
+            default=1,
+        )
+        for texts in columns
+    ]
+
+
+def _widths(content: Table, intervals: bool) -> list[int] | None:
+    """Share the terminal among columns so that no word breaks; None if it is narrow."""
+    least = _longest(content, intervals, True)
+    most = _longest(content, intervals, False)
+    spare = console.width - _frame(content) - sum(least)
+    wanted = sum(most) - sum(least)
     if spare < 0:
         return None
     if wanted <= spare:
@@ -148,7 +170,7 @@ def _widths(content: Table) -> list[int] | None:
     ]
 
 
-def _grid(content: Table, widths: Sequence[int]) -> Shown:
+def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:
     """Make a table whose first columns are words and the rest numbers."""
     made = Shown(title=Text(content.title, "bold"), title_justify="left")
     made.show_edge = made.pad_edge = _is_wide()  # four characters that numbers can use
@@ -156,7 +178,7 @@ def _grid(content: Table, widths: Sequence[int]) -> Shown:
         side: Literal["left", "right"] = "left" if at < content.words else "right"
         made.add_column(Text(name), justify=side, overflow="fold", width=width)
     for row in content.rows:
-        made.add_row(*(_text(cell, _is_wide()) for cell in row))
+        made.add_row(*(_text(cell, intervals) for cell in row))
     return made
 
 

@@ -11,6 +11,7 @@ from me2e_compress.study.definition import Condition, Study, Timing, Variant
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
 from me2e_compress.study.tables import differences, scoreboards
+from me2e_compress.study.verdict import verdict
 from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.compare import compare
@@ -35,7 +36,7 @@ class DriveResult(Result):
     Attributes:
         study: everything that was found.
         written: its files.
-        ending: what the user has now, in words.
+        ending: the verdict, and what the user has now.
     """
 
     study: StudyResult
@@ -44,11 +45,11 @@ class DriveResult(Result):
 
     @property
     def headline(self) -> str:
-        """What the user has now."""
+        """Size, time and plan, in one line."""
         return self.ending[0]
 
     def lines(self) -> tuple[str, ...]:
-        """Return what the user has, and how to make it for another target."""
+        """Return the verdict, what the user has, and another target's command."""
         return self.ending
 
     def tables(self) -> tuple[Table, ...]:
@@ -146,6 +147,7 @@ class DriverDemo:
         chosen = ("--routes", self.routes, "--scheme", self.scheme)
         written = write_study(found, self.out, (*words, *chosen))
         ending = (
+            *verdict(found, self.scheme),
             f"{self._small} and {written.report} are yours.",
             f"Its int8 is for {TARGET}, which drives here. For TensorRT: me2e-compress"
             f" compress {self.name} -r {self.scheme} --frames {self._frames} -o"

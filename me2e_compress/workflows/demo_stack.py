@@ -10,7 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.interleaved import RunTimes, time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.checks import check_folder
-from me2e_compress.workflows.compare import compare
+from me2e_compress.workflows.compare import CompareResult, compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
 from me2e_compress.workflows.export import export_stack
@@ -33,17 +33,33 @@ class FilesResult(Result):
         threads: of onnxruntime.
         rounds: how often each was run.
         ending: what the user has now, in words.
+        plan: how far it moved, in words.
     """
 
     times: dict[Path, RunTimes]
     threads: int
     rounds: int
     ending: str
+    plan: str
 
     @property
     def headline(self) -> str:
         """What the user has now."""
         return self.ending
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the verdict: size and time of the last file, the plan; the files."""
+        (source, before), *_, (path, after) = self.times.items()
+        sizes = graph.file_bytes(path), graph.file_bytes(source)
+        ratio = after.median_wall_s / before.median_wall_s
+        return (
+            f"{megabytes(sizes[0])} MB, {sizes[0] / sizes[1]:.0%} of"
+            f" {megabytes(sizes[1])}; {after.median_wall_s:.2f} s a frame, {ratio:.2f}"
+            f" of {before.median_wall_s:.2f}",
+            self.plan,
+            "nothing drives here: what that means on the road is not measured",
+            self.ending,
+        )
 
     def tables(self) -> tuple[Table, ...]:
         """Return a row a file."""
@@ -109,6 +125,7 @@ class StackDemo:
     scheme: str = "feature-ext"
     rounds: int = 4
     threads: int = 2
+    _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         """Check recipe and folder."""
@@ -141,7 +158,9 @@ class StackDemo:
 
     def compare(self, listener: Listener) -> Result:
         """Compare the small graph with the stack on other frames."""
-        return compare(self._source, self._small, self._held_out, listener)
+        found = compare(self._source, self._small, self._held_out, listener)
+        self._compared.append(found)
+        return found
 
     def time(self, listener: Listener) -> FilesResult:
         """Time the stack, its exact form and the small graph in turn."""
@@ -162,6 +181,7 @@ class StackDemo:
             self.threads,
             self.rounds,
             f"{self._small} and {report} are yours.",
+            self._compared[-1].headline if self._compared else "plan: not measured",
         )
 
     @property

@@ -4,7 +4,7 @@ import pytest
 
 from me2e_compress.cli import console
 from me2e_compress.cli.console import print_table
-from me2e_compress.display import table
+from me2e_compress.display import Cell, Table, table
 
 NODE = "/planner/agent_layer/cross_attn/value/MatMul"
 COLUMNS = ("module", "node", "op", "rule", "why")
@@ -65,3 +65,24 @@ def test_sentences_wrap_between_words(
     assert all(len(line) <= 80 for line in lines)
     assert sum(line.count("int8") for line in lines) == 20
     assert any(NODE in line for line in lines)
+
+
+def scores(count: int) -> Table:
+    row = (Cell("full"), *[Cell("+13.4", "-0.3 to +40.6")] * count)
+    columns = ("variant", *[f"score {at}" for at in range(count)])
+    return Table("Scores", columns, (row,), "Each with its interval.")
+
+
+def test_intervals_that_fit_stand_on_a_narrow_terminal_too(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """+13.4 points stood there without the interval that the caption promises."""
+    monkeypatch.setattr(console.console, "width", 80)
+
+    print_table(scores(2))
+    assert "-0.3 to +40.6" in capsys.readouterr().out
+
+    print_table(scores(6))
+    said = capsys.readouterr().out
+    assert "-0.3" not in said
+    assert "Intervals: in a terminal of 120 columns." in said
