@@ -21,6 +21,8 @@ PASSES: Registry[Pass] = Registry(
         "ablate-modules": f"{_HERE}.ablate_modules:AblateModules",
         "fuse-basic": f"{_HERE}.fuse_basic:FuseBasic",
         "quantize-int8": f"{_HERE}.quantize_int8:QuantizeInt8",
+        "convert-float16": f"{_HERE}.convert_float16:ConvertFloat16",
+        "convert-float32": f"{_HERE}.convert_float32:ConvertFloat32",
         "lower-int8": f"{_HERE}.lower_int8:LowerInt8",
     },
 )

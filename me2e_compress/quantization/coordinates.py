@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator
 import onnx_ir as ir
 
 from me2e_compress.graph import input_at
+from me2e_compress.graph.shapes import is_one_matrix
 from me2e_compress.quantization.find_attention import behind
 
 _POSITIONS: dict[str, tuple[int, ...]] = {
@@ -102,6 +103,37 @@ def find_coordinates(
             data = node.inputs[: _DATA_ONLY.get(node.op_type, len(node.inputs))]
             queue.extend((each, reader) for each in data if each is not None)
     return {**found, **_companions(model, found, constants)}
+
+
+def position_arithmetic(
+    model: ir.Model, constants: Collection[ir.Value]
+) -> frozenset[ir.Node]:
+    """Find the nodes that positions are computed with, and the layers they come from.
+
+    The same walk as :func:`find_coordinates`; it ends at layers with a weight, and goes
+    on through other products, which are projections: of two computed operands, or of
+    a camera's matrix and a table of points.
+    """
+    found: set[ir.Node] = set()
+    queue = deque(value for value, _ in _positions(model.graph))
+    while queue:
+        node = queue.popleft().producer()
+        if node is None or node in found:
+            continue
+        if node.op_type not in _ARITHMETIC and node.op_type not in _LAYERS:
+            continue
+        found.add(node)
+        if node.op_type in _ARITHMETIC or not _has_weight(node, constants):
+            data = node.inputs[: _DATA_ONLY.get(node.op_type, len(node.inputs))]
+            queue.extend(each for each in data if each is not None)
+    return frozenset(found)
+
+
+def _has_weight(layer: ir.Node, constants: Collection[ir.Value]) -> bool:
+    """Return whether a layer multiplies every row by one constant matrix."""
+    if layer.op_type == "MatMul" and not is_one_matrix(layer):
+        return False
+    return len(layer.inputs) > 1 and layer.inputs[1] in constants
 
 
 def _positions(graph: ir.Graph) -> Iterator[tuple[ir.Value, str]]:

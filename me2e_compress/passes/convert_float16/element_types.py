@@ -1,0 +1,228 @@
+"""Change the element type that nodes compute in, with as few Casts as that takes."""
+
+from collections.abc import Collection, Iterable
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+
+from me2e_compress import rewrite
+from me2e_compress.graph import is_standard, opset_of, provenance
+
+FLOAT, HALF = ir.DataType.FLOAT, ir.DataType.FLOAT16
+_ONNX = {FLOAT: "tensor(float)", HALF: "tensor(float16)"}
+_FIRST_ONLY = {"Resize": 1}
+"""Operators whose later inputs are scales and regions: how many inputs hold data."""
+
+
+class ElementTypes:
+    """Which inputs and outputs of a node may be of which element type.
+
+    Args:
+        model: the graph; its opset decides.
+        source: the type that is given up.
+        wanted: the type that takes its place.
+    """
+
+    def __init__(
+        self, model: ir.Model, source: ir.DataType, wanted: ir.DataType
+    ) -> None:
+        self.source, self.wanted = source, wanted
+        self._opset = opset_of(model)
+
+    def inputs(self, node: ir.Node) -> tuple[int, ...]:
+        """Return the inputs of the source type that can be of the wanted one.
+
+        Of a Cast: where that is the wider type. Else it would round before it casts.
+        """
+        if node.op_type == "Cast":
+            read = None if node.inputs[0] is None else node.inputs[0].dtype
+            return (0,) if self.wanted == FLOAT and read == self.source else ()
+        return tuple(
+            index
+            for index, value in enumerate(node.inputs)
+            if value is not None
+            and value.dtype == self.source
+            and self._variable(node, index) is not None
+        )
+
+    def outputs(self, node: ir.Node) -> tuple[int, ...]:
+        """Return the outputs that change type when those inputs do.
+
+        A Cast to the source type casts to the wanted one then.
+        """
+        if node.op_type == "Cast" and node.outputs[0].dtype == self.source:
+            return (0,)
+        schema = self._schema(node)
+        bound = {self._variable(node, index) for index in self.inputs(node)}
+        if schema is None or not bound:
+            return ()
+        if node.op_type == "DequantizeLinear":  # its output is of its scale's type
+            return (0,)
+        return tuple(
+            index
+            for index, value in enumerate(node.outputs)
+            if value.dtype == self.source
+            and _formal(schema.outputs, index).type_str in bound
+        )
+
+    def _variable(self, node: ir.Node, index: int) -> str | None:
+        """Return the type variable of an input that may be of the wanted type."""
+        schema = self._schema(node)
+        if schema is None or index >= _FIRST_ONLY.get(node.op_type, index + 1):
+            return None
+        name = str(_formal(schema.inputs, index).type_str)
+        allowed = {
+            kind
+            for constraint in schema.type_constraints
+            if constraint.type_param_str == name
+            for kind in constraint.allowed_type_strs
+        }
+        return name if _ONNX[self.wanted] in allowed else None
+
+    def _schema(self, node: ir.Node) -> onnx.defs.OpSchema | None:
+        if not is_standard(node) or node.op_type in ("Cast", "CastLike"):
+            return None
+        if not onnx.defs.has(node.op_type, self._opset, ""):
+            return None
+        return onnx.defs.get_schema(node.op_type, self._opset, "")
+
+
+def _formal(
+    parameters: Iterable[onnx.defs.OpSchema.FormalParameter], index: int
+) -> onnx.defs.OpSchema.FormalParameter:
+    listed = list(parameters)
+    return listed[min(index, len(listed) - 1)]  # the last may be variadic
+
+
+class Retyping:
+    """Gives nodes of a graph another element type, and puts Casts at the borders.
+
+    Args:
+        model: the graph, types inferred; it is changed in place.
+        types: from which type to which.
+        by: the pass's name.
+
+    Attributes:
+        changed: how many nodes changed type, and Casts were added.
+    """
+
+    def __init__(self, model: ir.Model, types: ElementTypes, by: str) -> None:
+        self._graph = model.graph
+        self._types = types
+        self._by = by
+        self._names = rewrite.value_names(model.graph)
+        self._casts: dict[tuple[ir.Value, ir.DataType], ir.Value] = {}
+        self.changed = 0
+
+    def run(self, nodes: Collection[ir.Node], *, keep_io: bool) -> None:
+        """Retype these nodes, and the constants that only they read.
+
+        Args:
+            nodes: of the main graph.
+            keep_io: whether inputs and outputs of the graph keep their types.
+        """
+        types = self._types
+        chosen = {node: types.inputs(node) for node in nodes}
+        results = {
+            node.outputs[index] for node in nodes for index in types.outputs(node)
+        }
+        if not keep_io:
+            results.update(v for v in self._graph.inputs if v.dtype == types.source)
+        uses = {
+            value: [(node, index) for node, index in value.uses()]
+            for value in self._float_values(results)
+        }
+        for value in results:
+            value.type = ir.TensorType(types.wanted)  # clones share the old one
+        for node in nodes:
+            if node.op_type == "Cast":
+                node.attributes["to"] = ir.AttrInt64("to", types.wanted.value)
+            if chosen[node] or any(each in results for each in node.outputs):
+                provenance.inherit(node, [node], by=self._by)
+                self.changed += 1
+        wanted = {(n, index) for n, indices in chosen.items() for index in indices}
+        for value, users in uses.items():
+            self._serve(value, users, wanted)
+        self._outputs(results, keep_io=keep_io)
+
+    def _float_values(self, results: Iterable[ir.Value]) -> list[ir.Value]:
+        """List inputs, constants and results of the source type, in graph order."""
+        made = (value for node in self._graph for value in node.outputs)
+        every = (*self._graph.inputs, *self._graph.initializers.values(), *made)
+        return [v for v in dict.fromkeys(every) if v.dtype == self._types.source]
+
+    def _serve(
+        self,
+        value: ir.Value,
+        users: list[tuple[ir.Node, int]],
+        wanted: Collection[tuple[ir.Node, int]],
+    ) -> None:
+        """Let every reader of a value read it in the type that it takes."""
+        types = self._types
+        inside = [use for use in users if use in wanted]
+        alone = bool(inside) and len(inside) == len(users)
+        if self._is_constant(value) and alone and not value.is_graph_output():
+            self._convert(value)
+            return
+        for node, index in users:
+            kind = types.wanted if (node, index) in wanted else types.source
+            if kind != value.dtype:
+                node.replace_input_with(index, self._as(value, kind, node))
+
+    def _as(self, value: ir.Value, kind: ir.DataType, reader: ir.Node) -> ir.Value:
+        """Return a value in another type; equal wishes share one Cast."""
+        if (value, kind) not in self._casts:
+            if self._is_constant(value):
+                array = _converted(value, kind)
+                name = f"{value.name}_{kind.name.lower()}"
+                self._casts[value, kind] = rewrite.add_constant(
+                    self._graph, array, name, self._names
+                )
+            else:
+                self._casts[value, kind] = self._cast(value, kind, reader)
+        return self._casts[value, kind]
+
+    def _cast(self, value: ir.Value, kind: ir.DataType, reader: ir.Node) -> ir.Value:
+        name = f"{value.name}_{kind.name.lower()}"
+        name = rewrite.fresh_name(name, self._names)
+        cast = ir.node("Cast", [value], {"to": kind.value}, name=name)
+        result, producer = cast.outputs[0], value.producer()
+        result.name, result.shape, result.type = name, value.shape, ir.TensorType(kind)
+        source = reader if producer is None else producer
+        provenance.inherit(cast, [source], by=self._by)
+        if producer is None:
+            self._graph.insert_before(self._graph[0], cast)
+        else:
+            self._graph.insert_after(producer, cast)
+        self.changed += 1
+        return result
+
+    def _outputs(self, results: Collection[ir.Value], *, keep_io: bool) -> None:
+        """Give outputs that changed type back in theirs, under their names."""
+        for index, value in enumerate(self._graph.outputs):
+            producer = value.producer()
+            if not keep_io or value not in results or producer is None:
+                continue
+            result = self._as(value, self._types.source, producer)
+            name, shape = value.name, value.shape
+            value.name = rewrite.fresh_name(f"{name}_inside", self._names)
+            result.name, result.shape = name, shape
+            self._graph.outputs[index] = result
+
+    def _is_constant(self, value: ir.Value) -> bool:
+        return value.is_initializer() and not value.is_graph_input()
+
+    def _convert(self, value: ir.Value) -> None:
+        array = _converted(value, self._types.wanted)
+        value.const_value = ir.tensor(array, name=value.name)
+        value.type = ir.TensorType(self._types.wanted)
+        self.changed += 1
+
+
+def _converted(
+    value: ir.Value, kind: ir.DataType
+) -> np.ndarray[tuple[int, ...], np.dtype[np.generic]]:
+    tensor = value.const_value
+    array = np.empty(0) if tensor is None else tensor.numpy()
+    return np.ascontiguousarray(array).astype(kind.numpy()).reshape(array.shape)

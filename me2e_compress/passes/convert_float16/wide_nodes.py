@@ -1,0 +1,195 @@
+"""Which nodes stay in float32 when a graph becomes float16, and why."""
+
+import fnmatch
+import itertools
+from collections.abc import Collection, Iterable, Mapping
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.sample import Recording
+from me2e_compress.graph import is_standard, provenance, static_shape
+from me2e_compress.graph.nodes import Numbers, constant_values, numbers_of
+from me2e_compress.passes.convert_float16.element_types import ElementTypes
+from me2e_compress.quantization.coordinates import position_arithmetic
+
+LARGEST = float(np.finfo(np.float16).max)
+"""65504."""
+
+HEADROOM = 2.0
+"""How far other frames may go beyond what was measured."""
+
+LONGEST_SUM = 1024
+"""A half has 11 bits: a sum of more than 2,048 equal numbers stops growing. A kernel
+that adds up a softmax in half is right to 1e-3 up to half of that."""
+
+_RESOLUTION = 2.0**-10
+"""Relative error of a constant that still is the same constant."""
+
+_SUMS = frozenset(
+    {
+        "CumSum", "Exp", "Log", "Mean", "Pow", "ReduceL1", "ReduceL2", "ReduceLogSum",
+        "ReduceLogSumExp", "ReduceMean", "ReduceProd", "ReduceSum", "ReduceSumSquare",
+        "Softplus", "Sum",
+    }
+)  # fmt: skip
+"""Sums of many elements, squares and exponentials: they leave float16 on their way."""
+
+_CHOICES = frozenset(
+    {
+        "ArgMax", "ArgMin", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual",
+        "NonMaxSuppression", "NonZero", "TopK", "Ceil", "Floor", "Round",
+    }
+)  # fmt: skip
+"""What turns numbers into choices: nearly equal ones would become equal."""
+
+_PLACES = frozenset({"DeformConv", "Det", "GridSample", "Range", "RoiAlign"})
+"""Operators that take coordinates beside their data."""
+
+_MOVES = frozenset(
+    {
+        "Concat", "Expand", "Flatten", "Gather", "GatherElements", "GatherND",
+        "Identity", "Pad", "Reshape", "ScatterElements", "ScatterND", "Slice", "Split",
+        "Squeeze", "Tile", "Transpose", "Unsqueeze",
+    }
+)  # fmt: skip
+"""What only moves elements: it is as exact in either type."""
+
+
+def wide_nodes(
+    model: ir.Model, types: ElementTypes, frames: Recording | None
+) -> dict[ir.Node, str]:
+    """Map the nodes of the main graph that must stay in float32 to the reason.
+
+    Args:
+        model: the graph, shapes and types inferred.
+        types: which inputs of a node can be float16 at all.
+        frames: measured for values that float16 does not hold; None measures none.
+    """
+    places = position_arithmetic(model, constant_values(model))
+    found: dict[ir.Node, str] = {}
+    for node in model.graph:
+        reason = _by_operator(node) or _by_constants(node, types)
+        if reason is None and node in places:
+            reason = "positions: a half is right to 1/2048"
+        if reason is not None:
+            found[node] = reason
+    if frames is not None:
+        found |= _by_ranges(model, types, found, frames)
+    return found | _between(model, found)
+
+
+def matching(
+    model: ir.Model,
+    ops: Collection[str],
+    modules: Collection[str],
+    globs: Iterable[str],
+) -> dict[ir.Node, str]:
+    """Map the nodes that the user wants in float32."""
+    patterns = tuple(globs)
+    return {
+        node: "the options keep it"
+        for node in model.graph
+        if node.op_type in ops
+        or provenance.module_of(node) in modules
+        or any(fnmatch.fnmatchcase(node.name or "", glob) for glob in patterns)
+    }
+
+
+def _by_operator(node: ir.Node) -> str | None:
+    if not is_standard(node):
+        return "not an operator of ONNX"
+    if graph.has_subgraph(node):
+        return "has a body"
+    if node.op_type in _SUMS:
+        return "sums, squares and exponentials"
+    if node.op_type in _CHOICES:
+        return "choices between nearly equal numbers"
+    if node.op_type in _PLACES:
+        return "positions: a half is right to 1/2048"
+    if node.op_type in ("LogSoftmax", "Softmax"):
+        shape = static_shape(node.inputs[0])
+        axis = node.attributes.get_int("axis", -1)
+        if shape is None or shape[axis] > LONGEST_SUM:
+            return f"a softmax over more than {LONGEST_SUM} elements"
+    return None
+
+
+def _by_constants(node: ir.Node, types: ElementTypes) -> str | None:
+    for index in types.inputs(node):
+        numbers = numbers_of(node.inputs[index])
+        if numbers is not None and not _fits(numbers):
+            return "a constant that float16 does not hold"
+    return None
+
+
+def _fits(numbers: Numbers) -> bool:
+    """Return whether constants are the same in float16.
+
+    Of a few numbers (epsilons, factors, bounds) each must be; of a weight, the large
+    elements, beside which an element that becomes 0 is nothing.
+    """
+    size = np.abs(numbers)
+    if numbers.size == 0 or not np.isfinite(size).all():
+        return True
+    if size.max() > LARGEST:
+        return False
+    error = np.abs(numbers.astype(np.float16).astype(np.float64) - numbers)
+    scale = size if numbers.size <= 16 else size.max()
+    return bool((error <= _RESOLUTION * scale).all())
+
+
+def _by_ranges(
+    model: ir.Model,
+    types: ElementTypes,
+    known: Collection[ir.Node],
+    frames: Recording,
+) -> dict[ir.Node, str]:
+    """Find the nodes that read or make numbers that float16 does not hold."""
+    touched: dict[str, list[ir.Node]] = {}
+    constants = constant_values(model)
+    for node in model.graph:
+        if node in known:
+            continue
+        read = [node.inputs[index] for index in types.inputs(node)]
+        made = [node.outputs[index] for index in types.outputs(node)]
+        for value in (*read, *made):
+            if value is not None and value not in constants:
+                touched.setdefault(str(value.name), []).append(node)
+    if not touched:
+        return {}
+    ranges = Calibrator().run(model, tuple(touched), frames).tensors
+    large = {
+        name: max(-low, high)
+        for name, (low, high) in ranges.items()
+        if max(-low, high) * HEADROOM > LARGEST
+    }
+    return {
+        node: f"numbers up to {reach:.3g}"
+        for name, reach in large.items()
+        for node in touched[name]
+    }
+
+
+def _between(model: ir.Model, wide: Mapping[ir.Node, str]) -> dict[ir.Node, str]:
+    """Find what only moves elements between nodes in float32, or from an input."""
+    moved: set[ir.Node] = set()
+
+    def given(value: ir.Value | None) -> bool:
+        maker = None if value is None else value.producer()
+        return maker is None or maker in wide or maker in moved
+
+    for node in model.graph:
+        data = node.inputs if node.op_type == "Concat" else node.inputs[:1]
+        if node.op_type in _MOVES and all(map(given, data)):
+            moved.add(node)
+    found: dict[ir.Node, str] = {}
+    for node in reversed(model.graph):
+        readers = list(itertools.chain(*(v.consumers() for v in node.outputs)))
+        outside = any(value.is_graph_output() for value in node.outputs)
+        inside = all(reader in wide or reader in found for reader in readers)
+        if node in moved and inside and (readers or outside):
+            found[node] = "moves numbers between nodes in float32"
+    return found

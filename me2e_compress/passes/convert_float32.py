@@ -1,0 +1,56 @@
+"""Float32 instead of float16."""
+
+import dataclasses
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress import rewrite
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.convert_float16.element_types import (
+    FLOAT,
+    HALF,
+    ElementTypes,
+    Retyping,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ConvertFloat32(Pass):
+    """Compute in float32 what a graph computes in float16.
+
+    Given:   y = Conv(x, w_half, b_half)                       x, y float16
+    Result:  y = Cast<float16>(Conv(Cast<float>(x), w, b))
+
+    A CPU has next to no kernels for float16: onnxruntime casts every operand to and
+    fro. Inputs and outputs keep their types. What rounds in float16 on purpose, plugins
+    and bodies of If, Loop and Scan, stays.
+    """
+
+    name: ClassVar[str] = "convert-float32"
+    exact: ClassVar[bool] = False
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Retype every node that can be, and drop the Casts that become idle."""
+        types = ElementTypes(model, HALF, FLOAT)
+        nodes = [n for n in model.graph if types.inputs(n) or types.outputs(n)]
+        retyping = Retyping(model, types, self.name)
+        retyping.run(nodes, keep_io=True)
+        changes = retyping.changed + _drop_idle_casts(model)
+        return PassResult(model, changes, (f"{len(nodes)} nodes in float32",))
+
+
+def _drop_idle_casts(model: ir.Model) -> int:
+    idle = [
+        node
+        for node in model.graph
+        if node.op_type == "Cast"
+        and node.inputs[0] is not None
+        and node.inputs[0].dtype == node.outputs[0].dtype == FLOAT
+    ]
+    for node in idle:
+        source = node.inputs[0]
+        if source is not None:
+            rewrite.bypass(node.outputs[0], source)
+    rewrite.sweep(model)
+    return len(idle)

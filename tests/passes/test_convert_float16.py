@@ -1,0 +1,286 @@
+"""Float16, and float32 where that is needed."""
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import ModuleMapError, PreconditionError
+from me2e_compress.manager.equivalence import relative
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.passes.convert_float16 import ConvertFloat16
+from me2e_compress.passes.convert_float32 import ConvertFloat32
+from me2e_compress.runtime.session import run_once
+from me2e_compress.testing import check_pass
+from tests.frames import record
+from tests.nets import MODULES, conv_attention, net
+
+OPSET = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
+HALF, FLOAT = ir.DataType.FLOAT16, ir.DataType.FLOAT
+
+
+def bare(text: str, arrays: Mapping[str, npt.NDArray[np.float32]]) -> ir.Model:
+    """Read a graph whose nodes have neither names nor a past."""
+    model = net(text, arrays)
+    for node in model.graph:
+        node.metadata_props.clear()
+    return model
+
+
+def converted(
+    text: str,
+    weights: Mapping[str, npt.ArrayLike] | None = None,
+    *,
+    keep_io: bool = True,
+) -> ir.Model:
+    arrays = {n: np.array(each, np.float32) for n, each in (weights or {}).items()}
+    step = ConvertFloat16(keep_io=keep_io)
+    return check_pass(step, bare(OPSET + text, arrays)).model
+
+
+def types_of(model: ir.Model) -> dict[str, str]:
+    """Map every operator but Cast to the element type of what it reads first."""
+    return {
+        node.op_type: node.inputs[0].dtype.name
+        for node in model.graph
+        if node.op_type != "Cast"
+        and node.inputs[0] is not None
+        and node.inputs[0].dtype is not None
+    }
+
+
+def casts(model: ir.Model) -> int:
+    return sum(node.op_type == "Cast" for node in model.graph)
+
+
+def test_weights_are_half_and_the_interface_is_as_it_was() -> None:
+    source = conv_attention()
+    found = check_pass(ConvertFloat16(), source)
+    initializers = found.model.graph.initializers
+
+    assert initializers["w"].dtype == initializers["l"].dtype == HALF
+    assert graph.interface(found.model) == graph.interface(source)
+    assert found.notes[0] == "10 nodes in float16, 0 stay in float32"
+
+
+def test_a_second_run_changes_nothing() -> None:
+    once = check_pass(ConvertFloat16(), conv_attention()).model
+
+    assert ConvertFloat16().run(once, Context(MODULES)).changes == 0
+
+
+def test_the_outputs_are_near() -> None:
+    source = conv_attention()
+    half = check_pass(ConvertFloat16(), source).model
+    drawn = np.random.default_rng(3)
+    fed = {
+        str(each.name): drawn.standard_normal(graph.static_shape(each)).astype("f4")
+        for each in source.graph.inputs
+    }
+
+    assert 0 < relative(run_once(source, fed)["y"], run_once(half, fed)["y"]) < 3e-3
+
+
+def test_without_keep_io_inputs_and_outputs_are_half() -> None:
+    half = converted("r (float[4] x) => (float[4] y) { y = Relu(x) }", keep_io=False)
+
+    assert half.graph.inputs[0].dtype == half.graph.outputs[0].dtype == HALF
+    assert casts(half) == 0
+
+
+@pytest.mark.parametrize(
+    ("body", "weights", "operator"),
+    [
+        ("y = Exp(a)", {}, "Exp"),
+        ("y = Softmax(a)", {}, "Softmax"),  # over 2,000 elements
+        ("y = Add(a, c)", {"c": -1e9}, "Add"),
+        ("y = Add(a, c)", {"c": 1e-12}, "Add"),
+        ("y = trt.Plugin(a)", {}, "Plugin"),
+    ],
+)
+def test_what_stays_in_float32(
+    body: str, weights: dict[str, float], operator: str
+) -> None:
+    constant = ", float c" if weights else ""
+    text = f"g (float[4,2000] x{constant}) => (float[4,2000] y) {{ a = Relu(x)\n"
+    half = converted(f"{text}{body}}}", weights)
+
+    assert types_of(half) == {"Relu": "FLOAT16", operator: "FLOAT"}
+
+
+def test_a_short_softmax_is_half() -> None:
+    half = converted("s (float[4,1024] x) => (float[4,1024] y) { y = Softmax(x) }")
+
+    assert types_of(half) == {"Softmax": "FLOAT16"}
+
+
+def test_positions_and_what_they_are_computed_with_stay_in_float32() -> None:
+    half = converted(
+        """p (float[1,4,8,8] f, float[1,2,2,2] ref, float[1,2,2,8] q, float[8,2] w,
+               float[1,4,4] lidar2img) => (float[1,4,2,2] y) <float two = {2.0}> {
+            value = Relu(f)
+            offset = MatMul(q, w)
+            at = Add(ref, offset)
+            grid = Mul(at, two)
+            y = GridSample(value, grid)
+        }"""
+    )
+
+    assert types_of(half) == {
+        "Relu": "FLOAT16", "MatMul": "FLOAT", "Add": "FLOAT", "Mul": "FLOAT",
+        "GridSample": "FLOAT",
+    }  # fmt: skip
+
+
+def test_a_camera_matrix_reaches_the_projection_unrounded() -> None:
+    half = converted(
+        """p (float[1,4,8,8] f, float[1,2,4] lidar2img, float[4,2] points)
+            => (float[1,4,1,2] y) {
+            row = Transpose<perm=[0,1,2]>(lidar2img)
+            pixel = MatMul(row, points)
+            shape = Constant<value = int64[4] {1, 1, 2, 2}>()
+            grid = Reshape(pixel, shape)
+            y = GridSample(f, grid)
+        }""",
+        {"points": np.ones((4, 2))},
+    )
+
+    assert casts(half) == 0
+
+
+def test_comparisons_are_made_of_what_was_compared() -> None:
+    half = converted("c (float[4] x, float[4] t) => (bool[4] y) { y = Greater(x, t) }")
+
+    assert types_of(half) == {"Greater": "FLOAT"}
+
+
+def test_moves_between_float32_have_no_casts() -> None:
+    half = converted(
+        "m (float[4,2] x) => (float[2,4] y)"
+        " { a = Exp(x)\n b = Transpose(a)\n y = Log(b) }"
+    )
+
+    assert casts(half) == 0
+
+
+def test_readers_share_a_cast() -> None:
+    half = converted(
+        "m (float[4,4] x) => (float[4,4] y, float[4,4] z)"
+        " { a = Exp(x)\n y = Relu(a)\n z = Sigmoid(a) }"
+    )
+
+    assert casts(half) == 3  # one for both readers, one for either output
+
+
+def test_numbers_that_the_frames_show_to_be_too_large(tmp_path: Path) -> None:
+    model = bare(
+        OPSET + "b (float[4] x) => (float[4] y) { a = Relu(x)\n y = Mul(a, a) }", {}
+    )
+    folder = record(tmp_path / "frames", [{"x": np.full(4, 300, np.float32)}])
+    context = Context(ModuleMap.whole(), CalibrationSet(folder))
+    found = check_pass(ConvertFloat16(), model, context)
+
+    assert types_of(found.model) == {"Relu": "FLOAT16", "Mul": "FLOAT"}
+    assert "numbers up to 9e+04 1" in found.notes[1]
+
+
+def test_without_frames_the_report_says_what_was_not_measured() -> None:
+    found = check_pass(ConvertFloat16(), conv_attention())
+
+    assert "was not measured" in found.notes[-1]
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"keep_ops": ("Conv",)},
+        {"keep_modules": ("backbone",)},
+        {"keep_nodes": ("/b*",)},
+    ],
+    ids=["ops", "modules", "nodes"],
+)
+def test_what_the_options_keep(option: dict[str, object]) -> None:
+    step = ConvertFloat16().with_options(option)
+    found = check_pass(step, conv_attention(), Context(MODULES))
+
+    assert found.model.graph.initializers["w"].dtype == FLOAT
+    assert found.model.graph.initializers["l"].dtype == HALF
+
+
+def test_no_such_module() -> None:
+    with pytest.raises(ModuleMapError):
+        check_pass(
+            ConvertFloat16(keep_modules=("wheels",)),
+            conv_attention(),
+            Context(MODULES),
+        )
+
+
+@pytest.mark.parametrize("cell", ["LSTM", "GRU"])
+def test_recurrent_layers_are_half(cell: str) -> None:
+    gates = {"LSTM": 4, "GRU": 3}[cell] * 8
+    half = converted(
+        f"r (float[5,1,6] x, float[1,{gates},6] w, float[1,{gates},8] r)"
+        f" => (float[5,1,1,8] y) {{ y = {cell}<hidden_size=8>(x, w, r) }}",
+    )
+
+    assert types_of(half) == {cell: "FLOAT16"}
+
+
+def test_a_weight_that_float32_reads_too_is_stored_in_both() -> None:
+    half = converted(
+        """w (float[1,4,8,8] f, float[2,2,2,8] q, float[8,2] w, float[3,8] z)
+            => (float[1,4,2,2] y, float[3,2] u) {
+            grid = MatMul(q, w)
+            y = GridSample(f, grid)
+            u = MatMul(z, w)
+        }""",
+        {"w": np.ones((8, 2))},
+    )
+    stored = {v.dtype for v in half.graph.initializers.values()}
+
+    assert stored == {HALF, FLOAT}
+    assert casts(half) == 2  # z and u
+
+
+def test_int8_takes_float16_scales_from_opset_19() -> None:
+    text = """<ir_version: 9, opset_import: ["" : 17]>
+    q (float[4] x) => (float[4] y) <float s = {0.1}, int8 z = {0}> {
+        q = QuantizeLinear(x, s, z)
+        y = DequantizeLinear(q, s, z)
+    }"""
+    with pytest.raises(PreconditionError, match="of opset 17: float16 scales need 19"):
+        check_pass(ConvertFloat16(), bare(text, {}))
+    half = check_pass(ConvertFloat16(), bare(text.replace("17", "19"), {})).model
+
+    assert half.graph.initializers["s"].dtype == HALF
+    assert casts(half) == 2
+
+
+def test_back_to_float32() -> None:
+    source = conv_attention()
+    half = check_pass(ConvertFloat16(), source).model
+    back = check_pass(ConvertFloat32(), half).model
+
+    assert Counter(n.op_type for n in back.graph) == Counter(
+        n.op_type for n in source.graph
+    )
+    assert {v.dtype for v in back.graph.initializers.values()} <= {
+        FLOAT, ir.DataType.INT64
+    }  # fmt: skip
+    assert ConvertFloat32().run(back, Context(MODULES)).changes == 0
+
+
+def test_float32_inside_leaves_a_half_interface() -> None:
+    text = "h (float16[4] x) => (float16[4] y) { a = Relu(x)\n y = Sigmoid(a) }"
+    back = check_pass(ConvertFloat32(), bare(OPSET + text, {})).model
+
+    assert types_of(back) == {"Relu": "FLOAT", "Sigmoid": "FLOAT"}
+    assert casts(back) == 2
