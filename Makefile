@@ -7,7 +7,7 @@ JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 .PHONY: coverage demo docs test test-slow check fix clean
 
 demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
-	$(BIN)/me2e-compress demo --out out
+	$(BIN)/me2e-compress demo -o out
 
 test: check  ## lint, types, layers, tests
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup

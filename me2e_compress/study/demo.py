@@ -143,7 +143,7 @@ class DriverDemo:
             timing=Timing(LATENCY_SAMPLES),
         )
         found = run_study(study, self.out, LocalEngine(self.workers), listener)
-        words = ("me2e-compress", "demo", "--out", str(self.out))
+        words = ("me2e-compress", "demo", "-o", str(self.out))
         chosen = ("--routes", self.routes, "--scheme", self.scheme)
         written = write_study(found, self.out, (*words, *chosen))
         ending = (

@@ -10,11 +10,14 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.workflows import calibrate as workflow
 from me2e_compress.workflows.checks import sizes
 
-Frames = Annotated[Path | None, typer.Argument(help="FRAMES; none for --import")]
-Output = Annotated[Path, typer.Option("-o", "--output", help="JSON; of a shard .npz")]
-Recipe = Annotated[str, typer.Option("-r", "--recipe", help="passes before int8")]
-Method = Annotated[str, typer.Option(help="max-min, percentile[:p], mse, entropy ...")]
-Count = Annotated[int, typer.Option("-n", "--count", help="frames, in whole scenes")]
+Frames = Annotated[
+    Path | None, typer.Argument(help="the recorded FRAMES; none for --import")
+]
+Output = Annotated[
+    Path, typer.Option("-o", "--output", help="the ranges as JSON; of a shard .npz")
+]
+Recipe = Annotated[str, typer.Option("-r", "--recipe", help=given.RECIPE)]
+Method = Annotated[str, typer.Option(help=given.METHOD)]
 Shard = Annotated[str | None, typer.Option(help="2/4: the second of four shards")]
 Merge = Annotated[list[Path] | None, typer.Option(help="a SHARD.npz; once for each")]
 Import = Annotated[Path | None, typer.Option("--import", help="another tool's cache")]
@@ -28,7 +31,7 @@ def calibrate(
     output: Output = Path("ranges.json"),
     recipe: Recipe = "exact",
     method: Method = "max-min",
-    count: Count = 256,
+    count: given.Count = 256,
     seed: given.Seed = 0,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
@@ -42,8 +45,9 @@ def calibrate(
 ) -> None:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
 
-    A run that was killed goes on from OUTPUT.checkpoint; compress takes the
-    ranges by --ranges.
+    Frames are taken in whole scenes; of a recipe, the passes before int8 are run.
+    A run that was killed goes on from OUTPUT.checkpoint; compress takes what is
+    measured by --ranges.
     """
     options = workflow.CalibrateOptions(
         recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,

@@ -13,12 +13,9 @@ from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
 from me2e_compress.workflows import compress as workflow
 from me2e_compress.workflows.checks import sizes
 
-VerifyFrames = Annotated[
-    int, typer.Option(min=0, help="frames that exact passes are checked on; 0: none")
-]
-MeasureFrames = Annotated[
-    int, typer.Option(min=0, help="most frames kept to measure on; 0: none")
-]
+Passes = Annotated[str | None, typer.Option(help="a pipeline, as text; see above")]
+Verify = Annotated[int, typer.Option(min=0, help="frames to check exact passes on")]
+Measure = Annotated[int, typer.Option(min=0, help="most frames kept to measure on")]
 Floor = Annotated[float, typer.Option(help="warn of an output below this SQNR, in dB")]
 AllowEmpty = Annotated[
     bool, typer.Option("--allow-empty", help="write it although nothing became int8")
@@ -27,15 +24,9 @@ AllowEmpty = Annotated[
 
 def compress(
     model: given.Model,
-    output: Annotated[Path, typer.Option("-o", "--output", help="the smaller one")],
-    recipe_name: Annotated[
-        str | None,
-        typer.Option("-r", "--recipe", help="a TOML file, or a shipped recipe's name"),
-    ] = None,
-    passes: Annotated[
-        str | None,
-        typer.Option(help="a pipeline: fold-constants,ablate-modules{drop=[occ]}"),
-    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="the smaller graph")],
+    recipe_name: given.Recipe = None,
+    passes: Passes = None,
     scheme: given.Scheme = None,
     rules: given.Rules = None,
     target: given.Target = None,
@@ -45,32 +36,26 @@ def compress(
     method: given.Method = None,
     module_map: given.ModuleMap = None,
     seed: given.Seed = 0,
-    verify_frames: VerifyFrames = 2,
-    measure_frames: MeasureFrames = 4,
+    verify_frames: Verify = 2,
+    measure_frames: Measure = 4,
     floor: Floor = SQNR_FLOOR_DB,
     allow_empty: AllowEmpty = False,
     set_dim: given.SetDim = None,
     as_json: given.Json = False,
 ) -> None:
-    """Apply passes to a graph, check each, and write the smaller graph and a report."""
+    """Apply passes to a graph, check each, and write the smaller graph and a report.
+
+    A pipeline names passes in order: fold-constants,fuse-basic{swish=true}
+    """
     if recipe_name is not None and passes is not None:
         raise RecipeError("give a recipe (-r) or a pipeline (--passes), not both")
     wanted = recipe_name if passes is None else recipe.parse(passes)
     options = workflow.CompressOptions(
-        scheme=scheme,
-        rules=rules,
-        target=target,
-        overrides=overrides,
-        ranges=ranges,
-        method=method,
-        module_map=module_map,
-        seed=seed,
-        verify_frames=verify_frames,
-        measure_frames=measure_frames,
-        floor=floor,
-        allow_empty=allow_empty,
+        scheme=scheme, rules=rules, target=target, overrides=overrides, ranges=ranges,
+        method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
+        measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
         dims=sizes(set_dim or ()),
-    )
+    )  # fmt: skip
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)
     show(found, as_json)

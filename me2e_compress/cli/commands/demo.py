@@ -11,18 +11,23 @@ from me2e_compress.workflows.demo_stack import StackDemo
 from me2e_compress.workflows.extras import need_closed_loop
 from me2e_compress.zoo.shipped import SHIPPED
 
+Output = Annotated[
+    Path, typer.Option("-o", "--output", "--out", help="the folder to write")
+]
 Stack = Annotated[
     Literal["highway", "vad-tiny"],
     typer.Option(help="the trained driver, or a stack of published size"),
 ]
-Scheme = Annotated[str, typer.Option(help="feature-ext, prediction or full")]
-Routes = Annotated[str, typer.Option(help="that highway drives: N or ID,ID")]
+Scheme = Annotated[
+    str, typer.Option(help="int8 modules: feature-ext, prediction or full")
+]
+Routes = Annotated[str, typer.Option(help=f"{given.ROUTES}; highway")]
 Rounds = Annotated[int, typer.Option(min=1, help="latency rounds of vad-tiny")]
-Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime, for vad-tiny")]
+Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; for vad-tiny")]
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="the folder to write")] = Path("out"),
+    output: Output = Path("out"),
     stack: Stack = "highway",
     scheme: Scheme = "feature-ext",
     routes: Routes = "5",
@@ -39,12 +44,12 @@ def demo(
         need_closed_loop("what the demo drives with")
         from me2e_compress.study.demo import DriverDemo
 
-        steps = DriverDemo(stack, out, scheme, routes, workers).steps
+        steps = DriverDemo(stack, output, scheme, routes, workers).steps
     else:
-        steps = StackDemo(stack, out, scheme, rounds, threads).steps
-    out.mkdir(parents=True, exist_ok=True)
+        steps = StackDemo(stack, output, scheme, rounds, threads).steps
+    output.mkdir(parents=True, exist_ok=True)
     for step in steps:
         with listening() as listener:
             found = step(listener)
         show(found)
-    console.save_svg(str(out / "demo.svg"), title="me2e-compress demo")
+    console.save_svg(str(output / "demo.svg"), title="me2e-compress demo")

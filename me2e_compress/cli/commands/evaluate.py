@@ -18,9 +18,11 @@ Latency = Annotated[
     str, typer.Option(help="none, fps:F, trace:FILE, measured, or see list")
 ]
 Scale = Annotated[float, typer.Option(help="of a trace or a measurement")]
-InOrder = Annotated[bool, typer.Option(help="replay a trace in its order")]
+InOrder = Annotated[
+    bool, typer.Option("--in-order", help="replay a trace in its order")
+]
 Step = Annotated[float, typer.Option(help="step of the world")]
-Weather = Annotated[str, typer.Option(help="fog_m=80,night=0.5,dropped=BACK")]
+Weather = Annotated[str, typer.Option(help="fog_m=80,night=0.5 ...")]
 Limit = Annotated[float, typer.Option(help="seconds until a decision counts as hung")]
 Render = Annotated[str | None, typer.Option(help="draw this route as GIF and PNG")]
 

@@ -14,7 +14,8 @@ Heads = Annotated[
     typer.Option(help="classes and ego modes of vad-tiny; default nuscenes"),
 ]
 Seed = Annotated[
-    int | None, typer.Option(min=0, help="of the initial weights; default 0")
+    int | None,
+    typer.Option(min=0, help="of everything random: of the weights; default 0"),
 ]
 
 

@@ -21,7 +21,7 @@ Length = Annotated[
 def frames(
     stack: Annotated[str, typer.Argument(help="vad-tiny, highway or M.onnx")],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
-    count: Annotated[int, typer.Option("-n", "--count", help="how many")] = 256,
+    count: given.Count = 256,
     scene_length: Length = None,
     seed: given.Seed = 0,
     as_json: given.Json = False,

@@ -15,7 +15,9 @@ TrtCheck = Annotated[
 
 def lint(
     model: given.Model,
-    target: Annotated[str, typer.Option(help="tensorrt or onnxruntime")] = "tensorrt",
+    target: Annotated[
+        str, typer.Option(help="runtime of the graph: tensorrt or onnxruntime")
+    ] = "tensorrt",
     trt_check: TrtCheck = False,
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,
     shown: Annotated[int, typer.Option(min=0, help="nodes shown of each rule")] = 3,

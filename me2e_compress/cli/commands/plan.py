@@ -10,11 +10,13 @@ from me2e_compress.cli.console import show
 from me2e_compress.workflows import plan as workflow
 from me2e_compress.workflows.checks import sizes
 
-Model = Annotated[str, typer.Argument(help="an ONNX file, float or with a plan")]
+Model = Annotated[
+    str, typer.Argument(help="the ONNX file, or highway; float or with a plan")
+]
 Against = Annotated[
     Path | None, typer.Option(help="a plan or model: compare; float: no overrides")
 ]
-Output = Annotated[Path | None, typer.Option("-o", "--output", help="save it as JSON")]
+Output = Annotated[Path | None, typer.Option("-o", "--output", help="the plan as JSON")]
 Nodes = Annotated[bool, typer.Option("--nodes", help="a row a node that could be int8")]
 Every = Annotated[bool, typer.Option("--all", help="a row a node, every node")]
 

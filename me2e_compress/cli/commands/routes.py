@@ -15,16 +15,20 @@ Output = Annotated[
 Check = Annotated[
     Path | None, typer.Option(help="examine this manifest instead of making one")
 ]
+Scenarios = Annotated[str, typer.Option(help="scenario types: all, or NAME,NAME")]
+Picked = Annotated[
+    str, typer.Option("--routes", "--pick", help=f"{given.ROUTES}; with --check")
+]
 
 
 def routes(
     output: Output = None,
     seed: given.Seed = 0,
     variants: Annotated[int, typer.Option(min=1, help="of each type")] = VARIANTS,
-    scenarios: Annotated[str, typer.Option(help="all, or NAME,NAME")] = "all",
-    workers: Annotated[int, typer.Option(min=1, help="types at a time")] = 1,
+    scenarios: Scenarios = "all",
+    workers: given.Workers = 1,
     check: Check = None,
-    pick: Annotated[str, typer.Option(help="with --check: all, N or ID,ID")] = "all",
+    picked: Picked = "all",
     as_json: given.Json = False,
 ) -> None:
     """Make a fresh set of admitted routes, or examine an existing set again."""
@@ -33,7 +37,7 @@ def routes(
 
     if check is not None:
         with listening() as listener:
-            examined = workflow.examine_routes(check, pick, listener)
+            examined = workflow.examine_routes(check, picked, listener)
         show(examined, as_json)
         examined.check()
         return

@@ -8,9 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, say, show
 
-Routes = Annotated[
-    str | None, typer.Option(help="instead of the study's: all, N, ID,ID")
-]
+Routes = Annotated[str | None, typer.Option(help=f"{given.ROUTES}; not the study's")]
 
 
 def study(

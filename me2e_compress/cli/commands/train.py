@@ -10,7 +10,7 @@ from me2e_compress.cli.console import listening, show
 
 Stack = Annotated[Literal["highway"], typer.Argument(help="highway")]
 Output = Annotated[
-    Path, typer.Option("-o", "--output", help="a folder; the same again resumes")
+    Path, typer.Option("-o", "--output", help="the folder; the same again resumes")
 ]
 Small = Annotated[
     bool, typer.Option("--small", help="every part, a minute, learns nothing")
@@ -20,7 +20,7 @@ Small = Annotated[
 def train(
     stack: Stack,
     output: Output,
-    workers: Annotated[int, typer.Option(min=1, help="processes")] = 4,
+    workers: given.Workers = 4,
     small: Small = False,
     as_json: given.Json = False,
 ) -> None:
