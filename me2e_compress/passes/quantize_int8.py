@@ -79,7 +79,8 @@ class QuantizeInt8(Pass):
         """Plan, calibrate, place.
 
         Raises:
-            PreconditionError: the graph is quantized already, or of opset below 13.
+            PreconditionError: the graph is quantized already, of opset below 13, or in
+                float16 that its target or opset has no int8 for.
             FramesError: neither frames nor ranges, or they are of another graph.
             ModuleMapError: no such module.
             RecipeError: no such scheme, rules, target or method, or bad overrides.
@@ -92,6 +93,7 @@ class QuantizeInt8(Pass):
             )
         target = TARGETS.parse(self.target)
         plan = self._placeable(model, context)
+        target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         if not tensors:
             return PassResult(

@@ -11,6 +11,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import is_standard, opset_of
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import KeptFloat, QuantPlan
@@ -103,9 +104,12 @@ class Target(abc.ABC):
 
     Class attributes:
         name: what recipes and the command line call it.
+        half_since: the first opset in which it takes int8 in a float16 graph, scales
+            in float16; None where it has no such kernels.
     """
 
     name: ClassVar[str]
+    half_since: ClassVar[int | None] = None
 
     @abc.abstractmethod
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
@@ -118,6 +122,27 @@ class Target(abc.ABC):
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
         """List the plan's nodes that stay float in that copy, and why."""
         return ()
+
+    def check_types(self, plan: QuantPlan, model: ir.Model) -> None:
+        """Check that int8 can be written into the float type that the graph has.
+
+        Raises:
+            PreconditionError: it is float16, and the target has no such kernels, or the
+                opset no such scales; the message names the way out.
+        """
+        types = {v.name: v.dtype for node in model.graph for v in node.outputs}
+        halves = [e for e in plan.chosen if types[e.output] == ir.DataType.FLOAT16]
+        opset, since = opset_of(model), self.half_since
+        if not halves or (since is not None and since <= opset):
+            return
+        reason = f"{self.name} has int8 kernels for float32 alone"
+        if since is not None:
+            reason = f"float16 scales need opset {since}, the graph is of {opset}"
+        raise PreconditionError(
+            f"{halves[0].node or halves[0].output} and {len(halves) - 1} more layers"
+            f" are in float16, and {reason}: put convert-float32 before quantize-int8"
+            " (--passes import-normalize,convert-float32,fuse-basic,quantize-int8)"
+        )
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
         """Estimate what int8 saves and costs; None where nothing is known of that.

@@ -49,7 +49,7 @@ class ModuleScope(Rule):
 
 @dataclasses.dataclass(frozen=True)
 class WeightOperand(Rule):
-    """The right operand is a float32 weight, or the product is an attention's."""
+    """The right operand is a weight in float32 or float16, or of an attention."""
 
     name: ClassVar[str] = "weight"
     firm: ClassVar[bool] = True
@@ -58,8 +58,8 @@ class WeightOperand(Rule):
         """Object to computed weights, constants on the left, other element types."""
         left, right = node.inputs[0], node.inputs[1]
         types = {each.dtype for each in (left, right) if each is not None}
-        if not types <= {ir.DataType.FLOAT, None}:
-            return "not float32"
+        if not types <= {ir.DataType.FLOAT, ir.DataType.FLOAT16, None}:
+            return "neither float32 nor float16"
         if left in facts.constants and right in facts.constants:
             return "both operands are constant: computed once, when the graph is loaded"
         if left in facts.constants and node in facts.attention:

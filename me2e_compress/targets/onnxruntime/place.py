@@ -37,10 +37,11 @@ class OnnxRuntime(Target):
             ranges: of every tensor that :meth:`tensors` names.
 
         Raises:
-            PreconditionError: the graph is older than opset 13, or something that the
-                plan calls a weight is not one.
+            PreconditionError: the graph is older than opset 13, or in a float type
+                without int8 here, or something that the plan calls a weight is not one.
             FramesError: the range of a tensor is missing.
         """
+        self.check_types(plan, model)
         weights = weights_of(model, _layers_of(plan))
         reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
         return lower(Draft(model.clone(), weights, reach))

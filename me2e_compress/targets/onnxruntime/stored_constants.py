@@ -26,7 +26,8 @@ def step_of(node: ir.Node) -> Floats:
     name = node.name or node.outputs[0].name
     if scale is None or scale.dtype != np.float32:
         kind = "computed" if scale is None else scale.dtype
-        raise PreconditionError(f"{name} has a {kind} scale, expected float32")
+        way = ": convert-float32 makes it so" if kind == np.float16 else ""
+        raise PreconditionError(f"{name} has a {kind} scale, expected float32{way}")
     if zero is None or zero.dtype != np.int8:
         kind = "uint8" if zero is None else zero.dtype
         raise PreconditionError(

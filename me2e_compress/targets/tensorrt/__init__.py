@@ -39,6 +39,7 @@ class TensorRT(Target):
     """NVIDIA's engine builder, by its ONNX parser and explicit quantization."""
 
     name: ClassVar[str] = "tensorrt"
+    half_since: ClassVar[int | None] = 19
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
         """Name what weighted layers and residual branches read."""
@@ -58,9 +59,10 @@ class TensorRT(Target):
             initializers behind a DequantizeLinear for the weights.
 
         Raises:
-            PreconditionError: the graph is older than opset 13, or something that the
-                plan calls a weight is not one.
+            PreconditionError: the graph is older than opset 13, or in a float type
+                without int8 here, or something that the plan calls a weight is not one.
         """
+        self.check_types(plan, model)
         weights = weights_of(model, plan.chosen)
         copy = model.clone()
         nodes = {str(node.outputs[0].name): node for node in copy.graph}
@@ -102,7 +104,7 @@ class _Writer:
     def _activation(self, value: ir.Value, reader: ir.Node) -> ir.Value:
         name = str(value.name)
         if name not in self._activations:
-            step = np.array(scale_of(*self._ranges.tensors[name]))
+            step = np.array(scale_of(*self._ranges.tensors[name]), _numpy(value))
             scale = self._constant(step, f"{name}_scale")
             if self._zero is None:
                 self._zero = self._constant(np.array(0, np.int8), "int8_zero")
@@ -128,7 +130,7 @@ class _Writer:
             name, scales = weight.name, weight.scales
             inputs = [
                 self._constant(weight.integers, f"{name}_int8"),
-                self._constant(scales, f"{name}_scale"),
+                self._constant(scales.astype(_numpy(like)), f"{name}_scale"),
                 self._constant(np.zeros(scales.shape, np.int8), f"{name}_zero"),
             ]
             dequantize = self._node("DequantizeLinear", inputs, name, like, reader)
@@ -156,3 +158,8 @@ class _Writer:
         output.name, output.shape, output.type = unique, like.shape, like.type
         provenance.inherit(node, [reader], by=BY)
         return node
+
+
+def _numpy(value: ir.Value) -> np.dtype[np.generic]:
+    """Return the type of a tensor's scale: its own, float32 where that is open."""
+    return np.dtype(np.float32) if value.dtype is None else value.dtype.numpy()
