@@ -1,3 +1,4 @@
+from collections.abc import Iterator
 from pathlib import Path
 
 import onnx_ir as ir
@@ -5,6 +6,7 @@ import pytest
 
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
+from me2e_compress.runtime import first_opening
 from me2e_compress.zoo import truth
 from me2e_compress.zoo.export import export
 
@@ -28,6 +30,17 @@ optional = ["occ_head"]
 role = "prediction"
 optional = ["plan_head"]
 """
+
+
+@pytest.fixture(autouse=True)
+def opened_before(request: pytest.FixtureRequest) -> Iterator[None]:
+    """No graph is opened apart first, but in the tests of just that."""
+    if request.node.get_closest_marker("opens_apart"):
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(first_opening, "try_apart", lambda *_, **__: 0.0)
+        yield
 
 
 @pytest.fixture

@@ -41,12 +41,15 @@ class PassManager:
         reproducers: the folder that a failing pass leaves its reproducer in.
         samples: recorded frames that exact passes are checked on where the context has
             none; None makes seeded inputs up then.
+        try_first: called with a graph, and what it is called, before it is run here;
+            what that raises ends the run.
     """
 
     passes: tuple[Pass, ...]
     verify_frames: int = 2
     reproducers: Path | None = None
     samples: CalibrationSet | None = None
+    try_first: Callable[[ir.Model, str], None] | None = None
 
     def run(
         self, model: ir.Model, context: Context, progress: Progress | None = None
@@ -161,6 +164,8 @@ class _Books:
         stretch, self._stretch = self._stretch, []
         if not stretch or not self.manager.verify_frames:
             return
+        if self.manager.try_first is not None:
+            self.manager.try_first(model, f"the graph after {stretch[-1][0].name}")
         found, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(found)
         if equivalence.passed(found) or inputs is None:

@@ -29,6 +29,7 @@ from me2e_compress.workflows.checks import (
     model_path,
     read_graph,
 )
+from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table
@@ -180,6 +181,7 @@ def calibrate(
     passes = with_sizes(recipe.load(options.recipe), options.dims)
     loaded = read_graph(source, listener)
     part = None if frames is None else _part(loaded, Path(frames), options)
+    try_first(loaded, source.name, listener, file=source, frames=part)
     ready = PreparedGraph.of(source, loaded, options.module_map, passes)
     tensors = ready.tensors()
     del loaded  # 150 MB of VAD-tiny; graphs are cycles

@@ -10,6 +10,7 @@ from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.checks import model_path
+from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, table
 
@@ -83,8 +84,10 @@ def compare(
     """
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
-    for path in paths:
-        recording.check(graph.load(path))
+    for path in dict.fromkeys(paths):
+        model = graph.load(path)
+        recording.check(model)
+        try_first(model, path.name, listener, file=path, frames=recording)
     total = len(recording)
 
     def reported(frame: Frame) -> Frame:

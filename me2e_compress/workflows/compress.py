@@ -35,6 +35,7 @@ from me2e_compress.workflows.compress_fidelity import (
     measure_loss,
 )
 from me2e_compress.workflows.compress_result import CompressResult, beside, loss_record
+from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.zoo.shipped import sample_frames
@@ -182,14 +183,22 @@ def compress(
         loaded = read_graph(source, listener)
         modules = load_map(options.module_map, loaded)
         frames_of = _split(source, loaded, frames, passes, options)
+        seen = frames_of.calibration or frames_of.samples
+        try_first(loaded, source.name, listener, file=source, frames=seen)
         context = Context(modules, frames_of.calibration, options.seed)
         manager = PassManager(
-            passes, options.verify_frames, output.parent, frames_of.samples
+            passes,
+            options.verify_frames,
+            output.parent,
+            frames_of.samples,
+            partial(try_first, listener=listener),
         )
         progress = partial(listener.on_progress, "passes")
         report = manager.run(loaded, context, progress)
         int8 = Int8Outcome.of(report, context)
         _refuse_empty(int8, options, listener)
+        if report.lossy and frames_of.measured is not None:
+            try_first(report.model, output.name, listener)
         loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
         seconds = process_time() - start
         return _write(report, source, output, int8, loss, seconds)

@@ -13,6 +13,7 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.checks import Given, check_count, check_output, load_map
+from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 
@@ -90,6 +91,8 @@ class TrialFiles:
         loaded = graph.load(self.model)
         recording.check(loaded)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
+        name = self.model.name
+        try_first(loaded, name, listener, file=self.model, frames=recording)
         ready = PreparedGraph.of(self.model, loaded, options.module_map)
         made = Trials(
             ready.model,

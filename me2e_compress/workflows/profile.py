@@ -3,11 +3,13 @@
 import dataclasses
 from pathlib import Path
 
+from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.workflows.checks import check_count, check_output, model_path
+from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table
 
@@ -97,9 +99,11 @@ def profile(
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
     check_output([written], (source, frames))
+    recording = CalibrationSet(Path(frames))
+    try_first(graph.load(source), source.name, listener, file=source, frames=recording)
     trace = measure(
         source,
-        CalibrationSet(Path(frames)),
+        recording,
         samples=options.samples,
         warm_up=options.warm_up,
         threads=options.threads,

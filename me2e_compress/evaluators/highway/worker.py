@@ -165,10 +165,10 @@ def _serve(
     line: Connection[Driven | Me2eError, Route], heartbeat: Heartbeat, job: Job
 ) -> None:
     """Drive the routes that come down the line until its other end closes."""
+    end_with_parent()
     from me2e_compress.evaluators.highway.episode_recorder import completion_percent
     from me2e_compress.evaluators.highway.runner import Listeners, drive
 
-    end_with_parent()
     asked = 0
 
     def on_query(world: World) -> None:

@@ -1,0 +1,111 @@
+"""A graph is opened in a process of its own first: onnxruntime may die of it.
+
+Native code that divides the least integer by -1, or runs out of stack, takes its
+process down without a word. What a graph did is remembered by its digest: the same one
+is not tried again on this machine.
+"""
+
+import contextlib
+import hashlib
+import json
+import signal
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import onnx_ir as ir
+import onnxruntime as ort
+import platformdirs
+
+from me2e_compress import graph
+from me2e_compress.errors import GraphError
+from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.children import run_script
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.opening import WRONG_FUSIONS, unsupported
+
+_SCRIPT = Path(__file__).with_name("opening_main.py")
+_SURVIVED = {"onnxruntime": ort.__version__, "survived": True}
+_REFUSED = (0, 1)
+"""Exit codes of a script that ended by itself: an exception gives 1."""
+
+
+def try_apart(
+    model: ir.Model,
+    name: str,
+    *,
+    file: Path | None = None,
+    feeds: Mapping[str, Array] | None = None,
+    memory: Path | None = None,
+    on_begin: Callable[[], None] = lambda: None,
+) -> float:
+    """Open a graph, and run it once, in a process of its own, if it is a new one.
+
+    Opening takes 0.3 s and what a session takes; running one inference more. A graph
+    that onnxruntime refuses passes here: whoever opens it then says why.
+
+    Args:
+        model: the graph; it stays as it is.
+        name: what messages call it.
+        file: that holds this very graph; None writes it to a temporary one.
+        feeds: inputs to run it once on; recurrent ones may be missing. None only opens.
+        memory: folder of verdicts; None takes the user's cache folder.
+        on_begin: called if the graph is a new one.
+
+    Returns:
+        Seconds that it took; 0 where the graph is known.
+
+    Raises:
+        GraphError: the process died; the message names the graph, the step and the
+            signal.
+    """
+    begun = perf_counter()
+    folder = memory or platformdirs.user_cache_path("me2e-compress") / "opened"
+    opened, ran = (folder / f"{each}.json" for each in _fingerprints(model))
+    verdict = opened if feeds is None else ran
+    if unsupported(model) or _is_known(verdict) or _is_known(ran):
+        return 0.0
+    on_begin()
+    with tempfile.TemporaryDirectory(prefix="me2e-opening-") as scratch:
+        inputs = Path(scratch) / "inputs.npz"
+        np.savez(inputs, allow_pickle=False, **(feeds or {}))
+        if file is None:
+            file = Path(scratch) / "model.onnx"
+            graph.save(model, file)
+        steps = "open" if feeds is None else "run"
+        words = [str(file), str(inputs), steps, *WRONG_FUSIONS]
+        done = run_script(_SCRIPT, words)
+    if done.returncode not in _REFUSED:
+        step = (done.stdout.split() or ["start"])[-1]
+        raise GraphError(f"{name}: onnxruntime {_end(done.returncode)} at step {step}")
+    with contextlib.suppress(OSError):  # a home that cannot be written to
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(verdict, _SURVIVED)
+    return perf_counter() - begun
+
+
+def _fingerprints(model: ir.Model) -> Iterator[str]:
+    """Name a graph that was opened, and one that was run, by this onnxruntime."""
+    known = (graph.digest(model), ort.__version__, "CPUExecutionProvider")
+    for step in ("opened", "ran"):
+        yield hashlib.sha256("\n".join((*known, step)).encode()).hexdigest()
+
+
+def _is_known(verdict: Path) -> bool:
+    """Return whether a graph survived before; a verdict that is no JSON is none."""
+    try:
+        found: object = json.loads(verdict.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return found == _SURVIVED
+
+
+def _end(code: int) -> str:
+    """Say how a process died."""
+    if code == -signal.SIGKILL:
+        return "was killed (out of memory?)"
+    if code < 0:
+        return f"dies of it ({signal.Signals(-code).name})"
+    return f"dies of it (exit code {code})"

@@ -1,0 +1,41 @@
+"""Opens and runs a graph: ``python opening_main.py MODEL INPUTS.npz STEPS FUSION...``.
+
+It says each step before it takes it, so that the last one is known if it dies.
+"""
+
+import sys
+
+import numpy as np
+import onnxruntime as ort
+
+_NUMPY = {"float": "float32", "double": "float64"}
+
+
+def main(model: str, inputs: str, steps: str, *disabled: str) -> None:
+    """Open a file as a session does; run it once where the steps say so."""
+    options = ort.SessionOptions()
+    options.log_severity_level = 4
+    options.enable_mem_pattern = False
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    sys.stdout.write("open\n")
+    sys.stdout.flush()
+    session = ort.InferenceSession(
+        model,
+        options,
+        providers=["CPUExecutionProvider"],
+        disabled_optimizers=list(disabled),
+    )
+    if steps != "run":
+        return
+    feeds = dict(np.load(inputs, allow_pickle=False))
+    for port in session.get_inputs():
+        if port.name not in feeds:
+            word = port.type.removeprefix("tensor(").removesuffix(")")
+            feeds[port.name] = np.zeros(port.shape, _NUMPY.get(word, word))
+    sys.stdout.write("run\n")
+    sys.stdout.flush()
+    session.run(None, {port.name: feeds[port.name] for port in session.get_inputs()})
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,42 @@
+"""A graph that was never opened here is opened in a process of its own first."""
+
+from functools import partial
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress.runtime import first_opening
+from me2e_compress.runtime.frames import Frames
+from me2e_compress.workflows.listener import Listener
+
+STAGE = "first opening"
+
+
+def try_first(
+    model: ir.Model,
+    name: str,
+    listener: Listener,
+    *,
+    file: Path | None = None,
+    frames: Frames | None = None,
+) -> None:
+    """Open a graph apart, if this machine has not seen it; run its first frame there.
+
+    Args:
+        model: the graph.
+        name: what messages call it.
+        listener: is told how long it took: no other time counts it.
+        file: that holds this very graph.
+        frames: a recording that fits it; without one, the graph is not run.
+
+    Raises:
+        GraphError: onnxruntime dies of the graph.
+    """
+    first = None if frames is None else next(iter(frames), None)
+    feeds = None if first is None else first.arrays
+    begins = partial(listener.on_progress, STAGE, 0, 1, name)
+    seconds = first_opening.try_apart(
+        model, name, file=file, feeds=feeds, on_begin=begins
+    )
+    if seconds:
+        listener.on_progress(STAGE, 1, 1, f"{name}: {seconds:.1f} s")
