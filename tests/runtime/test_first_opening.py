@@ -9,6 +9,7 @@ import pytest
 
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime import first_opening
+from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.first_opening import try_apart
 
 pytestmark = pytest.mark.opens_apart
@@ -21,7 +22,6 @@ def test_a_graph_that_survived_is_not_tried_again(
     assert try_apart(driver, "driver", feeds=camera, memory=tmp_path) > 0
     (verdict,) = tmp_path.iterdir()
     tried: list[object] = []
-    run_script = first_opening.run_script
 
     def noted(script: Path, words: list[str]) -> object:
         tried.append(script)
