@@ -41,15 +41,14 @@ class PassManager:
         reproducers: the folder that a failing pass leaves its reproducer in.
         samples: recorded frames that exact passes are checked on where the context has
             none; None makes seeded inputs up then.
-        try_first: called with a graph, and what it is called, before it is run here;
-            what that raises ends the run.
+        try_first: called with a graph and its name before it is run; may refuse it.
     """
 
     passes: tuple[Pass, ...]
     verify_frames: int = 2
     reproducers: Path | None = None
     samples: CalibrationSet | None = None
-    try_first: Callable[[ir.Model, str], None] | None = None
+    try_first: Callable[[ir.Model, str], None] = lambda model, name: None
 
     def run(
         self, model: ir.Model, context: Context, progress: Progress | None = None
@@ -101,8 +100,7 @@ class PassManager:
 def collector_paused() -> Iterator[None]:
     """Let Python's cycle collector rest: it would walk a million live nodes in vain.
 
-    A quarter of the time of a run goes into that otherwise. What a pass leaves behind
-    is collected once, at the end.
+    A quarter of a run goes into that otherwise; what is left is collected at its end.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -164,8 +162,7 @@ class _Books:
         stretch, self._stretch = self._stretch, []
         if not stretch or not self.manager.verify_frames:
             return
-        if self.manager.try_first is not None:
-            self.manager.try_first(model, f"the graph after {stretch[-1][0].name}")
+        self.manager.try_first(model, f"the graph after {stretch[-1][0].name}")
         found, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(found)
         if equivalence.passed(found) or inputs is None:

@@ -7,7 +7,7 @@ however large they are together (a protobuf message ends at 2 GiB).
 
 import functools
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -75,7 +75,7 @@ def unsupported(model: ir.Model) -> str | None:
 
 _INT8_STAYS = "session.qdqisint8allowed"
 WRONG_FUSIONS = ("Pad_Fusion",)
-"""Optimizations of onnxruntime (1.31) that no session makes: this one folds a Pad of
+"""Optimizations of onnxruntime (1.31) that sessions leave out: this one folds a Pad of
 zeros into the MaxPool behind it, whose own padding is minus infinity."""
 LENT_BYTES = 1024
 """Smaller tensors are left in the graph: shape inference reads those."""
@@ -92,7 +92,7 @@ _LENDABLE = frozenset(
 
 
 def open_file(
-    path: Path, options: ort.SessionOptions
+    path: Path, options: ort.SessionOptions, without: Sequence[str] = WRONG_FUSIONS
 ) -> tuple[ort.InferenceSession, Weights]:
     """Open an ONNX file: as it stands or, where onnxruntime refuses that, as read here.
 
@@ -108,14 +108,16 @@ def open_file(
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     try:
-        return _build(str(path), options), {}
+        return _build(str(path), options, without), {}
     except GraphError:
         model = graph.load(path)
-    return open_graph(model, options)
+    return open_graph(model, options, without)
 
 
 def open_graph(
-    model: ir.Model, options: ort.SessionOptions
+    model: ir.Model,
+    options: ort.SessionOptions,
+    without: Sequence[str] = WRONG_FUSIONS,
 ) -> tuple[ort.InferenceSession, Weights]:
     """Open a graph in memory.
 
@@ -123,6 +125,7 @@ def open_graph(
         model: the graph; it stays as it is, and its weights are not to be changed
             while the session lives.
         options: of the session.
+        without: optimizations that onnxruntime is not to make.
 
     Returns:
         The session, and what must live as long.
@@ -144,13 +147,14 @@ def open_graph(
         with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:
             path = Path(folder) / "model.onnx"
             graph.save(model, path)
-            return _build(str(path), options), {}
+            return _build(str(path), options, without), {}
     weights = {
         name: ort.OrtValue.ortvalue_from_numpy(np.ascontiguousarray(tensor.numpy()))
         for name, tensor in lent.items()
     }
     options.add_external_initializers(list(weights), list(weights.values()))
-    return _build(_without(model, lent).SerializeToString(), options), weights
+    bare = _without(model, lent).SerializeToString()
+    return _build(bare, options, without), weights
 
 
 def _without(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> onnx.ModelProto:
@@ -183,28 +187,32 @@ def _needs_file(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> bool:
     )
 
 
-def _build(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
+def _build(
+    source: str | bytes, options: ort.SessionOptions, without: Sequence[str]
+) -> ort.InferenceSession:
     """Open a graph; where that fails, again without the step that makes int8 uint8.
 
     From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
     ``output_dtype`` is not that of their zero point, and then refuses them.
     """
     try:
-        return _opened(source, options)
+        return _opened(source, options, without)
     except REFUSALS as error:
         refusal = error
     options.add_session_config_entry(_INT8_STAYS, "1")
     try:
-        return _opened(source, options)
+        return _opened(source, options, without)
     except REFUSALS:
         line = " ".join(str(refusal).split())
         raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
 
 
-def _opened(source: str | bytes, options: ort.SessionOptions) -> ort.InferenceSession:
+def _opened(
+    source: str | bytes, options: ort.SessionOptions, without: Sequence[str]
+) -> ort.InferenceSession:
     return ort.InferenceSession(
         source,
         options,
         providers=["CPUExecutionProvider"],
-        disabled_optimizers=list(WRONG_FUSIONS),
+        disabled_optimizers=list(without),
     )

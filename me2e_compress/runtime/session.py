@@ -13,6 +13,7 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.opening import (
     REFUSALS,
+    WRONG_FUSIONS,
     InvalidArgument,
     Weights,
     open_file,
@@ -56,6 +57,8 @@ class Session:
         model: the graph, or the file that holds it.
         threads: threads within an operator; 0 lets onnxruntime take every core.
         optimize: False runs the nodes exactly as they stand (``ORT_DISABLE_ALL``).
+        stock: True makes every optimization that onnxruntime makes elsewhere, those
+            of :data:`~me2e_compress.runtime.opening.WRONG_FUSIONS` too.
         frugal: True runs nodes in the priority-based order, in which a reduction
             written right after its producer frees that tensor at once, and without the
             memory pattern, which reserves one block for everything that ever lives.
@@ -80,6 +83,7 @@ class Session:
         *,
         threads: int = 0,
         optimize: bool = True,
+        stock: bool = False,
         frugal: bool = False,
         release: bool = False,
         rewritten: Path | None = None,
@@ -106,10 +110,11 @@ class Session:
         if release:
             self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
         self._lent: Weights = {}
+        without = () if stock else WRONG_FUSIONS
         if isinstance(model, ir.Model):
-            self._ort, self._lent = open_graph(model, options)
+            self._ort, self._lent = open_graph(model, options, without)
         else:
-            self._ort, self._lent = open_file(model, options)
+            self._ort, self._lent = open_file(model, options, without)
         self.inputs = _ports(self._ort.get_inputs())
         self.outputs = _ports(self._ort.get_outputs())
         self.metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map

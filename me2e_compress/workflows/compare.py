@@ -74,8 +74,8 @@ def compare(
         candidate: the graph that is judged.
         frames: folder of recorded frames.
         listener: is called with progress and warnings.
-        as_it_stands: run the first graph without onnxruntime's optimizations: a graph
-            held against itself shows what those change.
+        as_it_stands: run the first graph without onnxruntime's optimizations, and the
+            second with all of them: a graph held against itself shows what they change.
 
     Raises:
         GraphError: no such model, or onnxruntime cannot run it.
@@ -95,5 +95,5 @@ def compare(
         return frame
 
     left = Session(paths[0], optimize=not as_it_stands, release=True)
-    right = Session(paths[1], release=True)
+    right = Session(paths[1], stock=as_it_stands, release=True)
     return CompareResult(*paths, measure(left, right, map(reported, recording)))

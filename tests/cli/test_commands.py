@@ -2,13 +2,13 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
-from me2e_compress.runtime.session import Session
-from tests.cli.conftest import Command, strict
+from tests.cli.conftest import Command, strict, write_frames
 from tests.docs.documents import faults
 
 NAMES = sorted(COMMANDS)
@@ -107,23 +107,27 @@ def test_a_graph_compared_with_itself_is_equal(
     assert found["frames"] == 2
 
 
-def test_a_reference_runs_without_the_runtimes_optimizations(
-    command: Command, files: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_reference_shows_what_the_runtime_makes_of_a_graph(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    opened: list[bool] = []
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "pool (float[1,1,2,2] camera) => (float[1,1,2,2] plan)\n"
+        "<int64[8] around = {0, 0, 1, 1, 0, 0, 1, 1}>\n"
+        "{ q = Pad(camera, around) plan = MaxPool<kernel_shape=[3,3]>(q) }"
+    )
+    graph.save(model, tmp_path / "m.onnx")
+    write_frames(tmp_path / "frames", camera=np.full((1, 1, 2, 2), -9, np.float32))
+    words = ("compare", tmp_path / "m.onnx", tmp_path / "m.onnx", tmp_path / "frames")
 
-    class Noted(Session):
-        def __init__(
-            self, model: Path, *, optimize: bool = True, release: bool = False
-        ) -> None:
-            opened.append(optimize)
-            super().__init__(model, optimize=optimize, release=release)
+    assert command(*words, "--json") == 0
+    (same,) = strict(capsys.readouterr().out)["outputs"]
+    assert command(*words, "--json", "--reference") == 0
+    (wrong,) = strict(capsys.readouterr().out)["outputs"]
 
-    monkeypatch.setattr("me2e_compress.workflows.compare.Session", Noted)
-    words = (files / "in.onnx", files / "in.onnx", files / "frames")
-
-    assert command("compare", *words, "--reference") == 0
-    assert opened == [False, True]
+    assert (same["sqnr_db"], wrong["sqnr_db"]) == (None, None)
+    assert same["error"] == 0.0
+    assert wrong["error"] is None  # infinite: zeros became negative
 
 
 def test_doctor_names_the_versions(

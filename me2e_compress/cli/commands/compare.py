@@ -16,7 +16,8 @@ def compare(
     as_it_stands: Annotated[
         bool,
         typer.Option(
-            "--reference", help="run the first without onnxruntime's optimizations"
+            "--reference",
+            help="the first without onnxruntime's optimizations, the second with all",
         ),
     ] = False,
     as_json: given.Json = False,
