@@ -20,8 +20,9 @@ from me2e_compress.calibration.stream import (
     probed_session,
     stream,
 )
-from me2e_compress.errors import FramesError
+from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.opening import unsupported
 
 Progress: TypeAlias = Callable[[int, int], None]
 
@@ -96,6 +97,11 @@ class Calibrator:
         if not tensors:
             nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
             return dataclasses.replace(blank, measured=nothing)
+        if reason := unsupported(model):
+            raise GraphError(
+                f"{reason}; ranges that TensorRT measured are taken by `calibrate"
+                " --import CACHE`, and then by `compress --ranges`"
+            )
         job = _Job(self, model, blank, frames, progress, 2 if counting else 1)
         job.extremes()
         if counting:

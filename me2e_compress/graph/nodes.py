@@ -1,10 +1,12 @@
 """Facts about nodes and values: who makes, who reads, and what constants hold."""
 
+import functools
 from collections.abc import Iterator
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import onnx
 import onnx_ir as ir
 
 STANDARD = ("", "ai.onnx")
@@ -14,6 +16,21 @@ STANDARD = ("", "ai.onnx")
 def is_standard(node: ir.Node) -> bool:
     """Return whether a node is one of ONNX's own operators."""
     return node.domain in STANDARD
+
+
+def is_plugin(node: ir.Node) -> bool:
+    """Return whether ONNX has no such operator: a plugin, or a function of the model.
+
+    A plugin may stand in the default domain: so do those of
+    ``OperatorExportTypes.ONNX_FALLTHROUGH`` (``MultiScaleDeformableAttnTRT``) and of a
+    symbolic without a domain (``MSDAPlugin``).
+    """
+    return not is_standard(node) or not _has_operator(node.op_type)
+
+
+@functools.cache
+def _has_operator(op_type: str) -> bool:
+    return bool(onnx.defs.has(op_type, domain=""))
 
 
 def opset_of(imports: ir.Model | ir.Function) -> int:

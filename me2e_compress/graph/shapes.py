@@ -6,7 +6,7 @@ import math
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import input_at
+from me2e_compress.graph.nodes import input_at, is_plugin, nodes_of
 
 INLINE_BYTES = 1024
 """Weights up to this size are shown to ONNX's inference: shapes and axes are."""
@@ -45,7 +45,7 @@ def infer_shapes(model: ir.Model, *, strict: bool = False) -> None:
     """
     try:
         proto = onnx.shape_inference.infer_shapes(
-            _without_weights(model), strict_mode=strict, data_prop=True
+            without_weights(model), strict_mode=strict, data_prop=True
         )
     except (
         onnx.checker.ValidationError,
@@ -88,6 +88,20 @@ def _adopt(
                     _adopt(inner, message, interface)
 
 
+def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
+    """List the plugins that give something whose shape the graph does not record.
+
+    Nothing can infer it. ``value_info`` of the file is where it is to be written.
+    """
+    return [
+        node
+        for node in nodes_of(model)
+        if is_plugin(node)
+        and node.op_identifier() not in model.functions
+        and any(value.shape is None for value in node.outputs if value.name)
+    ]
+
+
 def refined(declared: ir.Shape | None, found: ir.Shape | None) -> ir.Shape | None:
     """Return a declared shape, its open dimensions numbers where those are found."""
     if declared is None or found is None or len(declared) != len(found):
@@ -98,7 +112,7 @@ def refined(declared: ir.Shape | None, found: ir.Shape | None) -> ir.Shape | Non
     return ir.Shape([new if isinstance(new, int) else old for old, new in pairs])
 
 
-def _without_weights(model: ir.Model) -> onnx.ModelProto:
+def without_weights(model: ir.Model) -> onnx.ModelProto:
     """Write the model with its large weights as inputs; the model stays as it was."""
     graph = model.graph
     inputs, initializers = list(graph.inputs), list(graph.initializers.values())

@@ -2,14 +2,13 @@
 
 import dataclasses
 
-import onnx
 import onnx_ir as ir
-import onnx_ir.passes.common as common
 
 from me2e_compress import graph
 from me2e_compress.errors import VerificationError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.shapes import refined
+from me2e_compress.graph.validity import refusal
 from me2e_compress.passes.base import Pass, PassResult
 
 
@@ -45,11 +44,8 @@ def check_valid(name: str, model: ir.Model) -> None:
         VerificationError: it is not; the message names who left it so.
     """
     _check_order(name, model.graph)
-    try:
-        common.CheckerPass()(model)
-    except (onnx.checker.ValidationError, ir.passes.PassError) as error:
-        reason = str(error.__cause__ or error).strip().splitlines()[0]
-        raise VerificationError(f"{name} left an invalid graph: {reason}") from error
+    if reason := refusal(model):
+        raise VerificationError(f"{name} left an invalid graph: {reason}")
 
 
 def _check_claim(current: Pass, result: PassResult, *, changed: bool) -> None:

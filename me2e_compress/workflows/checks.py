@@ -10,6 +10,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph.opset import lowered
+from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.shipped import SHIPPED, shipped
@@ -41,7 +42,7 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 
 
 def read_graph(path: Path, listener: Listener) -> ir.Model:
-    """Read a graph, and warn of what was changed so that onnxruntime reads it.
+    """Read a graph, and warn of what was changed in it, and of what it lacks.
 
     Raises:
         GraphError: not a graph.
@@ -49,7 +50,21 @@ def read_graph(path: Path, listener: Listener) -> ir.Model:
     model = graph.load(path)
     if said := lowered(model):
         listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
+    if lack := lacking_shapes(model):
+        listener.on_warning(f"{path}: {lack}")
     return model
+
+
+def lacking_shapes(model: ir.Model) -> str:
+    """Say which plugins give what nobody knows the shape of; empty if none does."""
+    plugins = unshaped_plugins(model)
+    if not plugins:
+        return ""
+    names = ", ".join(dict.fromkeys(node.op_type for node in plugins))
+    return (
+        f"{len(plugins)} plugin nodes ({names}) tell no shape of what they give; write"
+        " it as value_info of the file, and folding, MACs and int8 go on behind them"
+    )
 
 
 def load_map(named: str | Path | None, model: ir.Model) -> ModuleMap:

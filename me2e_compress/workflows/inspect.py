@@ -15,7 +15,7 @@ from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
-from me2e_compress.workflows.checks import load_map, model_path
+from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.result import (
     AT_LEAST,
     Result,
@@ -41,6 +41,7 @@ class InspectResult(Result):
         file_bytes: with the weights beside it.
         opset: of the default domain.
         lowered: what was changed so that onnxruntime reads it; empty if nothing was.
+        hint: what the graph lacks, of which more could be known; empty if nothing.
         domains: further operator domains.
         map: the module map that was used.
         inputs: what it takes.
@@ -68,6 +69,7 @@ class InspectResult(Result):
     uncounted: dict[str, int]
     open_dimensions: tuple[str, ...]
     lowered: str = ""
+    hint: str = ""
 
     @property
     def headline(self) -> str:
@@ -76,6 +78,10 @@ class InspectResult(Result):
         read = f" ({self.lowered})" if self.lowered else ""
         size = f"{megabytes(self.file_bytes)} MB"
         return f"{self.file}: {size}, opset {self.opset}{more}{read}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the headline, and what the graph lacks."""
+        return tuple(filter(None, (self.hint, self.headline)))
 
     def tables(self) -> tuple[Table, ...]:
         """Return the interface, and the modules."""
@@ -171,6 +177,7 @@ def inspect(
         _uncounted(folded),
         open_dimensions(loaded),
         lowered(loaded),
+        lacking_shapes(loaded),
     )
 
 

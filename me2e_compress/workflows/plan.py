@@ -24,7 +24,7 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.plan.decision import record
 from me2e_compress.quantization.rules import DEFAULT_RULES
-from me2e_compress.workflows.checks import check_output, model_path
+from me2e_compress.workflows.checks import check_output, lacking_shapes, model_path
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table, table
 
@@ -56,10 +56,12 @@ class PlanResult(Result):
         plan: decisions for every node.
         changes: nodes that another plan decides differently; None where none was
             given to compare with.
+        hint: what the graph lacks, of which more could be known; empty if nothing.
     """
 
     plan: QuantPlan
     changes: tuple[PlanDifference, ...] | None = None
+    hint: str = ""
 
     @property
     def headline(self) -> str:
@@ -70,7 +72,8 @@ class PlanResult(Result):
 
     def lines(self) -> tuple[str, ...]:
         """Return the differences, and the headline."""
-        return (*map(str, self.changes or ()), self.headline)
+        said = filter(None, (self.hint, self.headline))
+        return (*map(str, self.changes or ()), *said)
 
     def tables(self) -> tuple[Table, ...]:
         """Return how many nodes of each module became what, by which rule."""
@@ -161,7 +164,8 @@ def plan(
     if written is not None:
         save_plan(found, written)
     if against is None:
-        return PlanResult(found)
+        hint = "" if isinstance(read[0], QuantPlan) else lacking_shapes(read[0])
+        return PlanResult(found, hint=hint)
     other = _made(files[1], read[1], plain, options)
     return PlanResult(found, tuple(differences(other, found)))
 

@@ -256,7 +256,11 @@ def test_a_report_is_plain_data(
     graph.save(report.model, output)
     record = report.record(source, output)
     assert record["pipeline"] == "import-normalize,halves"
-    assert record["source"] == {"file": "a.onnx", "sha256": graph.sha256_of(source)}
+    assert record["source"] == {
+        "file": "a.onnx",
+        "sha256": graph.sha256_of(source),
+        "read_as": "",
+    }
 
 
 def test_progress_counts_the_passes(chain: ir.Model, context: Context) -> None:

@@ -1,23 +1,20 @@
 """Make a graph from anywhere one that the other passes can work on."""
 
 import dataclasses
-import functools
 from collections.abc import Iterator
 from typing import ClassVar
 
-import onnx
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance
+from me2e_compress.graph.nodes import is_plugin
+from me2e_compress.graph.validity import PLUGIN_DOMAIN
 from me2e_compress.modules import assign
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import doubles
 from me2e_compress.rewrite import lift_constants
 
 __all__ = ["ORIGINAL_DOMAIN", "PLUGIN_DOMAIN", "ImportNormalize"]
-
-PLUGIN_DOMAIN = "me2e.plugin"
-"""Where plugins live in our graphs: the checker and functions need a domain."""
 
 ORIGINAL_DOMAIN = "me2e.domain"
 """Node metadata with the domain that a plugin had in the file it came from."""
@@ -125,7 +122,7 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
             node
             for node in body.all_nodes()
             if node.domain == ""
-            and not _is_standard(node.op_type)
+            and is_plugin(node)
             and node.op_identifier() not in model.functions
         ]
         for node in moved:
@@ -136,11 +133,6 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
             body.opset_imports.setdefault(PLUGIN_DOMAIN, 1)
         count += len(moved)
     return count
-
-
-@functools.cache
-def _is_standard(op_type: str) -> bool:
-    return bool(onnx.defs.has(op_type, domain=""))
 
 
 def _declare(model: ir.Model) -> int:

@@ -14,6 +14,7 @@ RULES: tuple[LintRule, ...] = (
     support.element_types,
     support.one_type,
     support.plugins,
+    support.plugin_shapes,
     support.restrictions,
     qdq.scales,
     qdq.zero_points,

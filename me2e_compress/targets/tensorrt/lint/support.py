@@ -6,6 +6,8 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import input_at, is_standard, nodes_of, opset_of, rank_of
+from me2e_compress.graph.nodes import is_plugin
+from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.quantized import PAIR
 from me2e_compress.targets.tensorrt.lint.support_matrix import (
@@ -39,7 +41,7 @@ def opset(model: ir.Model) -> Iterator[LintFinding]:
 def operators(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators that the parser refuses, or that are unknown."""
     for node in nodes_of(model):
-        if not is_standard(node) or node.op_type in PAIR:
+        if is_plugin(node) or node.op_type in PAIR:
             continue
         name = node.op_type
         if name in UNSUPPORTED:
@@ -89,9 +91,12 @@ def one_type(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def plugins(model: ir.Model) -> Iterator[LintFinding]:
-    """Check custom operators against the known plugins."""
+    """Check custom operators against the known plugins, whatever their domain.
+
+    TensorRT looks at the name alone; exporters leave the domain out.
+    """
     for node in nodes_of(model):
-        if is_standard(node):
+        if not is_plugin(node):
             continue
         plugin = PLUGINS.get(node.op_type)
         if plugin is not None:
@@ -100,9 +105,22 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
             yield error(
                 "plugin",
                 node,
-                f"{node.domain}::{node.op_type} is neither an operator nor a known"
-                " plugin, and has no local function",
+                f"{node.domain or 'ai.onnx'}::{node.op_type} is neither an operator nor"
+                " a known plugin, and has no local function",
             )
+
+
+def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
+    """Find known plugins whose outputs have no shape: nor has what is behind them."""
+    for node in unshaped_plugins(model):
+        if node.op_type not in PLUGINS:
+            continue
+        yield warning(
+            "plugin-shape",
+            node,
+            f"{node.op_type} tells no shape of what it gives: written as value_info,"
+            " folding, MACs and int8 go on behind it",
+        )
 
 
 def _call(node: ir.Node, plugin: Plugin) -> Iterator[LintFinding]:

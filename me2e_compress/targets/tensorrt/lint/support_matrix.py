@@ -144,6 +144,10 @@ PLUGINS: dict[str, Plugin] = {
     "MultiScaleDeformableAttentionPlugin": Plugin(
         _DL4AGX, (5, 5), rank=4, integers=(1, 2)
     ),
+    "MSDAPlugin": Plugin(_DL4AGX, (5, 5), rank=4, integers=(1, 2)),
+    "GridSamplePlugin": Plugin(_DL4AGX, (2, 2)),
+    "InversePlugin": Plugin(_DL4AGX, (1, 1), types=_PLUGIN_FLOAT),
+    "SelectAndPadPlugin": Plugin(_DL4AGX, (3, 3), ("P",), integers=(1,)),
     "RotatePlugin": Plugin(_DL4AGX, (3, 3), ("interpolation",), rank=3),
     "MMCVMultiScaleDeformableAttention": Plugin(
         _MMDEPLOY, (5, 5), rank=4, integers=(1, 2)

@@ -1,0 +1,49 @@
+"""Whether ONNX's own checker takes a graph."""
+
+import onnx
+import onnx_ir as ir
+
+from me2e_compress.graph.nodes import is_plugin, is_standard, nodes_of
+from me2e_compress.graph.shapes import without_weights
+
+PLUGIN_DOMAIN = "me2e.plugin"
+"""Where plugins of the default domain live in our graphs: checker and functions need a
+domain."""
+
+
+def refusal(model: ir.Model, *, plugins: bool = False) -> str | None:
+    """Return why ONNX's checker refuses a graph, in one line; None if it takes it.
+
+    An output without a shape is let pass: exporters leave out what they do not know,
+    behind a plugin for one, and every runtime takes that.
+
+    Args:
+        model: the graph; it stays as it is.
+        plugins: whether operators of the default domain that ONNX does not have are
+            taken for plugins, as TensorRT takes them.
+    """
+    try:
+        proto = without_weights(_apart(model) if plugins else model)
+        for value in proto.graph.output:
+            if value.type.HasField("tensor_type"):
+                value.type.tensor_type.shape.SetInParent()
+        onnx.checker.check_model(proto)
+    except (onnx.checker.ValidationError, ir.serde.SerdeError) as error:
+        reason = str(error.__cause__ or error).strip()
+        return reason.splitlines()[0] if reason else type(error).__name__
+    return None
+
+
+def _apart(model: ir.Model) -> ir.Model:
+    """Return a graph whose plugins of the default domain have a domain of their own."""
+    if not any(is_standard(node) and is_plugin(node) for node in nodes_of(model)):
+        return model
+    copy = model.clone()
+    for node in nodes_of(copy):
+        ours = node.op_identifier() in copy.functions
+        if is_standard(node) and is_plugin(node) and not ours:
+            node.domain = PLUGIN_DOMAIN
+    copy.opset_imports.setdefault(PLUGIN_DOMAIN, 1)
+    for function in copy.functions.values():
+        function.opset_imports.setdefault(PLUGIN_DOMAIN, 1)
+    return copy
