@@ -145,9 +145,11 @@ class _Measurement:
         reference = self._reference(self.report.lossy[0])
         fidelity = self._compare(reference)
         found = dataclasses.replace(found, fidelity=fidelity)
-        if not self.floor.shortfalls(fidelity):
+        low = [each.output for each in self.floor.shortfalls(fidelity)]
+        if not low:
             return found
-        unsteady = unsteady_outputs(reference, self.floor)
+        choosing = unsteady_outputs(reference, self.floor)
+        unsteady = {name: value for name, value in choosing.items() if name in low}
         below = self.floor.shortfalls(fidelity, unsteady)
         found = dataclasses.replace(found, unsteady=unsteady, shortfalls=below)
         return self._blame(found, reference) if below else found

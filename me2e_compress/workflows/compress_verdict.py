@@ -1,6 +1,6 @@
 """The last lines of a compression: size, int8, how far outputs and plan moved, time."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.floor import Shortfall, shown
@@ -26,11 +26,11 @@ def verdict(
     else:
         yield _fidelity_line(loss.fidelity, loss)
     if loss is not None and loss.unsteady:
-        listed = _listed(loss.unsteady.items(), loss)
         yield (
-            f"not judged: {listed} before anything is compressed, if only the largest"
-            " input is rounded to int8: near-equal candidates are chosen otherwise, and"
-            " only the road tells what that means"
+            f"not judged: {', '.join(loss.unsteady)}: the graph itself, uncompressed,"
+            f" falls to {_figures(loss)} when only its largest input is rounded to"
+            " int8; it chooses between near-equal candidates, and the road tells what"
+            " that means"
         )
 
 
@@ -106,12 +106,12 @@ def _fidelity_line(found: Fidelity, loss: MeasuredLoss) -> str:
     return f"{'; '.join(said) or 'no output could be judged'} ({where})"
 
 
-def _listed(items: Iterable[tuple[str, float]], loss: MeasuredLoss) -> str:
-    plan = "" if loss.fidelity is None else loss.fidelity.plan_output
-    has_metres = loss.fidelity is not None and loss.fidelity.plan is not None
+def _figures(loss: MeasuredLoss) -> str:
+    found = loss.fidelity
+    plan = found.plan_output if found is not None and found.plan is not None else ""
     return ", ".join(
-        f"{name} {shown(value, 'm' if has_metres and name == plan else 'dB')}"
-        for name, value in items
+        shown(value, "m" if name == plan else "dB")
+        for name, value in loss.unsteady.items()
     )
 
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import RecipeError
@@ -111,3 +112,19 @@ def test_what_is_wrong_with_overrides_is_one_line(text: str, message: str) -> No
 def test_no_such_file(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"none\.toml: no such file of overrides"):
         Overrides.load(tmp_path / "none.toml")
+
+
+def test_many_overrides_read_the_past_of_a_node_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model, read, whole = conv_attention(), list[str](), provenance.read
+    text = '[[override]]\nnodes = "/head/*"\ndtype = "float"\n'
+
+    def counted(node: ir.Node) -> Provenance | None:
+        read.append(node.name or "")
+        return whole(node)
+
+    monkeypatch.setattr(provenance, "read", counted)
+    Overrides.parse(text * 50).bind(model)
+
+    assert len(read) == len(model.graph)

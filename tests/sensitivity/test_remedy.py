@@ -26,7 +26,7 @@ def made(noise: Mapping[int, float]) -> Measure:
     return measure
 
 
-def search(noise: Mapping[int, float], most: int = 16) -> Remedy:
+def search(noise: Mapping[int, float], most: int = 14) -> Remedy:
     measure = made(noise)
     return find_remedy(NODES, measure([]), measure, Floor(20.0), most_trials=most)
 
@@ -45,7 +45,7 @@ def test_two_nodes_are_found_one_after_the_other() -> None:
 
     assert remedy.nodes == (NODES[37], NODES[3])
     assert remedy.cures
-    assert remedy.trials <= 14
+    assert remedy.trials == 14
 
 
 def test_noise_that_is_spread_over_a_module_is_cured_by_the_module() -> None:

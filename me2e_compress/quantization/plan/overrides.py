@@ -20,7 +20,7 @@ that they stand for. Where two overrides match a node, the later counts.
 
 import dataclasses
 import fnmatch
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -57,12 +57,17 @@ class Override(_Strict):
             raise ValueError("none of nodes, module, op and reads is given")
         return self
 
-    def matches(self, node: ir.Node) -> bool:
-        """Return whether it applies to a node."""
+    def matches(self, node: ir.Node, names: Sequence[str] | None = None) -> bool:
+        """Return whether it applies to a node.
+
+        Args:
+            node: of a graph.
+            names: its own and its origins'; None looks them up.
+        """
         return (
             (self.op is None or node.op_type == self.op)
             and (self.module is None or provenance.module_of(node) == self.module)
-            and (self.nodes is None or _named(node, self.nodes))
+            and (self.nodes is None or _named(names or _names(node), self.nodes))
             and (self.reads is None or _reads(node, self.reads))
         )
 
@@ -130,15 +135,17 @@ class Overrides(_Strict):
         Raises:
             RecipeError: one matches nothing.
         """
-        main = tuple(model.graph)
+        main = {node: _names(node) for node in model.graph}
         pinned: dict[ir.Node, Override] = {}
         for each in self.override:
             pinned.update(dict.fromkeys(_some(main, each.matches, str(each)), each))
         apart: dict[ir.Node, None] = {}
         for rule in self.concat:
 
-            def joined(node: ir.Node, glob: str = rule.nodes) -> bool:
-                return node.op_type == "Concat" and _named(node, glob)
+            def joined(
+                node: ir.Node, names: Sequence[str], glob: str = rule.nodes
+            ) -> bool:
+                return node.op_type == "Concat" and _named(names, glob)
 
             apart.update(dict.fromkeys(_some(main, joined, f"concat {rule.nodes!r}")))
         return Pins(pinned, frozenset(apart))
@@ -191,9 +198,12 @@ class Pins:
                 )
 
 
-def _named(node: ir.Node, glob: str) -> bool:
+def _names(node: ir.Node) -> tuple[str, ...]:
     past = provenance.read(node)
-    names = (node.name or "", *(past.origins if past is not None else ()))
+    return (node.name or "", *(past.origins if past is not None else ()))
+
+
+def _named(names: Sequence[str], glob: str) -> bool:
     return any(fnmatch.fnmatchcase(name, glob) for name in names)
 
 
@@ -203,9 +213,11 @@ def _reads(node: ir.Node, glob: str) -> bool:
 
 
 def _some(
-    nodes: tuple[ir.Node, ...], matches: Callable[[ir.Node], bool], what: str
+    nodes: Mapping[ir.Node, Sequence[str]],
+    matches: Callable[[ir.Node, Sequence[str]], bool],
+    what: str,
 ) -> list[ir.Node]:
-    found = [node for node in nodes if matches(node)]
+    found = [node for node, names in nodes.items() if matches(node, names)]
     if not found:
         raise RecipeError(f"override {what} matches none of {len(nodes)} nodes")
     return found
