@@ -14,13 +14,16 @@ from me2e_compress.quantization.plan import (
     Overrides,
     QuantPlan,
     make_plan,
+    savable_bytes,
     sharing_costs,
     stamp_plan,
+    with_weight_only,
 )
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.quantized import describe_quantized
+from me2e_compress.targets.weight_only import store_weights
 
 _SHOWN = 5
 """How many of a kind a note lists."""
@@ -54,6 +57,8 @@ class QuantizeInt8(Pass):
         method: how ranges are read from the frames: ``max-min``,
             ``moving-average:W``, ``percentile:P``, ``mse`` or ``entropy``.
         ranges: file of saved ranges instead of frames.
+        weight_only_gemv: store the weights of matrix-vector products, which rule
+            ``gemv`` keeps in float, as int8; no range is needed for it.
     """
 
     name: ClassVar[str] = "quantize-int8"
@@ -69,6 +74,7 @@ class QuantizeInt8(Pass):
     overrides: Path | None = None
     method: str = "max-min"
     ranges: Path | None = None
+    weight_only_gemv: bool = False
 
     @property
     def needs_frames(self) -> bool:
@@ -95,25 +101,41 @@ class QuantizeInt8(Pass):
         plan = self._placeable(model, context)
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
-        if not tensors:
-            return PassResult(
-                model, 0, ("nothing to quantize", *_notes(plan, self.target))
+        advice = self._advice(plan, model)
+        if not tensors and not plan.weight_only:
+            notes = ("nothing to quantize", *_notes(plan, self.target), *advice)
+            return PassResult(model, 0, notes)
+        ranges = Ranges({}, self.method, 0, "", "")
+        if tensors:
+            ranges = context.ranges(
+                self.name,
+                model,
+                tensors,
+                method=self.method,
+                saved=self.ranges,
             )
-        ranges = context.ranges(
-            self.name,
-            model,
-            tensors,
-            method=self.method,
-            saved=self.ranges,
-        )
         placed = target.place(model, plan, ranges)
+        store_weights(placed, plan)
         stamp_plan(placed, plan)
         notes = (
             *_notes(plan, self.target),
             *_findings(plan, ranges),
+            *advice,
             _lint(placed, self.target),
         )
-        return PassResult(placed, len(plan.placed), notes)
+        return PassResult(placed, len(plan.placed) + len(plan.weight_only), notes)
+
+    def _advice(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
+        """Say what weights of matrix-vector products would save as int8, if much."""
+        if self.weight_only_gemv:
+            return ()
+        count, saved = savable_bytes(plan, model)
+        if not count:
+            return ()
+        return (
+            f"weight_only_gemv=true would save {saved / 1e6:.1f} MB:"
+            f" {count} weights of matrix-vector products are float",
+        )
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
         """Decide for every node of a graph whose shapes are inferred."""
@@ -121,7 +143,9 @@ class QuantizeInt8(Pass):
         if self.overrides is not None:
             overrides = Overrides.load(self.overrides)
         costs = TARGETS.parse(self.target).costs
-        return make_plan(model, self._scheme(context), self._rules(), overrides, costs)
+        rules, scheme = self._rules(), self._scheme(context)
+        plan = make_plan(model, scheme, rules, overrides, costs)
+        return with_weight_only(plan, model) if self.weight_only_gemv else plan
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of what its target reads in int8."""
@@ -151,6 +175,8 @@ class QuantizeInt8(Pass):
 def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
     counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
     found = f"{len(plan.placed)} of {len(plan.decisions)} nodes {INT8}"
+    if plan.weight_only:
+        found += f", the weights alone of {len(plan.weight_only)} more"
     if plan.kept_float:
         found += f"; {len(plan.chosen)} by the plan"
     scheme = plan.scheme

@@ -4,7 +4,7 @@ import dataclasses
 
 import onnx_ir as ir
 
-from me2e_compress.quantization.plan import INT8, Decision, QuantPlan
+from me2e_compress.quantization.plan import FLOAT, Decision, QuantPlan
 
 LEAST_BYTES = 1024
 """Smaller constants are not worth a word."""
@@ -52,7 +52,7 @@ def float_weights(model: ir.Model, plan: QuantPlan) -> tuple[FloatWeight, ...]:
         decision = decided.get(str(node.outputs[0].name)) if node.outputs else None
         if decision is None:
             continue
-        is_int8 = decision.dtype == INT8 and decision.output not in kept
+        is_int8 = decision.dtype != FLOAT and decision.output not in kept
         for at, value in enumerate(node.inputs):
             if value is None or not _is_weight(value):
                 continue

@@ -54,6 +54,7 @@ class CompressOptions:
         rules: of the int8 plan: ``safe`` or ``paper``.
         target: runtime of the int8 graph: ``tensorrt`` or ``onnxruntime``.
         overrides: TOML file of exceptions to the int8 plan.
+        weight_only_gemv: store the weights of matrix-vector products as int8.
         ranges: file of saved ranges, instead of frames.
         method: how ranges are read from frames, or were for ``ranges``.
         module_map: preset or TOML file; None finds the preset.
@@ -73,6 +74,7 @@ class CompressOptions:
     rules: str | None = None
     target: str | None = None
     overrides: str | Path | None = None
+    weight_only_gemv: bool = False
     ranges: str | Path | None = None
     method: str | None = None
     module_map: str | Path | None = None
@@ -120,7 +122,7 @@ class CompressOptions:
 
     def _with_int8(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
         """Set options of the passes that quantize, else of those that read ranges."""
-        named = ("rules", "target", "method")
+        named = ("rules", "target", "method", "weight_only_gemv")
         given: dict[str, object] = {n: v for n in named if (v := getattr(self, n))}
         files = {"overrides": self.overrides, "ranges": self.ranges}
         given |= {name: Path(file) for name, file in files.items() if file is not None}
@@ -132,7 +134,7 @@ class CompressOptions:
         known = {name for each in readers for name in each.option_names()}
         if unknown := [name for name in given if name not in known]:
             raise RecipeError(
-                f"--{unknown[0]} is for int8, and the pipeline has no"
+                f"--{unknown[0].replace('_', '-')} is for int8, and the pipeline has no"
                 f" {QuantizeInt8.name}: add --scheme"
             )
         return tuple(

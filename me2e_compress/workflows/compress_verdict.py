@@ -73,6 +73,9 @@ def _int8_line(int8: Int8Outcome) -> str:
         rules = ", ".join(f"{k} {megabytes(v)}" for k, v in int8.float_bytes.items())
         total = megabytes(sum(int8.float_bytes.values()))
         said += f"; {total} MB of weights stay float, by rule: {rules}"
+    if int8.weight_only_bytes:
+        saved = megabytes(int8.weight_only_bytes)
+        said += f"; --weight-only-gemv would save {saved} MB"
     return said
 
 

@@ -11,7 +11,7 @@ from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.float_weights import FloatWeight, float_weights
-from me2e_compress.quantization.plan import QuantPlan, plan_of
+from me2e_compress.quantization.plan import QuantPlan, plan_of, savable_bytes
 
 LISTED = 10
 """Float weights that a report lists."""
@@ -29,6 +29,8 @@ class Int8Outcome:
         kept: how many of those each rule keeps float, the most first, with its reason.
         weights: the largest that stayed float, at most `LISTED`.
         float_bytes: of all weights that stayed float, by rule, the most first.
+        weight_only_bytes: that ``weight_only_gemv`` would save; 0 where it does, or
+            where that is little.
     """
 
     by: str
@@ -37,6 +39,7 @@ class Int8Outcome:
     kept: Mapping[str, int] = dataclasses.field(default_factory=dict)
     weights: tuple[FloatWeight, ...] = ()
     float_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    weight_only_bytes: int = 0
 
     @classmethod
     def of(cls, report: Report, context: Context) -> Self | None:
@@ -49,7 +52,7 @@ class Int8Outcome:
         if plan is None:
             return cls(name, changes)
         layers = [each for each in plan.decisions if each.op in WEIGHTED]
-        placed = {each.output for each in plan.placed}
+        placed = {each.output for each in (*plan.placed, *plan.weight_only)}
         left = [each for each in layers if each.output not in placed]
         weights = float_weights(quantizer.before, plan)
         return cls(
@@ -59,6 +62,7 @@ class Int8Outcome:
             dict(Counter(f"{e.rule}: {e.reason}" for e in left).most_common()),
             weights[:LISTED],
             _by_rule(weights),
+            savable_bytes(plan, quantizer.before)[1],
         )
 
     @property

@@ -39,6 +39,7 @@ class PlanOptions:
         overrides: TOML file of exceptions.
         module_map: preset or TOML file; None finds the preset.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        weight_only_gemv: store the weights of matrix-vector products as int8.
     """
 
     scheme: str | None = None
@@ -46,6 +47,7 @@ class PlanOptions:
     overrides: str | Path | None = None
     module_map: str | Path | None = None
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    weight_only_gemv: bool = False
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -156,7 +158,9 @@ def plan(
     read = [_read(path) for path in files]
     _check_options(options, files, read)
     plain = QuantizeInt8(
-        scheme=options.scheme or "full", rules=options.rules or DEFAULT_RULES
+        scheme=options.scheme or "full",
+        rules=options.rules or DEFAULT_RULES,
+        weight_only_gemv=options.weight_only_gemv,
     )
     overrides = None if options.overrides is None else Path(options.overrides)
     chosen = dataclasses.replace(plain, overrides=overrides)
@@ -196,11 +200,11 @@ def _check_options(
     Raises:
         RecipeError: names the first option and the file.
     """
-    names = ("scheme", "rules", "overrides")
+    names = ("scheme", "rules", "weight_only_gemv", "overrides")
     given = [name for name in names if getattr(options, name)]
     only = read[:1] if "overrides" in given else read
     if given and all(isinstance(each, QuantPlan) for each in only):
-        option = "overrides" if "overrides" in given else given[0]
+        option = "overrides" if "overrides" in given else given[0].replace("_", "-")
         raise RecipeError(
             f"--{option} is for a plan that is yet to be made, and {files[0]} has its"
             " own: give the float model"

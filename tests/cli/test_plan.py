@@ -148,7 +148,14 @@ def test_options_of_int8_reach_the_pass(
     command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (dense / "o.toml").write_text('[[override]]\nop = "MatMul"\ndtype = "float"\n')
-    more = ("--overrides", dense / "o.toml", "--rules", "paper", "--json")
+    more = (
+        "--overrides",
+        dense / "o.toml",
+        "--rules",
+        "paper",
+        "--json",
+        "--allow-empty",
+    )
 
     compressed(command, dense, *more)
 

@@ -31,6 +31,7 @@ def compress(
     rules: given.Rules = None,
     target: given.Target = None,
     overrides: given.Overrides = None,
+    weight_only_gemv: given.WeightOnlyGemv = False,
     frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
     ranges: given.SavedRanges = None,
     method: given.Method = None,
@@ -54,7 +55,7 @@ def compress(
         scheme=scheme, rules=rules, target=target, overrides=overrides, ranges=ranges,
         method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
         measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
-        dims=sizes(set_dim or ()),
+        weight_only_gemv=weight_only_gemv, dims=sizes(set_dim or ()),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)

@@ -26,6 +26,7 @@ def plan(
     scheme: given.Scheme = None,
     rules: given.Rules = None,
     overrides: given.Overrides = None,
+    weight_only_gemv: given.WeightOnlyGemv = False,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
     against: Against = None,
@@ -36,7 +37,7 @@ def plan(
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
     options = workflow.PlanOptions(
-        scheme, rules, overrides, module_map, sizes(set_dim or ())
+        scheme, rules, overrides, module_map, sizes(set_dim or ()), weight_only_gemv
     )
     found = workflow.plan(model, output, against, options)
     listed = found.details(every=every) if nodes or every else ()

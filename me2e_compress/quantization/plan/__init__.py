@@ -4,6 +4,7 @@ from me2e_compress.quantization.plan.decision import (
     FLOAT,
     INT8,
     RESIDUAL,
+    WEIGHT_ONLY,
     Decision,
     KeptFloat,
     PlanDifference,
@@ -23,11 +24,16 @@ from me2e_compress.quantization.plan.groups import (
 )
 from me2e_compress.quantization.plan.make import make_plan, tensors_of
 from me2e_compress.quantization.plan.overrides import Overrides
+from me2e_compress.quantization.plan.weight_only import (
+    savable_bytes,
+    with_weight_only,
+)
 
 __all__ = [
     "FLOAT",
     "INT8",
     "RESIDUAL",
+    "WEIGHT_ONLY",
     "Decision",
     "KeptFloat",
     "Overrides",
@@ -40,9 +46,11 @@ __all__ = [
     "make_plan",
     "plan_of",
     "record",
+    "savable_bytes",
     "save_plan",
     "share_scales",
     "sharing_costs",
     "stamp_plan",
     "tensors_of",
+    "with_weight_only",
 ]

@@ -12,6 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, nodes_of
+from me2e_compress.graph.shapes import extent
 from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
@@ -203,7 +204,10 @@ def branches(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
-    """Find layers that read int8 on one side only."""
+    """Find layers that read int8 on one side only.
+
+    A matrix-vector product may: it is as fast as its weight is small.
+    """
     for node in nodes_of(model):
         if node.op_type not in WEIGHTED or not is_standard(node):
             continue
@@ -214,7 +218,7 @@ def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
             )
         elif sides == [False, True] and not _only_stored(node.inputs[1]):
             yield warning("half-quantized", node, "only one operand is int8")
-        elif sides == [False, True]:
+        elif sides == [False, True] and not _is_vector(node):
             yield warning(
                 "half-quantized", node, "its activation is float: it runs in float"
             )
@@ -226,6 +230,12 @@ def float_weights(model: ir.Model) -> Iterator[LintFinding]:
         value = node.inputs[0]
         if node.op_type == QUANTIZE and stored(value):
             yield warning("float-weight", node, "the weight is stored as float")
+
+
+def _is_vector(node: ir.Node) -> bool:
+    """Return whether a layer is a product of a matrix by a vector."""
+    products = ("Gemm", "MatMul")
+    return node.op_type in products and extent(node, weight=True).is_vector
 
 
 def _is_weight(node: ir.Node) -> bool:
