@@ -45,6 +45,9 @@ SetDim = Annotated[
     list[str] | None,
     typer.Option(help="size of an open dimension: batch=1; once for each"),
 ]
+Force = Annotated[
+    bool, typer.Option("--force", help="replace what is there, whoever wrote it")
+]
 Json = Annotated[bool, typer.Option("--json", help="for programs")]
 RecipeOutput = Annotated[Path, typer.Option("-o", "--output", help="the RECIPE.toml")]
 TrialScheme = Annotated[

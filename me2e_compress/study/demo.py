@@ -17,11 +17,11 @@ from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
+from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.result import Result, Table
-from me2e_compress.zoo import shipped
 
 CALIBRATION_FRAMES, CALIBRATION_SEED = 64, 0
 HELD_OUT_FRAMES, HELD_OUT_SEED = 24, 1
@@ -75,6 +75,7 @@ class DriverDemo:
         scheme: a shipped recipe.
         routes: that both drive: a number or ``ID,ID``.
         workers: routes at a time.
+        force: replace files that are not as we left them, too.
 
     Raises:
         RecipeError: no such recipe.
@@ -87,6 +88,7 @@ class DriverDemo:
     scheme: str = "feature-ext"
     routes: str = "5"
     workers: int = 2
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check recipe, routes and folder."""
@@ -104,16 +106,19 @@ class DriverDemo:
 
         Int8 is for what drives here: placed for TensorRT it is slower than float.
         """
-        shipped.copy(self.name, self._source)
+        export_stack(self.name, self._source, ExportOptions(force=self.force))
         for folder, count, seed in (
             (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
             (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
         ):
-            record_frames(self._source, folder, FramesOptions(count, seed), listener)
+            asked = FramesOptions(count, seed, force=self.force)
+            record_frames(self._source, folder, asked, listener)
         passes = recipe.load(self.scheme)
         target = TARGET if any(each.quantizes for each in passes) else None
         # Fidelity is measured on frames of other routes, see `compare`.
-        options = CompressOptions(target=target, measure_frames=0, allow_empty=True)
+        options = CompressOptions(
+            target=target, measure_frames=0, allow_empty=True, force=self.force
+        )
         return compress(
             self._source, self._small, passes, self._frames, options, listener
         )
@@ -142,10 +147,11 @@ class DriverDemo:
             held_out=self._held_out,
             timing=Timing(LATENCY_SAMPLES),
         )
-        found = run_study(study, self.out, LocalEngine(self.workers), listener)
+        engine = LocalEngine(self.workers)
+        found = run_study(study, self.out, engine, listener, force=self.force)
         words = ("me2e-compress", "demo", "-o", str(self.out))
         chosen = ("--routes", self.routes, "--scheme", self.scheme)
-        written = write_study(found, self.out, (*words, *chosen))
+        written = write_study(found, self.out, (*words, *chosen), force=self.force)
         ending = (
             *verdict(found, self.scheme),
             f"{self._small} and {written.report} are yours.",

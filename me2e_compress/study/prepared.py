@@ -130,6 +130,7 @@ def _compressed(
 
     # The study measures on frames of its own; nothing int8 is a finding, not an end.
     options = CompressOptions(
+        force=True,  # what is in the workspace is its own affair
         module_map=variant.module_map,
         seed=study.seed,
         measure_frames=0,

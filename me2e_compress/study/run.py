@@ -14,6 +14,7 @@ from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
 from me2e_compress.workflows.checks import check_folder
+from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.listener import SILENT, Listener
 
 
@@ -23,6 +24,8 @@ def run_study(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     pictures: int = 3,
+    *,
+    force: bool = False,
 ) -> StudyResult:
     """Make the models, time them, hold them against the baseline, drive them.
 
@@ -35,6 +38,7 @@ def run_study(
         engine: Where routes are driven; None for one process of this machine.
         listener: Is called with progress and warnings.
         pictures: On how many routes two drives are shown side by side.
+        force: Replace a report that is not as we left it, too.
 
     Raises:
         GraphError: The folder is a file or an input.
@@ -43,6 +47,14 @@ def run_study(
     """
     study, folder = _read(study), Path(folder)
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
+    check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
+    with writing(folders=[folder]):
+        return _run(study, folder, engine or LocalEngine(), listener, pictures)
+
+
+def _run(
+    study: Study, folder: Path, engine: Engine, listener: Listener, pictures: int
+) -> StudyResult:
     workspace = Workspace(folder)
     prepared = [
         prepare_variant(study, variant, workspace, listener)
@@ -50,7 +62,7 @@ def run_study(
     ]
     clock = time_all(study, prepared, workspace, listener)
     variants = _variants(study, prepared, clock, listener)
-    setup = DriveSetup(study, clock, workspace, engine or LocalEngine(), listener)
+    setup = DriveSetup(study, clock, workspace, engine, listener)
     drives = [
         drive
         for condition in study.conditions

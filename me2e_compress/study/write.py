@@ -10,6 +10,7 @@ from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report import html
 from me2e_compress.study.tables import all_tables
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
+from me2e_compress.workflows.claims import writing
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,11 @@ class StudyFiles:
 
 
 def write_study(
-    outcome: StudyResult, folder: str | Path, command: Sequence[str] = ()
+    outcome: StudyResult,
+    folder: str | Path,
+    command: Sequence[str] = (),
+    *,
+    force: bool = False,
 ) -> StudyFiles:
     """Write JSON, Markdown and HTML, each whole or not at all.
 
@@ -36,9 +41,11 @@ def write_study(
         outcome: What was found.
         folder: It is made when needed.
         command: What makes it again, word by word.
+        force: Replace files that are not as we left them, too.
 
     Raises:
         StudyError: The folder cannot be written.
+        GraphError: One of the files is not as we left it.
     """
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
@@ -46,9 +53,10 @@ def write_study(
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(written.record, outcome.to_json(), indent=1)
-        write_bytes(written.tables, text.encode())
-        write_bytes(written.report, html(outcome, command).encode())
+        with writing([written.record, written.tables, written.report], force=force):
+            write_json(written.record, outcome.to_json(), indent=1)
+            write_bytes(written.tables, text.encode())
+            write_bytes(written.report, html(outcome, command).encode())
     except OSError as error:
         raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
     return written

@@ -23,12 +23,14 @@ from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.workflows.checks import (
+    Given,
     check_count,
     check_folder,
-    check_output,
     model_path,
+    output_path,
     read_graph,
 )
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -56,6 +58,7 @@ class CalibrateOptions:
         onnxruntime_table: write onnxruntime's table too, into this folder.
         threads: of onnxruntime; 0 takes all.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: no such method, a number below 0, or a shard that is none.
@@ -74,6 +77,7 @@ class CalibrateOptions:
     onnxruntime_table: str | Path | None = None
     threads: int = 0
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check what can be checked without a file."""
@@ -174,10 +178,22 @@ def calibrate(
         RecipeError: no such recipe.
     """
     options = options or CalibrateOptions()
-    source, output = model_path(model), Path(output)
+    source, output = model_path(model), output_path(output)
     _check_sources(frames, options)
-    checkpoint = output.with_name(output.name + ".checkpoint")
-    _check_outputs(source, frames, (output, checkpoint), options)
+    outputs, inputs = _outputs(output, options), _inputs(source, frames, options)
+    if options.onnxruntime_table is not None:
+        check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
+    with writing(outputs, inputs, force=options.force):
+        return _calibrate(source, frames, output, options, listener)
+
+
+def _calibrate(
+    source: Path,
+    frames: str | Path | None,
+    output: Path,
+    options: CalibrateOptions,
+    listener: Listener,
+) -> CalibrateResult:
     passes = with_sizes(recipe.load(options.recipe), options.dims)
     loaded = read_graph(source, listener)
     part = None if frames is None else _part(loaded, Path(frames), options)
@@ -190,6 +206,7 @@ def calibrate(
         found = _given(graph.digest(ready.model), tensors, options)
         return _written(found, output, options)
     method = options.method
+    checkpoint = _checkpoint(output)
     calibrator = Calibrator(method, options.threads, checkpoint=checkpoint)
     seen = calibrator.collect(
         ready.model,
@@ -214,18 +231,27 @@ def _check_sources(frames: str | Path | None, options: CalibrateOptions) -> None
         raise FramesError("--shard is for frames, and none are given")
 
 
-def _check_outputs(
-    source: Path,
-    frames: str | Path | None,
-    outputs: tuple[Path, ...],
-    options: CalibrateOptions,
-) -> None:
-    cache, table = options.tensorrt_cache, options.onnxruntime_table
+def _checkpoint(output: Path) -> Path:
+    return output.with_name(output.name + ".checkpoint")
+
+
+def _outputs(output: Path, options: CalibrateOptions) -> list[Path]:
+    """List the files that are written; an onnxruntime table is a folder of three."""
+    files = [output, _checkpoint(output)]
+    if options.tensorrt_cache is not None:
+        files.append(Path(options.tensorrt_cache))
+    if options.onnxruntime_table is not None:
+        folder = Path(options.onnxruntime_table)
+        if folder.is_dir():
+            files += (folder / name for name in TABLE_FILES)
+    return files
+
+
+def _inputs(
+    source: Path, frames: str | Path | None, options: CalibrateOptions
+) -> tuple[Given, ...]:
     named = (options.recipe, options.module_map, options.imported)
-    read = (source, frames, *named, *options.merge)
-    check_output([*outputs, None if cache is None else Path(cache)], read)
-    if table is not None:
-        check_folder(Path(table), read, TABLE_FILES)
+    return (source, frames, *named, *options.merge)
 
 
 def _part(loaded: ir.Model, folder: Path, options: CalibrateOptions) -> Part:

@@ -76,6 +76,18 @@ def load_map(named: str | Path | None, model: ir.Model) -> ModuleMap:
     return map_of(model, None if named is None else str(named))
 
 
+def output_path(named: str | Path) -> Path:
+    """Return the file that an output names; others are named after it.
+
+    Raises:
+        GraphError: it names none.
+    """
+    path = Path(named)
+    if path.name in ("", ".."):
+        raise GraphError(f"{path} is a folder: name a file for the output")
+    return path
+
+
 def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> None:
     """Refuse files that could not be written, or would harm an input.
 
@@ -85,8 +97,8 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             with its weights count too.
 
     Raises:
-        GraphError: an output is an input, a frame of a recording, a folder or named
-            twice, or its folder does not exist.
+        GraphError: an output is an input, a frame of a recording, a folder, a device
+            or named twice, or its folder does not exist.
     """
     named = dict[Path, Path]()
     read = [Path(each) for each in inputs if each is not None]
@@ -95,6 +107,8 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             raise GraphError(f"{output}: no such folder {output.parent}")
         if output.is_dir():
             raise GraphError(f"{output} is a folder: name a file for the output")
+        if output.exists() and not output.is_file():
+            raise GraphError(f"{output} is a device or a pipe: name a file")
         if named.setdefault(output.resolve(), output) is not output:
             raise GraphError(f"{output} is named for two outputs: choose another name")
         for given in read:

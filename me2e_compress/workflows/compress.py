@@ -24,11 +24,12 @@ from me2e_compress.runtime.atomic import write_json
 from me2e_compress.workflows.checks import (
     check_count,
     check_number,
-    check_output,
     load_map,
     model_path,
+    output_path,
     read_graph,
 )
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.compress_fidelity import (
     MeasuredLoss,
     SplitFrames,
@@ -65,6 +66,7 @@ class CompressOptions:
         floor: least SQNR of an output, in dB, without a warning.
         allow_empty: write the graph although nothing in it became int8.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: a number below 0, or a floor that is not finite.
@@ -84,6 +86,7 @@ class CompressOptions:
     floor: float = SQNR_FLOOR_DB
     allow_empty: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -175,13 +178,16 @@ def compress(
         Me2eError: a pass refused the graph or broke.
     """
     options = options or CompressOptions()
-    source, output = model_path(model), Path(output)
+    source, output = model_path(model), output_path(output)
     passes = options.passes(recipe)
     read = [file for each in passes for file in each.files()]
     named = recipe if isinstance(recipe, str | Path) else None
-    check_output(_written(output), (source, named, frames, options.module_map, *read))
+    inputs = (source, named, frames, options.module_map, *read)
     start = process_time()
-    with collector_paused():
+    with (
+        writing(_written(output), inputs, force=options.force),
+        collector_paused(),
+    ):
         loaded = read_graph(source, listener)
         modules = load_map(options.module_map, loaded)
         frames_of = _split(source, loaded, frames, passes, options)

@@ -13,7 +13,7 @@ from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.compare import CompareResult, compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
-from me2e_compress.workflows.export import export_stack
+from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
 from me2e_compress.workflows.listener import Listener
@@ -114,6 +114,7 @@ class StackDemo:
         scheme: a shipped recipe.
         rounds: of the latency.
         threads: of onnxruntime.
+        force: replace files that are not as we left them, too.
 
     Raises:
         RecipeError: no such recipe.
@@ -125,6 +126,7 @@ class StackDemo:
     scheme: str = "feature-ext"
     rounds: int = 4
     threads: int = 2
+    force: bool = False
     _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
@@ -139,15 +141,15 @@ class StackDemo:
 
     def compress(self, listener: Listener) -> CompressResult:
         """Export the stack, write its frames, make it small."""
-        export_stack(self.stack, self._source)
+        export_stack(self.stack, self._source, ExportOptions(force=self.force))
         for folder, count, seed in (
             (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
             (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
         ):
-            options = FramesOptions(count, seed, SCENE_LENGTH)
+            options = FramesOptions(count, seed, SCENE_LENGTH, self.force)
             record_frames(self.stack, folder, options, listener)
         # Fidelity is measured on frames of another seed, see `compare`.
-        unmeasured = CompressOptions(measure_frames=0)
+        unmeasured = CompressOptions(measure_frames=0, force=self.force)
         return compress(
             self._source, self._small, self.scheme, self._frames, unmeasured, listener
         )
@@ -165,7 +167,7 @@ class StackDemo:
     def time(self, listener: Listener) -> FilesResult:
         """Time the stack, its exact form and the small graph in turn."""
         exact = self.out / f"{self.stack}.exact.onnx"
-        unchecked = CompressOptions(verify_frames=0)
+        unchecked = CompressOptions(verify_frames=0, force=self.force)
         compress(self._source, exact, "exact", options=unchecked, listener=listener)
         paths = {path.name: path for path in (self._source, exact, self._small)}
         sessions = {

@@ -15,12 +15,13 @@ from me2e_compress.evaluators.highway.evaluation_options import (
     weather_of,
 )
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
-from me2e_compress.evaluators.highway.results import MANIFEST
+from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number
@@ -47,6 +48,7 @@ class EvaluateOptions:
         engine: ``local`` or ``ray``.
         address: of a Ray cluster.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: a number that is not positive and finite.
@@ -65,6 +67,7 @@ class EvaluateOptions:
     engine: str = "local"
     address: str | None = None
     render: str | None = None
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -133,6 +136,14 @@ def evaluate(
     options, output, policy = options or EvaluateOptions(), Path(output), str(policy)
     trace = options.latency.removeprefix("trace:")
     check_folder(output, (policy, options.routes, trace, options.adapter), (MANIFEST,))
+    logs = [log_beside(output)]
+    with writing(logs, folders=[output], force=options.force):
+        return _evaluated(policy, output, options, listener)
+
+
+def _evaluated(
+    policy: str, output: Path, options: EvaluateOptions, listener: Listener
+) -> EvaluateResult:
     picked, set_size = routes_named(options.routes)
     shown = () if options.render is None else pick_routes(picked, options.render)
     driver = driver_of(policy, options.adapter)

@@ -7,7 +7,8 @@ from typing import Literal
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import file_bytes
-from me2e_compress.workflows.checks import check_count, check_output
+from me2e_compress.workflows.checks import check_count
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.result import Result, Table, megabytes
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
@@ -24,6 +25,7 @@ class ExportOptions:
         opset: ONNX opset of the file.
         heads: classes and ego modes of vad-tiny; None is nuScenes'.
         seed: of the initial weights; None is 0.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: a seed below 0.
@@ -32,6 +34,7 @@ class ExportOptions:
     opset: int = OPSET
     heads: Literal["nuscenes", "bench2drive"] | None = None
     seed: int | None = None
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check the seed."""
@@ -97,8 +100,12 @@ def export_stack(
         MissingExtraError: exporting needs the extra ``zoo``.
     """
     options, output = options or ExportOptions(), Path(output)
-    if output.parent.is_dir():  # else it is made
-        check_output([output], ())
+    files = [output] if output.parent.is_dir() else []  # else it is made
+    with writing(files, force=options.force):
+        return _exported(stack, output, options)
+
+
+def _exported(stack: str, output: Path, options: ExportOptions) -> Path:
     if stack not in shipped.SHIPPED:
         return exporter.export(
             stack,

@@ -7,6 +7,7 @@ from pathlib import Path
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.extras import need_closed_loop
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table
@@ -28,6 +29,7 @@ class FramesOptions:
         seed: of everything.
         scene_length: frames a scene; None is `SCENE_LENGTH` of a synthetic world,
             `DRIVEN_SCENE_LENGTH` of a driven route.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: a seed below 0.
@@ -36,6 +38,7 @@ class FramesOptions:
     count: int = 256
     seed: int = 0
     scene_length: int | None = None
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check the seed."""
@@ -111,6 +114,13 @@ def record_frames(
     """
     options, folder = options or FramesOptions(), Path(folder)
     check_folder(folder, (source,))
+    with writing(trees=[folder], force=options.force):
+        return _recorded(source, folder, options, listener)
+
+
+def _recorded(
+    source: str | Path, folder: Path, options: FramesOptions, listener: Listener
+) -> Path:
     if Path(source).is_file() or find(str(source)).trained:
         made = _driven(model_path(source), options)
     else:

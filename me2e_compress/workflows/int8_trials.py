@@ -1,6 +1,7 @@
 """What ``sensitivity`` and ``search`` have in common: a model, calibrated once."""
 
 import dataclasses
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from me2e_compress import graph, recipe
@@ -12,7 +13,13 @@ from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.checks import Given, check_count, check_output, load_map
+from me2e_compress.workflows.checks import (
+    Given,
+    check_count,
+    load_map,
+    output_path,
+)
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -30,6 +37,7 @@ class TrialOptions:
         module_map: preset or TOML file; None finds the preset.
         count: frames to judge on.
         threads: of onnxruntime; 0 takes all.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: threads below 0.
@@ -42,6 +50,7 @@ class TrialOptions:
     module_map: str | Path | None = None
     count: int = 4
     threads: int = 0
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check the number of threads."""
@@ -62,15 +71,18 @@ class TrialFiles:
     frames: Path
     output: Path
 
-    def check(self, options: TrialOptions, *inputs: Given) -> None:
-        """Refuse, before any work, a recipe that could not be written or does harm.
+    def claimed(
+        self, options: TrialOptions, *inputs: Given
+    ) -> AbstractContextManager[None]:
+        """Claim the recipe and its overrides while they are made.
 
         Raises:
-            GraphError: names it.
+            GraphError: one of them is not to be written; names it.
         """
+        output = output_path(self.output)
         read = (self.model, self.frames, options.ranges, options.module_map, *inputs)
-        overrides = self.output.with_name(self.output.stem + ".overrides.toml")
-        check_output([self.output, overrides], read)
+        overrides = output.with_name(output.stem + ".overrides.toml")
+        return writing([output, overrides], read, force=options.force)
 
     def trials(
         self,

@@ -24,7 +24,8 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.plan.decision import record
 from me2e_compress.quantization.rules import DEFAULT_RULES
-from me2e_compress.workflows.checks import check_output, lacking_shapes, model_path
+from me2e_compress.workflows.checks import lacking_shapes, model_path
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table, table
 
@@ -40,6 +41,7 @@ class PlanOptions:
         module_map: preset or TOML file; None finds the preset.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         weight_only_gemv: store the weights of matrix-vector products as int8.
+        force: replace outputs that are not as we left them, too.
     """
 
     scheme: str | None = None
@@ -48,6 +50,7 @@ class PlanOptions:
     module_map: str | Path | None = None
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     weight_only_gemv: bool = False
+    force: bool = False
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -154,7 +157,14 @@ def plan(
     options = options or PlanOptions()
     files = [model_path(model), *([] if against is None else [Path(against)])]
     written = None if output is None else Path(output)
-    check_output([written], (*files, options.overrides, options.module_map))
+    inputs = (*files, options.overrides, options.module_map)
+    with writing([written], inputs, force=options.force):
+        return _planned(files, written, options)
+
+
+def _planned(
+    files: Sequence[Path], written: Path | None, options: PlanOptions
+) -> PlanResult:
     read = [_read(path) for path in files]
     _check_options(options, files, read)
     plain = QuantizeInt8(
@@ -167,7 +177,7 @@ def plan(
     found = _made(files[0], read[0], chosen, options)
     if written is not None:
         save_plan(found, written)
-    if against is None:
+    if len(files) == 1:
         hint = "" if isinstance(read[0], QuantPlan) else lacking_shapes(read[0])
         return PlanResult(found, hint=hint)
     other = _made(files[1], read[1], plain, options)

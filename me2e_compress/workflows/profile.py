@@ -8,7 +8,8 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
-from me2e_compress.workflows.checks import check_count, check_output, model_path
+from me2e_compress.workflows.checks import check_count, model_path
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table
@@ -22,6 +23,7 @@ class ProfileOptions:
         samples: how many; None is one a frame.
         warm_up: inferences before the first that counts.
         threads: of onnxruntime; 0 takes all.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: threads below 0.
@@ -30,6 +32,7 @@ class ProfileOptions:
     samples: int | None = None
     warm_up: int = WARM_UP
     threads: int = 1
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check the number of threads."""
@@ -98,10 +101,19 @@ def profile(
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
-    check_output([written], (source, frames))
-    recording = CalibrationSet(Path(frames))
+    with writing([written], (source, frames), force=options.force):
+        trace = _measured(source, Path(frames), options, listener)
+        if written is not None:
+            trace.save(written)
+    return ProfileResult(source, trace, written)
+
+
+def _measured(
+    source: Path, frames: Path, options: ProfileOptions, listener: Listener
+) -> LatencyTrace:
+    recording = CalibrationSet(frames)
     try_first(graph.load(source), source.name, listener, file=source, frames=recording)
-    trace = measure(
+    return measure(
         source,
         recording,
         samples=options.samples,
@@ -111,6 +123,3 @@ def profile(
             "profile", done, total, "inferences"
         ),
     )
-    if written is not None:
-        trace.save(written)
-    return ProfileResult(source, trace, written)

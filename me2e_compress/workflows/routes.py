@@ -8,7 +8,8 @@ from me2e_compress.evaluators.highway.admission import Admission, examine
 from me2e_compress.evaluators.highway.generate import ScenarioRoutes, generate
 from me2e_compress.simulator.routes import load_routes, pick_routes, save_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
-from me2e_compress.workflows.checks import check_count, check_output
+from me2e_compress.workflows.checks import check_count
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, table
 
@@ -22,6 +23,7 @@ class RoutesOptions:
         variants: of each scenario type.
         scenarios: ``all``, or ``NAME,NAME``.
         workers: scenario types at a time.
+        force: replace outputs that are not as we left them, too.
 
     Raises:
         RecipeError: a seed below 0.
@@ -32,6 +34,7 @@ class RoutesOptions:
     variants: int = VARIANTS
     scenarios: str = "all"
     workers: int = 1
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Check seed and scenarios."""
@@ -128,7 +131,11 @@ def make_routes(
         GraphError: the output cannot be written.
     """
     options, output = options or RoutesOptions(), Path(output)
-    check_output([output], ())
+    with writing([output], force=options.force):
+        return _made(output, options, listener)
+
+
+def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesResult:
     names, harvests = options.names, list[ScenarioRoutes]()
     made = generate(options.seed, names, options.variants, options.workers)
     for harvest in made:

@@ -131,7 +131,13 @@ def search(
         EvaluationError: nothing fits; says what the least was.
     """
     files = TrialFiles(model_path(model), Path(frames), Path(output))
-    files.check(options)
+    with files.claimed(options):
+        return _search(files, options, listener)
+
+
+def _search(
+    files: TrialFiles, options: SearchOptions, listener: Listener
+) -> SearchResult:
     trials, modules = files.trials(options, options.runs_on, listener)
     if options.max_mb is not None:
         budget = Budget(

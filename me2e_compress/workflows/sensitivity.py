@@ -181,11 +181,17 @@ def measure_sensitivity(
     """
     options = options or SensitivityOptions()
     files = TrialFiles(model_path(model), Path(frames), Path(output))
-    files.check(options, options.adapter, options.drive)
+    with files.claimed(options, options.adapter, options.drive):
+        return _measured(files, options, listener)
+
+
+def _measured(
+    files: TrialFiles, options: SensitivityOptions, listener: Listener
+) -> SensitivityResult:
     drive = None
     if options.drive is not None:
         folder = files.output.with_name(files.output.stem + ".drives")
-        check_folder(folder, (frames,))
+        check_folder(folder, (files.frames,))
         drive = _on_routes(options.drive, files.model, folder, options)
     target = options.target or "tensorrt"
     trials, modules = files.trials(options, target, listener, drive)

@@ -7,6 +7,7 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.training.course import NO_LATENCY, CourseProgress, RoundResult, run
 from me2e_compress.training.curriculum import FULL, SMALL, SMALL_LATENCY
 from me2e_compress.workflows.checks import check_folder
+from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number, table
 from me2e_compress.workflows.score import score_records
@@ -98,7 +99,8 @@ def train(
         listener.on_progress(news.what, news.done, news.total, "")
 
     course, latency = (SMALL, SMALL_LATENCY) if options.small else (FULL, NO_LATENCY)
-    return TrainResult(run(course, output, options.workers, tell, latency))
+    with writing(folders=[output]):
+        return TrainResult(run(course, output, options.workers, tell, latency))
 
 
 def _between(estimate: Estimate) -> str:

@@ -41,6 +41,7 @@ def calibrate(
     tensorrt_cache: Cache = None,
     onnxruntime_table: Table = None,
     threads: given.Threads = 0,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Measure the ranges of every tensor that any scheme, rule set or target needs.
@@ -52,6 +53,7 @@ def calibrate(
     options = workflow.CalibrateOptions(
         recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,
         shard=shard, merge=tuple(merge or ()), imported=imported, threads=threads,
+        force=force,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
         dims=sizes(set_dim or ()),
     )  # fmt: skip

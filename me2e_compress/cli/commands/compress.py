@@ -42,6 +42,7 @@ def compress(
     floor: Floor = SQNR_FLOOR_DB,
     allow_empty: AllowEmpty = False,
     set_dim: given.SetDim = None,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
@@ -55,7 +56,7 @@ def compress(
         scheme=scheme, rules=rules, target=target, overrides=overrides, ranges=ranges,
         method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
         measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
-        weight_only_gemv=weight_only_gemv, dims=sizes(set_dim or ()),
+        weight_only_gemv=weight_only_gemv, force=force, dims=sizes(set_dim or ()),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)

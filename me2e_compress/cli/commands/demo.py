@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import console, listening, show
+from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.demo_stack import StackDemo
 from me2e_compress.workflows.extras import need_closed_loop
 from me2e_compress.zoo.shipped import SHIPPED
@@ -14,6 +15,7 @@ from me2e_compress.zoo.shipped import SHIPPED
 Output = Annotated[
     Path, typer.Option("-o", "--output", "--out", help="the folder to write")
 ]
+PICTURE = "demo.svg"
 Stack = Annotated[
     Literal["highway", "vad-tiny"],
     typer.Option(help="the trained driver, or a stack of published size"),
@@ -34,6 +36,7 @@ def demo(
     workers: given.Workers = 2,
     rounds: Rounds = 4,
     threads: Threads = 2,
+    force: given.Force = False,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
 
@@ -44,12 +47,14 @@ def demo(
         need_closed_loop("what the demo drives with")
         from me2e_compress.study.demo import DriverDemo
 
-        steps = DriverDemo(stack, output, scheme, routes, workers).steps
+        steps = DriverDemo(stack, output, scheme, routes, workers, force).steps
     else:
-        steps = StackDemo(stack, output, scheme, rounds, threads).steps
+        steps = StackDemo(stack, output, scheme, rounds, threads, force).steps
     output.mkdir(parents=True, exist_ok=True)
+    check_ours([output / PICTURE], force=force)
     for step in steps:
         with listening() as listener:
             found = step(listener)
         show(found)
-    console.save_svg(str(output / "demo.svg"), title="me2e-compress demo")
+    with writing([output / PICTURE], force=force):
+        console.save_svg(str(output / PICTURE), title="me2e-compress demo")

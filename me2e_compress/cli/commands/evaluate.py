@@ -43,6 +43,7 @@ def evaluate(
     engine: given.Engine = "local",
     address: given.Address = None,
     render: Render = None,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on."""
@@ -50,6 +51,7 @@ def evaluate(
         routes=routes, latency=latency, latency_scale=latency_scale, in_order=in_order,
         seed=seed, workers=workers, dt_ms=dt_ms, adapter=adapter, weather=weather,
         frame_limit_s=frame_limit, engine=engine, address=address, render=render,
+        force=force,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.evaluate(policy, output, options, listener)

@@ -25,10 +25,11 @@ def export(
     opset: Annotated[int, typer.Option(help="ONNX opset of the file")] = workflow.OPSET,
     heads: Heads = None,
     seed: Seed = None,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver."""
-    options = workflow.ExportOptions(opset, heads, seed)
+    options = workflow.ExportOptions(opset, heads, seed, force)
     with listening() as listener:
         listener.on_progress(f"exporting {stack}", 0, 1, "")
         workflow.export_stack(stack, output, options)

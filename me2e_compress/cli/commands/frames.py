@@ -24,6 +24,7 @@ def frames(
     count: given.Count = 256,
     scene_length: Length = None,
     seed: given.Seed = 0,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
@@ -31,7 +32,7 @@ def frames(
     For vad-tiny a synthetic world is drawn; for highway, or any ONNX file that
     keeps the policy contract, the expert drives fresh routes of highway-env.
     """
-    options = workflow.FramesOptions(count, seed, scene_length)
+    options = workflow.FramesOptions(count, seed, scene_length, force)
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)
     show(workflow.FramesResult(stack, output, options), as_json)

@@ -33,11 +33,18 @@ def plan(
     output: Output = None,
     nodes: Nodes = False,
     every: Every = False,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why."""
     options = workflow.PlanOptions(
-        scheme, rules, overrides, module_map, sizes(set_dim or ()), weight_only_gemv
+        scheme,
+        rules,
+        overrides,
+        module_map,
+        sizes(set_dim or ()),
+        weight_only_gemv,
+        force,
     )
     found = workflow.plan(model, output, against, options)
     listed = found.details(every=every) if nodes or every else ()

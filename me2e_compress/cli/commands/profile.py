@@ -18,10 +18,11 @@ def profile(
     samples: Annotated[int | None, typer.Option(help="how many latencies")] = None,
     warm_up: Annotated[int, typer.Option(help="inferences before")] = WARM_UP,
     threads: given.Threads = 1,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace."""
-    options = workflow.ProfileOptions(samples, warm_up, threads)
+    options = workflow.ProfileOptions(samples, warm_up, threads, force)
     with listening() as listener:
         found = workflow.profile(model, frames, output, options, listener)
     show(found, as_json)

@@ -29,6 +29,7 @@ def routes(
     workers: given.Workers = 1,
     check: Check = None,
     picked: Picked = "all",
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Make a fresh set of admitted routes, or examine an existing set again."""
@@ -43,7 +44,7 @@ def routes(
         return
     if output is None:
         raise typer.BadParameter("a new set needs -o ROUTES.json", param_hint="-o")
-    options = workflow.RoutesOptions(seed, variants, scenarios, workers)
+    options = workflow.RoutesOptions(seed, variants, scenarios, workers, force)
     with listening() as listener:
         made = workflow.make_routes(output, options, listener)
     show(made, as_json)

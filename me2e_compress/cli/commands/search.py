@@ -27,12 +27,14 @@ def search(
     module_map: given.ModuleMap = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Find the modules whose int8 meets a budget and costs the plan least."""
     options = workflow.SearchOptions(
         max_mb=max_mb, max_ms=max_ms, scheme=scheme, rules=rules, target=target,
         ranges=ranges, module_map=module_map, count=count, threads=threads,
+        force=force,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.search(model, frames, output, options, listener)

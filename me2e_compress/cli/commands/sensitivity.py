@@ -40,6 +40,7 @@ def sensitivity(
     module_map: given.ModuleMap = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Measure what int8 costs per module and node, and write a recipe within a limit.
@@ -53,7 +54,7 @@ def sensitivity(
         scheme=scheme, rules=rules, target=target, limit=limit, drive=drive,
         drive_limit=drive_limit, adapter=adapter, workers=workers,
         node_trials=node_trials, ranges=ranges, module_map=module_map, count=count,
-        threads=threads,
+        threads=threads, force=force,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.measure_sensitivity(model, frames, output, options, listener)

@@ -18,6 +18,7 @@ def study(
     workers: given.Workers = 1,
     engine: given.Engine = "local",
     address: given.Address = None,
+    force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Drive variants under conditions and compare them; run it again to go on."""
@@ -31,10 +32,11 @@ def study(
     asked = load_study(definition, routes)
     check_folder(output, (definition,), (JSON, MARKDOWN, HTML))
     with listening() as listener:
-        found = run_study(asked, output, engine_of(engine, workers, address), listener)
+        chosen_engine = engine_of(engine, workers, address)
+        found = run_study(asked, output, chosen_engine, listener, force=force)
     chosen = () if routes is None else ("--routes", routes)
     words = ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
-    written = write_study(found, output, words)
+    written = write_study(found, output, words, force=force)
     show(found, as_json)
     if not as_json:
         say(f"{written.report}, {written.tables} and {written.record} are yours.")

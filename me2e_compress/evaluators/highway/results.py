@@ -115,8 +115,7 @@ class ResultsFolder:
     @property
     def log(self) -> Path:
         """Where wall-clock times go: beside the folder, which must not hold any."""
-        resolved = self.path.resolve()
-        return resolved.with_name(f"{resolved.name}.log")
+        return log_beside(self.path)
 
     def episodes(self) -> dict[str, Episode]:
         """Read every route that was driven, in the order of the evaluation."""
@@ -171,6 +170,12 @@ class ResultsFolder:
         except (OSError, ValueError, KeyError, TypeError) as error:
             self.corrupt[path] = " ".join(str(error).split())[:200]
             return None
+
+
+def log_beside(folder: Path) -> Path:
+    """Return where the log of a folder of results goes."""
+    resolved = folder.resolve()
+    return resolved.with_name(f"{resolved.name}.log")
 
 
 def read_results(paths: Iterable[Path]) -> list[ResultsFolder]:
