@@ -68,7 +68,8 @@ def test_a_completion_beyond_the_whole_route_is_left_out(
     record["episode"]["completion_percent"] = 5000.0
     file.write_text(json.dumps(record))
 
-    assert json.loads(run("score", results, "--json"))["routes"]["driven"] == 1
+    (scored,) = json.loads(run("score", results, "--json"))["folders"]
+    assert scored["routes"]["driven"] == 1
 
 
 def test_one_route_counts_once_whatever_its_file_is_called(
@@ -79,7 +80,8 @@ def test_one_route_counts_once_whatever_its_file_is_called(
     copied = (results / "routes" / "crossing.json").read_bytes()
     (results / "routes" / "parked.json").write_bytes(copied)
 
-    assert json.loads(run("score", results, "--json"))["routes"]["driven"] == 1
+    (scored,) = json.loads(run("score", results, "--json"))["folders"]
+    assert scored["routes"]["driven"] == 1
 
 
 def test_score_says_partial(run: Run, manifest: Path, tmp_path: Path) -> None:
