@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from me2e_compress import graph
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
+from me2e_compress.passes.work import work
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
 
 SHAPE_CHAIN = """
@@ -296,8 +297,8 @@ def test_random_programs_keep_their_meaning_and_their_price(
     for want, got in zip(compute(before, feeds), compute(after, feeds), strict=True):
         np.testing.assert_array_equal(got, want)
     growth = _file_bytes(after) - _file_bytes(before)
-    removed = len(before.graph) - len(after.graph)
-    assert growth <= bytes_per_node * removed
+    worth = sum(map(work, before.graph)) - sum(map(work, after.graph))
+    assert growth <= bytes_per_node * worth
 
 
 def _file_bytes(model: ir.Model) -> int:

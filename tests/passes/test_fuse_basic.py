@@ -108,17 +108,6 @@ def test_a_training_normalization_stays() -> None:
     assert apply(FuseBasic(), model).changes == 0
 
 
-def test_shared_weights_are_not_scaled() -> None:
-    text = opset(17) + (
-        f"g ({IMAGE} x) => (float[1,8,6,6] y, float[1,8,6,6] z) {{"
-        " a = Conv(x, weight) y = Mul(a, c) z = Conv(x, weight) }"
-    )
-    model = read(text, weight=normal(8, 4, 1, 1), c=np.float32(3))
-    result = apply(FuseBasic(), model)
-    assert result.changes == 0
-    assert "left 1: Conv that shares its weights" in result.notes
-
-
 def test_a_residual_add_stays_and_is_reported() -> None:
     text = opset(17) + (
         f"g ({IMAGE} x) => ({IMAGE} y) {{ a = Conv(x, weight)"

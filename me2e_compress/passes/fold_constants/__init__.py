@@ -16,6 +16,7 @@ from me2e_compress.passes.fold_constants import evaluation
 from me2e_compress.passes.fold_constants.choice import FoldChoice, choose
 from me2e_compress.passes.fold_constants.inference import branch_fits
 from me2e_compress.passes.fold_constants.knowledge import Sweep
+from me2e_compress.passes.work import BYTES_PER_NODE
 from me2e_compress.rewrite import (
     Array,
     add_constant,
@@ -54,16 +55,18 @@ class FoldConstants(Pass):
     Result:  Reshape and MatMul read initializers
 
     Attributes:
-        bytes_per_node: how many bytes a removed node may cost. A fold that shrinks
+        bytes_per_node: how many bytes a removed node may cost, more if it works long
+            in every frame (:mod:`me2e_compress.passes.work`). A fold that shrinks
             the weights is always taken, one that grows them only up to this price,
-            so that a position table repeated for every token stays computed.
+            so that a position table repeated for every token stays computed and an
+            attention between constants does not.
         through_compute: fold through products, convolutions and softmax too (by the
             same price); False keeps every named layer, e.g. to ablate it later.
     """
 
     name: ClassVar[str] = "fold-constants"
     exact: ClassVar[bool] = True
-    bytes_per_node: int = 512
+    bytes_per_node: int = BYTES_PER_NODE
     through_compute: bool = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:

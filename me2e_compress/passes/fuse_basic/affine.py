@@ -5,16 +5,24 @@ Result:  one Conv with other weights
 
 With y = k x + d per output channel: weight' = k weight, bias' = k bias + d, computed
 in float64 (Ioffe, Szegedy 2015 for the k and d of a normalization).
+
+A weight that several layers share is scaled once for each different k: layers that are
+followed by the same numbers go on sharing. The copies may grow the file by what the
+nodes that go are worth (:mod:`me2e_compress.passes.work`); a shared weight that costs
+more stays as it is, and so does what follows its layers.
 """
 
 import dataclasses
+import hashlib
 import math
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import bias_of, channel_axis, static_shape
+from me2e_compress.passes.work import BYTES_PER_NODE, work
 from me2e_compress.rewrite import (
+    Array,
     Facts,
     Fusion,
     Kit,
@@ -23,6 +31,7 @@ from me2e_compress.rewrite import (
     constant,
     either,
     holds_numbers,
+    match,
     numbers_of,
     op,
     overflow,
@@ -105,25 +114,20 @@ def _is_per_channel(match: Match) -> bool:
     return same and shape is not None and shape[1] == full[1]
 
 
-def _rewrite(match: Match, kit: Kit) -> str | None:
-    layer, affine = match.node(LAYER), _affine(match)
+def _rewrite(found: Match, kit: Kit) -> str | None:
+    layer, affine = found.node(LAYER), _affine(found)
     bias, what = _bias(layer), layer.op_type
-    if affine is None or bias is None or not holds_numbers(match[WEIGHT]):
+    if affine is None or bias is None or not holds_numbers(found[WEIGHT]):
         return f"{what} whose weights are computed"
-    weight, stored = match.numbers(WEIGHT), match.array(WEIGHT)
-    groups = layer.attributes.get_int("group", 1) if what == "ConvTranspose" else 1
-    channels = weight.shape[channel_axis(layer)] * groups
-    scale = np.broadcast_to(affine.scale, (channels,))
-    weight = weight * _shaped(layer, weight, scale)
-    bias = np.broadcast_to(bias * scale + affine.shift, (channels,))
-    owned = sole_reader(match[WEIGHT]) is layer
-    if not owned and not (scale == 1).all():
-        return f"{what} that shares its weights"
+    stored = found.array(WEIGHT)
+    scale = _scale(layer, affine)
+    weight = _scaled(layer, found.numbers(WEIGHT), scale)
+    bias = np.broadcast_to(bias * scale + affine.shift, scale.shape)
     if overflow(weight, stored) or overflow(bias, stored):
         return f"{what} whose weights would overflow"
-    name = match[WEIGHT].name or layer.name or "layer"
-    if owned:  # else its scale is 1
-        kit.refill(layer, 1, weight.astype(stored.dtype), name)
+    name = found[WEIGHT].name or layer.name or "layer"
+    if not _give(layer, found[WEIGHT], weight.astype(stored.dtype), scale, kit):
+        return f"{what} that shares its weights"
     kit.refill(
         layer, 2, bias.astype(stored.dtype), f"{name.removesuffix('.weight')}.bias"
     )
@@ -131,6 +135,70 @@ def _rewrite(match: Match, kit: Kit) -> str | None:
         layer.attributes["beta"] = ir.AttrFloat32("beta", 1.0)  # it is in the bias
     kit.absorb(layer)
     return None
+
+
+def _give(
+    layer: ir.Node, shared: ir.Value, weight: Array, scale: Numbers, kit: Kit
+) -> bool:
+    """Give a layer its scaled weight; False if the copy would cost too much."""
+    if (scale == 1).all():
+        return True
+    name = _copy_name(shared, scale)
+    copy = kit.graph.initializers.get(name)
+    if copy is None and sole_reader(shared) is layer:
+        kit.refill(layer, 1, weight, shared.name or name)
+        return True
+    if copy is None:
+        if not _is_worth_copies(shared):
+            return False
+        copy = kit.constant(weight, name)
+    layer.replace_input_with(1, copy)
+    return True
+
+
+def _copy_name(shared: ir.Value, scale: Numbers) -> str:
+    """Name the copy of a weight after its scale: equal copies are one."""
+    digest = hashlib.blake2b(np.ascontiguousarray(scale).tobytes(), digest_size=8)
+    return f"{shared.name}.scaled.{digest.hexdigest()}"
+
+
+def _is_worth_copies(shared: ir.Value) -> bool:
+    """Weigh the copies of a shared weight against the nodes that go if they are made.
+
+    Copies that other layers were given before are made already.
+    """
+    copies, stays, worth = set[str](), shared.is_graph_output(), 0.0
+    for use in shared.uses():
+        found = _behind(use.node) if use.idx == 1 else None
+        if found is None or (affine := _affine(found)) is None:
+            stays = True
+            continue
+        worth += BYTES_PER_NODE * work(found.root)
+        copies.add(_copy_name(shared, _scale(use.node, affine)))
+    made = shared.graph.initializers if shared.graph is not None else {}
+    growth = sum(name not in made for name in copies) - (not stays)
+    tensor = shared.const_value
+    return growth * (0 if tensor is None else tensor.nbytes) <= worth
+
+
+def _behind(layer: ir.Node) -> Match | None:
+    """Return the match of a layer and what follows it."""
+    reader = sole_reader(layer.outputs[0])
+    if reader is None:
+        return None
+    if reader.attributes.get_int("training_mode", 0):
+        return None
+    found = match(PATTERN, reader)
+    return found if found is not None and found.node(LAYER) is layer else None
+
+
+def _scale(layer: ir.Node, affine: _Affine) -> Numbers:
+    """Return one factor for each output channel of a layer."""
+    shape = static_shape(layer.inputs[1]) or (1, 1)
+    groups = 1
+    if layer.op_type == "ConvTranspose":
+        groups = layer.attributes.get_int("group", 1)
+    return np.broadcast_to(affine.scale, (shape[channel_axis(layer)] * groups,))
 
 
 def _bias(layer: ir.Node) -> Numbers | None:
@@ -144,16 +212,17 @@ def _bias(layer: ir.Node) -> Numbers | None:
     return bias.reshape(-1) * (beta if layer.op_type == "Gemm" else 1.0)
 
 
-def _shaped(layer: ir.Node, weight: Numbers, scale: Numbers) -> Numbers:
-    """Return the scale in the form in which it multiplies the weight."""
+def _scaled(layer: ir.Node, weight: Numbers, scale: Numbers) -> Numbers:
+    """Multiply a weight by a factor for each output channel."""
     if layer.op_type == "Gemm":
-        return scale[:, None] if layer.attributes.get_int("transB", 0) else scale
+        flip = layer.attributes.get_int("transB", 0)
+        return weight * (scale[:, None] if flip else scale)
     rest = (1,) * (weight.ndim - 2)
     if layer.op_type == "Conv":
-        return scale.reshape(-1, 1, *rest)
+        return weight * scale.reshape(-1, 1, *rest)
     groups = layer.attributes.get_int("group", 1)
     rows = np.repeat(scale.reshape(groups, -1), weight.shape[0] // groups, axis=0)
-    return rows.reshape(*rows.shape, *rest)
+    return weight * rows.reshape(*rows.shape, *rest)
 
 
 FUSION = Fusion("layers with what follows them", PATTERN, _rewrite, where=_is_affine)

@@ -1,0 +1,44 @@
+"""What a node costs in every frame, and what that is worth in bytes of the file."""
+
+import math
+
+import onnx_ir as ir
+
+from me2e_compress.graph import macs, static_shape
+
+BYTES_PER_NODE = 2048
+"""What a node that is gone may cost in the file: at 2 us a node, 1 MB for 1 ms."""
+MACS_PER_NODE = 200_000
+"""Multiply-accumulates that take as long as starting a node does."""
+MOVED_BYTES_PER_NODE = 40_000
+"""Bytes read and written that take as long as starting a node does.
+
+Both from onnxruntime on two cores of an AMD Zen 5: 2 us a node, 100 GMAC/s of float32
+products and 20 GB/s through element-wise operators; `benchmarks/bench_folding.py
+--price` measures them anew. The ratios matter, and other processors have similar ones.
+"""
+
+VIEWS = frozenset(
+    {"Flatten", "Identity", "Reshape", "Shape", "Size", "Squeeze", "Unsqueeze"}
+)
+"""Operators that move nothing."""
+
+
+def work(node: ir.Node) -> float:
+    """Return what a node costs a frame, in starts of a node: 1 and its work.
+
+    Sizes that are not known count as nothing.
+    """
+    if node.op_type in VIEWS:
+        return 1.0
+    values = [*node.inputs, *node.outputs]
+    moved = sum(_bytes(value) for value in values if value is not None)
+    products = macs(node) or 0
+    return 1.0 + products / MACS_PER_NODE + moved / MOVED_BYTES_PER_NODE
+
+
+def _bytes(value: ir.Value) -> int:
+    shape = static_shape(value)
+    if shape is None or value.dtype is None:
+        return 0
+    return math.ceil(math.prod(shape) * value.dtype.itemsize)

@@ -1,0 +1,130 @@
+"""What folding stores: bytes of the file against work of every frame."""
+
+import itertools
+
+import numpy as np
+import onnx_ir as ir
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.passes import PassResult
+from me2e_compress.passes.fold_constants import FoldConstants
+from me2e_compress.passes.fold_constants.min_cut import Network
+from tests.passes.small import apply, ops, read
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
+
+Edges = list[tuple[int, int, int]]
+
+
+@st.composite
+def edges(draw: st.DrawFn) -> Edges:
+    """Edges between six vertices; 0 is the source and 5 the sink."""
+    pairs = draw(st.lists(st.sampled_from(list(itertools.permutations(range(6), 2)))))
+    return [(tail, head, draw(st.integers(0, 9))) for tail, head in pairs]
+
+
+def cost(given_edges: Edges, side: set[int]) -> int:
+    return sum(
+        price for tail, head, price in given_edges if tail in side and head not in side
+    )
+
+
+@settings(max_examples=100, deadline=None)
+@given(edges())
+def test_no_cut_is_cheaper_and_no_equal_one_larger(given_edges: Edges) -> None:
+    network = Network()
+    for _ in range(6):
+        network.vertex()
+    for tail, head, price in given_edges:
+        network.edge(tail, head, price)
+
+    found = network.cut(0, 5)
+
+    sides = [
+        {0, *inner}
+        for count in range(5)
+        for inner in itertools.combinations(range(1, 5), count)
+    ]
+    best = min((cost(given_edges, side), -len(side)) for side in sides)
+    assert 0 in found
+    assert 5 not in found
+    assert (cost(given_edges, found), -len(found)) == best
+
+
+def attention(tokens: int) -> ir.Model:
+    """A self-attention of learned queries: constant, its result larger than they are.
+
+    Its packed projection is cut into three, each turned, as torch exports it.
+    """
+    lines = []
+    for place, part in enumerate("qkv"):
+        lines += [
+            f"{part}_cut = Slice(packed, at_{place}, at_{place + 1}, axis)",
+            f"{part}_turned = Transpose<perm = [1, 0]>({part}_cut)",
+            f"{part} = MatMul(queries, {part}_turned)",
+        ]
+    body = "\n".join(lines)
+    text = HEAD + (
+        f"g (float[{tokens},32] x) => (float[{tokens},32] y, float[{tokens},32] z) {{"
+        f" queries = Expand(learned, shape) {body}"
+        " k_again = Transpose<perm = [1, 0]>(k) scores = MatMul(q, k_again)"
+        " mixed = Softmax(scores) out = MatMul(mixed, v) y = Add(x, out)"
+        " moved = Mul(x, x) z = MatMul(moved, q_turned) }"
+    )
+    random = np.random.default_rng(0)
+    return read(
+        text,
+        learned=random.normal(size=(1, 32)).astype(np.float32),
+        shape=np.array([tokens, 32]),
+        packed=random.normal(size=(96, 32)).astype(np.float32),
+        axis=np.array([0]),
+        **{f"at_{place}": np.array([32 * place]) for place in range(4)},
+    )
+
+
+def folded(tokens: int) -> tuple[ir.Model, PassResult]:
+    model = attention(tokens)
+    return model, apply(FoldConstants(), model)
+
+
+def test_an_attention_that_takes_longer_than_its_bytes_are_worth_is_folded() -> None:
+    """2,000 x 2,000 x 32, twice, is 256 MMACs a frame; its result is 256 kB."""
+    model, _ = folded(2000)
+
+    assert ops(model) == ["Add", "Mul", "MatMul"]
+
+
+def test_a_table_that_is_only_repeated_stays_computed() -> None:
+    text = HEAD + (
+        "g (float[2000,32] x) => (float[2000,32] y) {"
+        " table = Expand(learned, shape) turned = Neg(table) y = Add(x, turned) }"
+    )
+    learned = np.ones((1, 32), np.float32)
+    model = read(text, learned=learned, shape=np.array([2000, 32]))
+    apply(FoldConstants(), model)
+
+    assert "Expand" in ops(model)
+
+
+def test_slices_of_a_packed_weight_are_folded_beside_what_stays_computed() -> None:
+    """Together they are no larger than it, whatever the expansion behind them costs."""
+    text = HEAD + (
+        "g (float[90000,32] x) => (float[90000,32] y) {"
+        " cut = Slice(packed, zero, half, zero) turned = Transpose<perm = [1, 0]>(cut)"
+        " rest = Slice(packed, half, end, zero)"
+        " a = MatMul(x, turned) b = Add(a, rest)"
+        " row = ReduceSum<keepdims = 1>(rest, zero)"
+        " table = Expand(row, shape) y = Add(b, table) }"
+    )
+    model = read(
+        text,
+        packed=np.ones((64, 32), np.float32)[:33],
+        zero=np.array([0]),
+        half=np.array([32]),
+        end=np.array([33]),
+        shape=np.array([90000, 32]),
+    )
+    apply(FoldConstants(), model)
+
+    assert ops(model) == ["MatMul", "Add", "Expand", "Add"]
