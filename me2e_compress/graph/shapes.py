@@ -19,6 +19,11 @@ def static_shape(value: ir.Value | None) -> tuple[int, ...] | None:
     return tuple(int(dim) for dim in value.shape.numpy())
 
 
+def is_static(model: ir.Model) -> bool:
+    """Return whether the size of every input is known."""
+    return all(static_shape(value) is not None for value in model.graph.inputs)
+
+
 def open_shape(value: ir.Value | None) -> tuple[int | None, ...] | None:
     """Return a value's shape, None for every open dimension; None if unknown."""
     if value is None or value.shape is None:

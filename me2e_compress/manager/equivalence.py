@@ -10,6 +10,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.dataset import synthetic
 from me2e_compress.calibration.sample import Recording
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.shapes import is_static
 from me2e_compress.manager.report import Verification
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, detached, replay
@@ -40,9 +41,22 @@ class VerificationInputs:
 
     @classmethod
     def of(
-        cls, model: ir.Model, frames: Recording | None, seed: int, count: int
+        cls,
+        model: ir.Model,
+        frames: Recording | None,
+        seed: int,
+        count: int,
+        successor: ir.Model | None = None,
     ) -> "VerificationInputs":
         """Take the first recorded frames, or make seeded inputs where none are given.
+
+        Args:
+            model: the graph.
+            frames: the recording; None makes inputs up.
+            seed: of those.
+            count: how many frames.
+            successor: what passes made of the graph: where its inputs have the sizes
+                that the graph leaves open, those are taken.
 
         Raises:
             PreconditionError: none are given and the inputs have no static shape.
@@ -50,6 +64,8 @@ class VerificationInputs:
         if frames is not None:
             chosen = [frames[i] for i in range(min(count, len(frames)))]
             return cls(chosen, "recorded")
+        if successor is not None and not is_static(model):
+            model = successor
         return cls(list(synthetic(model, seed=seed, count=count)), "synthetic")
 
     def run(self, model: ir.Model) -> Iterator[Outputs]:

@@ -192,7 +192,7 @@ class _Books:
             names = tuple(current.name for current, _ in stretch[first:])
             try:
                 inputs = equivalence.VerificationInputs.of(
-                    before, frames, context.seed, count
+                    before, frames, context.seed, count, model
                 )
                 found = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:

@@ -48,6 +48,7 @@ def test_sizes_make_every_shape_static_and_its_arithmetic_foldable() -> None:
 def test_a_graph_made_static_is_verified_on_seeded_inputs() -> None:
     (check,) = fixed({"batch": 2, "side": 4}).verifications
     assert check.inputs == "synthetic"
+    assert check.passes[:2] == ("import-normalize", "fix-shapes")
 
 
 def test_a_dimension_that_is_not_named_stays_open() -> None:
