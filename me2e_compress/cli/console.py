@@ -117,6 +117,7 @@ def print_table(content: Table) -> None:
     """
     intervals = _is_wide() or _room(content, intervals=True) >= 0
     widths = _widths(content, intervals)
+    console.print(Text(content.title, "bold"), soft_wrap=True)
     if widths is None:
         _print_rows(content)
     else:
@@ -172,7 +173,7 @@ def _widths(content: Table, intervals: bool) -> list[int] | None:
 
 def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:
     """Make a table whose first columns are words and the rest numbers."""
-    made = Shown(title=Text(content.title, "bold"), title_justify="left")
+    made = Shown()
     made.show_edge = made.pad_edge = _is_wide()  # four characters that numbers can use
     for at, (name, width) in enumerate(zip(content.columns, widths, strict=True)):
         side: Literal["left", "right"] = "left" if at < content.words else "right"
@@ -184,7 +185,6 @@ def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:
 
 def _print_rows(content: Table) -> None:
     """Print each row as its name and, indented, what is told of it."""
-    console.print(Text(content.title, "bold"))
     alone = len(content.columns) == 2
     for first, *others in content.rows:
         console.print(Text(first.text), soft_wrap=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.others_load import BUSY, OthersLoad, is_busy
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.workflows.checks import check_count, model_path
@@ -13,6 +14,10 @@ from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table
+
+BEYOND_P99 = 5
+"""Samples that must lie beyond the 99th percentile: with fewer, one disturbance more or
+less moves it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,11 +52,15 @@ class ProfileResult(Result):
         model: the file.
         trace: the samples.
         output: the trace that was written; None if none was.
+        others_cores: how many cores other processes kept busy; None: not measured.
+        cores: of the machine.
     """
 
     model: Path
     trace: LatencyTrace
     output: Path | None
+    others_cores: float | None = None
+    cores: int = 1
 
     @property
     def headline(self) -> str:
@@ -59,8 +68,24 @@ class ProfileResult(Result):
         return f"{self.output or self.model.name}: {self.trace.headline}"
 
     def lines(self) -> tuple[str, ...]:
-        """Return none: the table's title is the headline."""
-        return ()
+        """Return how far the last percentile can be trusted."""
+        count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
+        if count >= needed:
+            return ()
+        return (
+            f"p99 rests on too few samples: {count}, and {needed} are needed for"
+            f" {BEYOND_P99} beyond it (--samples {needed})",
+        )
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return whether the machine was busy with something else."""
+        if self.others_cores is None or not is_busy(self.others_cores, self.cores):
+            return ()
+        return (
+            f"the machine was busy: other processes took {self.others_cores:.1f} of"
+            f" {self.cores} cores, and more than {BUSY:.0%} moves latencies; measure"
+            " again when it is idle",
+        )
 
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds."""
@@ -74,8 +99,9 @@ class ProfileResult(Result):
         return [{"latency_us": sample} for sample in self.trace.samples_us]
 
     def to_json(self) -> object:
-        """Return what the trace file holds."""
-        return self.trace.to_json()
+        """Return what the trace file holds, and how busy the machine was."""
+        others = {"others_cores": self.others_cores, "cores": self.cores}
+        return {**self.trace.to_json(), **others}
 
 
 def profile(
@@ -102,24 +128,26 @@ def profile(
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
     with writing([written], (source, frames), force=options.force):
-        trace = _measured(source, Path(frames), options, listener)
+        trace, load = _measured(source, Path(frames), options, listener)
         if written is not None:
             trace.save(written)
-    return ProfileResult(source, trace, written)
+    return ProfileResult(source, trace, written, load.cores, load.of)
 
 
 def _measured(
     source: Path, frames: Path, options: ProfileOptions, listener: Listener
-) -> LatencyTrace:
+) -> tuple[LatencyTrace, OthersLoad]:
     recording = CalibrationSet(frames)
     try_first(graph.load(source), source.name, listener, file=source, frames=recording)
-    return measure(
-        source,
-        recording,
-        samples=options.samples,
-        warm_up=options.warm_up,
-        threads=options.threads,
-        on_sample=lambda done, total: listener.on_progress(
-            "profile", done, total, "inferences"
-        ),
-    )
+    with OthersLoad() as load:
+        trace = measure(
+            source,
+            recording,
+            samples=options.samples,
+            warm_up=options.warm_up,
+            threads=options.threads,
+            on_sample=lambda done, total: listener.on_progress(
+                "profile", done, total, "inferences"
+            ),
+        )
+    return trace, load

@@ -12,7 +12,7 @@ from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import STACKS
 
 WEIGHTS = Path(__file__).with_name("weights")
-"""One ``NAME.onnx``, ``NAME.pt`` and ``NAME.json`` a model."""
+"""One ``NAME.onnx`` and ``NAME.json`` a model; in a checkout ``NAME.pt`` too."""
 
 SHIPPED = tuple(stack.name for stack in STACKS.values() if stack.trained)
 """Names of the models."""
@@ -109,7 +109,8 @@ def shipped(name: str, folder: Path | None = None) -> Path:
 def checkpoint(name: str, folder: Path | None = None) -> Path:
     """Return the weights of a shipped model as training goes on from them.
 
-    It is a file of `me2e_compress.training.checkpoint.Start`.
+    It is a file of `me2e_compress.training.checkpoint.Start`. The repository and the
+    source distribution hold it; the wheel does not.
 
     Args:
         name: one of `SHIPPED`.
@@ -122,7 +123,13 @@ def checkpoint(name: str, folder: Path | None = None) -> Path:
     expected = card(name, folder).checkpoint_sha256
     if expected is None:
         raise GraphError(f"{name}: its card names no checkpoint")
-    return _same(folder / f"{name}.pt", expected)
+    path = folder / f"{name}.pt"
+    if not path.exists():
+        raise GraphError(
+            f"{path}: the wheel leaves the checkpoint out; take"
+            f" me2e_compress/zoo/weights/{name}.pt of the source distribution"
+        )
+    return _same(path, expected)
 
 
 def sample_frames(model: Path, folder: Path | None = None) -> Path | None:

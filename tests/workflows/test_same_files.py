@@ -157,7 +157,7 @@ def test_a_profile_is_silent_and_its_trace_may_be_charged(
     )
 
     assert capfd.readouterr() == ("", "")
-    assert json.loads((dense / "trace.json").read_text()) == found.to_json()
+    assert json.loads((dense / "trace.json").read_text()) == found.trace.to_json()
     assert len(found.trace.samples_us) == 3
 
 

@@ -1,0 +1,61 @@
+"""What the index shows, what the wheel holds, what a source distribution needs."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.docs.pages import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+MOST_BYTES = 10_000_000
+"""Of the wheel."""
+
+
+def test_the_page_of_the_index_needs_no_checkout() -> None:
+    text = (ROOT / PROJECT["readme"]).read_text(encoding="utf-8")
+
+    links = re.findall(r"\]\(([^)]+)\)|<img[^>]+src=\"([^\"]+)", text)
+    assert [link for link in links if not link[0].startswith("https://")] == []
+
+
+def test_the_project_says_who_and_for_whom() -> None:
+    assert PROJECT["authors"] == [{"name": PROJECT["name"]}]
+    assert "Typing :: Typed" in PROJECT["classifiers"]
+    assert "urls" not in PROJECT, "a URL must lead somewhere: try it, then name it here"
+
+
+@pytest.mark.xdist_group("installed")
+def test_the_wheel_is_small_and_leaves_the_checkpoint_out(site: Path) -> None:
+    weights = {file.name for file in (site / "me2e_compress/zoo/weights").iterdir()}
+    assert weights == {"highway.json", "highway.onnx", "highway-frames"}
+    (wheel,) = site.parent.glob("wheels*/me2e_compress-*.whl")
+    assert wheel.stat().st_size < MOST_BYTES
+
+
+@pytest.mark.xdist_group("installed")
+def test_a_checkpoint_that_the_wheel_lacks_is_one_line(site: Path) -> None:
+    asked = "from me2e_compress.zoo.shipped import checkpoint; checkpoint('highway')"
+    done = subprocess.run(
+        [sys.executable, "-c", asked],
+        cwd=site,
+        env={"PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    last = done.stderr.strip().splitlines()[-1]
+    assert "the wheel leaves the checkpoint out; take me2e_compress/zoo" in last
+
+
+@pytest.mark.parametrize(
+    "needed", ["Makefile", "constraints.txt", "README.md", "docs", "tests", "examples"]
+)
+def test_a_source_distribution_takes_what_make_needs(needed: str) -> None:
+    listed = (ROOT / "MANIFEST.in").read_text(encoding="utf-8").split()
+
+    assert needed in listed
+    assert (ROOT / needed).exists()

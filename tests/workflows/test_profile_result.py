@@ -1,0 +1,56 @@
+"""A profile says when its figures are in doubt."""
+
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.others_load import OthersLoad
+from me2e_compress.workflows.profile import BEYOND_P99, ProfileResult
+
+ENOUGH = 100 * BEYOND_P99
+
+
+def found(samples: int = ENOUGH, others: float | None = 0.0) -> ProfileResult:
+    trace = LatencyTrace("0", "a CPU", (7,) * samples)
+    return ProfileResult(Path("m.onnx"), trace, None, others, 2)
+
+
+def test_few_samples_make_no_p99() -> None:
+    (line,) = found(samples=ENOUGH - 1).lines()
+
+    assert f"p99 rests on too few samples: {ENOUGH - 1}" in line
+    assert found().lines() == ()
+
+
+def test_a_busy_machine_is_said_last() -> None:
+    (line,) = found(others=0.7).alerts()
+
+    assert "other processes took 0.7 of 2 cores" in line
+    assert found(others=0.7).status == "warning"
+
+
+@pytest.mark.parametrize("others", [None, 0.0, 0.2])
+def test_an_idle_machine_needs_no_words(others: float | None) -> None:
+    assert found(others=others).status == "ok"
+
+
+@pytest.mark.parametrize(("ours", "others"), [(2.0, 1.0), (6.0, 0.0)])
+def test_what_we_take_is_not_the_others(ours: float, others: float) -> None:
+    load = OthersLoad(
+        machine=iter((100.0, 106.0)).__next__,
+        ours=iter((1.0, 1.0 + ours)).__next__,
+        clock=iter((0.0, 4.0)).__next__,
+    )
+    with load:
+        pass
+
+    assert load.cores == others
+
+
+def test_this_machine_can_tell() -> None:
+    with OthersLoad() as load:
+        sum(range(100_000))
+
+    assert load.cores is not None
+    assert 0.0 <= load.cores <= load.of + 1
