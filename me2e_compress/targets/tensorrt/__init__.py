@@ -9,6 +9,7 @@ itself.
 """
 
 import dataclasses
+from collections.abc import Collection
 from typing import ClassVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from me2e_compress import rewrite
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
+from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import (
     Decision,
     QuantPlan,
@@ -26,6 +28,7 @@ from me2e_compress.quantization.plan import (
     tensors_of,
 )
 from me2e_compress.targets.base import LintRule, Target
+from me2e_compress.targets.tensorrt.costs import MACHINES, costs_of
 from me2e_compress.targets.tensorrt.lint import RULES
 from me2e_compress.targets.weights import QuantizedWeight, weights_of
 
@@ -36,10 +39,23 @@ BY = "quantize-int8"
 
 @dataclasses.dataclass(frozen=True)
 class TensorRT(Target):
-    """NVIDIA's engine builder, by its ONNX parser and explicit quantization."""
+    """NVIDIA's engine builder, by its ONNX parser and explicit quantization.
+
+    Attributes:
+        machine: ``orin``: layers that are predicted to be slower there in int8 than in
+            float16 stay float (rule ``cost``); empty predicts nothing.
+    """
 
     name: ClassVar[str] = "tensorrt"
     half_since: ClassVar[int | None] = 19
+    machine: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the machine."""
+        if self.machine and self.machine not in MACHINES:
+            raise ValueError(
+                f"no machine {self.machine}; there are {', '.join(MACHINES)}"
+            )
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
         """Name what weighted layers and residual branches read."""
@@ -71,6 +87,12 @@ class TensorRT(Target):
             writer.apply(nodes[decision.output], decision, weights.get(decision.output))
         rewrite.sweep(copy)
         return copy
+
+    def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
+        """Predict what int8 of some layers saves and costs on the machine."""
+        if not self.machine:
+            return None
+        return costs_of(model, layers, MACHINES[self.machine])
 
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its parser and of explicit quantization."""
