@@ -8,55 +8,19 @@ frame of every scene.
 import hashlib
 import itertools
 import zipfile
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import documents
+from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.recurrence import not_fed_back, recurrent_inputs, sides
-
-_UNREADABLE = (
-    OSError,
-    EOFError,
-    ValueError,  # pickled objects, headers that lie
-    MemoryError,  # so do they
-    RuntimeError,  # encrypted, or compressed as zipfile does not know
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
-
-def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
-    """Read every array of an ``.npz``, by name.
-
-    Args:
-        path: the file.
-        what: it should be, for the message.
-
-    Raises:
-        FramesError: the file cannot be read, or holds something else.
-    """
-    try:
-        with path.open("rb") as source:
-            content = np.load(source, allow_pickle=False)
-            if not isinstance(content, np.lib.npyio.NpzFile):
-                raise FramesError(f"{path}: not {what} (it is a single array)")
-            found = {name: content[name] for name in content}
-    except _UNREADABLE as error:
-        line = " ".join(str(error).split())
-        raise FramesError(f"{path}: not {what} ({line})") from error
-    for name, value in found.items():
-        if not isinstance(value, np.ndarray):
-            raise FramesError(f"{path}: not {what} ({name} is not an array)")
-    return found
-
 
 __all__ = ["CalibrationSet", "Frame", "synthetic"]
 
@@ -148,15 +112,17 @@ class CalibrationSet(Displayed):
                 shape or dtype, or not finite: its file, its name, what was found and
                 what is expected.
         """
-        for path, frame in zip(self.files, self, strict=True):
-            _check_frame(frame, model, str(path))
+        for path in self.files:
+            _check_frame(declared(path), model, str(path))
+            for name, array in load_arrays(path).items():
+                _check_finite(array, f"{path}: {name}")
 
 
-def _check_frame(frame: Frame, model: ir.Model, source: str) -> None:
-    """Check names, dtypes, shapes, and that every number is finite.
+def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) -> None:
+    """Check names, dtypes and shapes, before an array is read.
 
     Args:
-        frame: what was recorded.
+        frame: what its file says of it.
         model: whose inputs it must fit; recurrent inputs may be absent.
         source: what the message calls the frame, e.g. its file.
 
@@ -166,28 +132,31 @@ def _check_frame(frame: Frame, model: ir.Model, source: str) -> None:
     ports = {str(value.name): value for value in model.graph.inputs}
     optional = recurrent_inputs(model)
     for name, value in ports.items():
-        array = frame.arrays.get(name)
+        array = frame.get(name)
         if array is not None:
             _check_array(array, value, f"{source}: {name}")
         elif name not in optional:
             raise FramesError(
-                f"{source}: {name} is missing; there is {', '.join(frame.arrays)}"
+                f"{source}: {name} is missing; there is {', '.join(frame)}"
                 f"{not_fed_back(name, *sides(model))}"
             )
-    if unknown := [name for name in frame.arrays if name not in ports]:
+    if unknown := [name for name in frame if name not in ports]:
         raise FramesError(
             f"{source}: {unknown[0]} is not an input of the model;"
             f" it takes {', '.join(ports)}"
         )
 
 
-def _check_array(array: Array, value: ir.Value, where: str) -> None:
+def _check_array(array: Declared, value: ir.Value, where: str) -> None:
     if value.dtype is not None and array.dtype != value.dtype.numpy():
         raise FramesError(f"{where} is {array.dtype}, expected {value.dtype.numpy()}")
     if value.shape is not None and not _fits(array.shape, value.shape):
         raise FramesError(
             f"{where} has shape {list(array.shape)}, expected {value.shape}"
         )
+
+
+def _check_finite(array: Array, where: str) -> None:
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         kind = "NaN" if np.isnan(array).any() else "infinite"
         at = np.argwhere(~np.isfinite(array))[0].tolist()

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress import documents
-from me2e_compress.calibration.dataset import load_arrays
+from me2e_compress.calibration.archives import load_arrays
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array

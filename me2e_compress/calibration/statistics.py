@@ -11,7 +11,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.calibration.dataset import load_arrays
+from me2e_compress.calibration.archives import load_arrays
 from me2e_compress.calibration.shares import Share, check_whole
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_bytes

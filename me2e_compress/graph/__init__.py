@@ -6,6 +6,7 @@ package says about it, besides walking nodes and values.
 
 from me2e_compress.graph.digest import digest
 from me2e_compress.graph.files import (
+    data_names,
     file_bytes,
     is_external,
     load,
@@ -55,6 +56,7 @@ __all__ = [
     "array_of",
     "bias_of",
     "channel_axis",
+    "data_names",
     "digest",
     "file_bytes",
     "graphs_of",

@@ -4,6 +4,7 @@ import hashlib
 import mmap
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import onnx
@@ -82,7 +83,8 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
 
     Args:
         model: what to write; it stays as it is.
-        path: the file; with external weights a ``<name>.data`` stands beside it.
+        path: the file; with external weights a ``<name>.data`` stands beside it, or a
+            ``<name>.1.data`` where the model that is replaced has the other.
         external: weights in their own file; None decides: yes where some already
             are, or where they would not fit one protobuf message.
 
@@ -94,9 +96,12 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     if not path.parent.is_dir():
         raise GraphError(f"{path}: no such folder {path.parent}")
     stored = list(external_tensors(model))
-    data = path.with_name(path.name + ".data")
-    if any(Path(tensor.path).resolve() == data.resolve() for tensor in stored):
-        raise GraphError(f"{data}: holds the weights of the model that is being saved")
+    names = data_names(path)
+    for data in names:
+        if any(Path(tensor.path).resolve() == data.resolve() for tensor in stored):
+            raise GraphError(f"{data}: holds the weights of the model being saved")
+    earlier = _named_in(path, names)
+    data = next(each for each in names if each not in earlier)
     if external is None:
         external = bool(stored) or _weight_bytes(model) > INLINE_LIMIT_BYTES
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder:
@@ -105,10 +110,29 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
             ir.save(model, draft, format="protobuf", external_data=data.name)
         else:
             onnx.save(ir.to_proto(_inlined(model)), draft, format="protobuf")
+        # The earlier model keeps its weights until the new one stands in its place.
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
             os.replace(draft_data, data)
         os.replace(draft, path)
+    for old in earlier:
+        old.unlink(missing_ok=True)
+
+
+def data_names(path: Path) -> tuple[Path, Path]:
+    """Return where the weights of a model may lie; what it is written over has one."""
+    return path.with_name(f"{path.name}.data"), path.with_name(f"{path.name}.1.data")
+
+
+def _named_in(path: Path, names: Iterable[Path]) -> list[Path]:
+    """Return which data file the model at a path names; the last one may be old."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return []
+    with (
+        path.open("rb") as stream,
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
+    ):
+        return [each for each in names if content.find(each.name.encode()) >= 0][:1]
 
 
 def is_external(model: ir.Model) -> bool:

@@ -246,8 +246,12 @@ def _refuse_empty(
 
 
 def _written(output: Path) -> tuple[Path, ...]:
-    data = output.with_name(output.name + ".data")
-    return output, data, beside(output, "plan"), beside(output, "report")
+    return (
+        output,
+        *graph.data_names(output),
+        beside(output, "plan"),
+        beside(output, "report"),
+    )
 
 
 def _write(

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import numpy as np
@@ -159,3 +160,36 @@ def test_a_model_of_ir_version_3_is_raised_to_where_weights_are_no_inputs(
     saved = onnx.load(tmp_path / "new.onnx")
     assert saved.ir_version == 4
     assert [value.name for value in saved.graph.input] == ["x"]
+
+
+def test_weights_and_model_are_replaced_as_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "m.onnx"
+    graph.save(weighted(64), path, external=True)
+    before = graph.digest(graph.load(path))
+    replace, moved = os.replace, list[str]()
+
+    def killed(source: Path, target: Path) -> None:
+        if moved:
+            raise KeyboardInterrupt
+        moved.append(Path(target).name)
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        graph.save(weighted(128), path, external=True)
+    monkeypatch.undo()
+    assert moved == ["m.onnx.1.data"]
+    assert graph.digest(graph.load(path)) == before
+
+    graph.save(weighted(128), path, external=True)
+    assert graph.digest(graph.load(path)) == graph.digest(weighted(128))
+    names = sorted(file.name for file in tmp_path.iterdir())
+    assert names == ["m.onnx", "m.onnx.1.data"]
+
+
+def test_a_model_without_external_weights_leaves_no_old_ones(tmp_path: Path) -> None:
+    graph.save(weighted(), tmp_path / "m.onnx", external=True)
+    graph.save(weighted(), tmp_path / "m.onnx")
+    assert [file.name for file in tmp_path.iterdir()] == ["m.onnx"]

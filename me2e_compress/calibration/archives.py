@@ -1,0 +1,121 @@
+"""Arrays in ``.npz`` files, whose sizes are known before they are read."""
+
+import dataclasses
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.frames import Array
+
+LARGEST_BYTES = 2 << 30
+"""The most bytes of all arrays of one file. Six full-size camera images have 0.1 GB."""
+
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,  # pickled objects, headers that lie
+    SyntaxError,  # or are no Python
+    OverflowError,
+    RecursionError,
+    MemoryError,
+    RuntimeError,  # encrypted, or compressed as zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """What a file says of one array.
+
+    Attributes:
+        shape: of the array.
+        dtype: of its elements.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+
+
+def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared]:
+    """Read what an ``.npz`` says of its arrays, by name, not the arrays.
+
+    Args:
+        path: the file.
+        what: it should be, for the message.
+
+    Raises:
+        FramesError: the file cannot be read, holds something else, more than
+            `LARGEST_BYTES`, or an array that is not as large as it says.
+    """
+    try:
+        with path.open("rb") as source, zipfile.ZipFile(source) as archive:
+            found = [_member(archive, each) for each in archive.infolist()]
+    except _UNREADABLE as error:
+        line = " ".join(str(error).split())[:200]
+        raise FramesError(f"{path}: not {what} ({line})") from error
+    if len(dict(found)) < len(found):
+        raise FramesError(f"{path}: not {what} (an array is there twice)")
+    total = sum(_bytes(each) for _, each in found)
+    if total > LARGEST_BYTES:
+        raise FramesError(
+            f"{path}: not {what}: its arrays have {total:,} bytes, more than"
+            f" {LARGEST_BYTES:,}"
+        )
+    return dict(found)
+
+
+def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
+    """Read every array of an ``.npz``, by name.
+
+    Args:
+        path: the file.
+        what: it should be, for the message.
+
+    Raises:
+        FramesError: as :func:`declared`.
+    """
+    declared(path, what)
+    try:
+        with path.open("rb") as source, np.load(source, allow_pickle=False) as content:
+            return {name: np.asarray(content[name]) for name in content}
+    except _UNREADABLE as error:
+        line = " ".join(str(error).split())[:200]
+        raise FramesError(f"{path}: not {what} ({line})") from error
+
+
+def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Declared]:
+    with archive.open(entry) as stream:
+        about = _header(stream)
+        begin = stream.tell()
+    if entry.file_size != begin + _bytes(about):
+        raise ValueError(
+            f"{entry.filename} has {entry.file_size} bytes, its header says"
+            f" {begin + _bytes(about)}"
+        )
+    return entry.filename.removesuffix(".npy"), about
+
+
+def _header(stream: IO[bytes]) -> Declared:
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+    else:
+        raise ValueError(f"an array of version {version}")
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    if any(side < 0 for side in shape):
+        raise ValueError(f"an array of shape {shape}")
+    return Declared(tuple(shape), dtype)
+
+
+def _bytes(about: Declared) -> int:
+    return math.prod(about.shape) * about.dtype.itemsize

@@ -1,0 +1,62 @@
+"""Sizes are looked at before anything is read."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.calibration import archives
+from me2e_compress.calibration.archives import load_arrays
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import FramesError
+from tests.conftest import DRIVER
+from tests.fuzz.frames import archive, broken_frames, member
+
+
+@pytest.fixture
+def unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("an array was read")
+
+    monkeypatch.setattr(np, "load", read)
+
+
+@pytest.mark.usefixtures("unread")
+def test_a_zip_bomb_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archives, "LARGEST_BYTES", 1_000_000)
+    bomb = archive({"x.npy": member("(1000000,)", more=4_000_000)})
+    assert len(bomb) < 5_000
+    (tmp_path / "bomb.npz").write_bytes(bomb)
+    with pytest.raises(FramesError, match="arrays have 4,000,000 bytes, more than"):
+        load_arrays(tmp_path / "bomb.npz")
+
+
+@pytest.mark.usefixtures("unread")
+def test_a_frame_of_another_size_is_refused_unread(tmp_path: Path) -> None:
+    frame = archive({"camera.npy": member("(1, 9999)", more=4 * 9999)})
+    (tmp_path / "000000.npz").write_bytes(frame)
+    (tmp_path / "scenes.json").write_text('{"scenes": [0]}')
+    with pytest.raises(FramesError, match=r"camera has shape \[1, 9999\], expected"):
+        CalibrationSet(tmp_path).check(ir.from_onnx_text(DRIVER))
+
+
+FRAMES = dict(broken_frames())
+READABLE = ("extra", "extra-markup", "missing", "double", "half-float", "complex",
+            "words", "dates", "fields", "void", "bytes", "flat", "scalar",
+            "no-elements", "other-shape", "nan", "infinite", "largest",
+            "path", "no-member")  # fmt: skip
+"""Archives that are whole, whatever a model says of them."""
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_an_archive_that_lies_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "x.npz").write_bytes(FRAMES[name])
+    if name in READABLE:
+        load_arrays(tmp_path / "x.npz")
+        return
+    with pytest.raises(FramesError, match=r"x\.npz: not a readable \.npz") as caught:
+        load_arrays(tmp_path / "x.npz")
+    assert "\n" not in str(caught.value)
