@@ -5,7 +5,7 @@ import html
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-AT_LEAST = "≥: nodes of unknown MACs, such as plugins, are not counted"
+AT_LEAST = "≥ or -: plugins and open shapes are not counted; inspect names them"
 """What a table says of MACs that are a lower bound."""
 
 MOST_ROWS = 30

@@ -51,3 +51,17 @@ def test_a_model_with_external_weights_works_from_any_folder(
     command: Command, apart: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command(name, *COMMANDS[name](apart)) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["inspect", "lint", "compress"])
+def test_weights_outside_the_model_s_folder_are_one_line_and_nothing_is_written(
+    command: Command, apart: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = apart / "weights.bin"
+    weights.rename(apart.parent / "private.bin")
+    weights.symlink_to(apart.parent.resolve() / "private.bin")
+    assert command(name, *COMMANDS[name](apart)) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "the data of tokens lie at 'weights.bin'" in line
+    assert "private.bin, outside the model's folder: not read" in line
+    assert list(Path().iterdir()) == []
