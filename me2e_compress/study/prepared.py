@@ -19,6 +19,7 @@ from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import beside
+from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import Listener
 
 
@@ -65,6 +66,7 @@ def prepare_variant(
     if variant.passes:
         model = _compressed(study, variant, workspace, listener)
     driver = replace(driver, path=model)
+    try_file(model, listener)
     driver.open()
     sha256 = graph.sha256_of(model)
     origin = source.name, to_text(variant.passes)

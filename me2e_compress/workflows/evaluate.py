@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-from me2e_compress import graph
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
@@ -22,7 +21,7 @@ from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number
 from me2e_compress.workflows.score import driving_score, score_records, scores_table
@@ -148,7 +147,7 @@ def _evaluated(
     shown = () if options.render is None else pick_routes(picked, options.render)
     driver = driver_of(policy, options.adapter)
     if isinstance(driver, OnnxDriver):
-        _try_policy(driver.path, listener)
+        try_file(driver.path, listener)
     job = _job(driver, options)
 
     def on_progress(now: DrivingProgress) -> None:
@@ -175,14 +174,6 @@ def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, 
     from me2e_compress.evaluators.highway.render import render  # imports highway-env
 
     return tuple(file for route in routes for file in render(job, route, folder))
-
-
-def _try_policy(file: Path, listener: Listener) -> None:
-    try:
-        model = graph.load(file)
-    except GraphError:
-        return  # who opens the policy says what is wrong
-    try_first(model, file.name, listener, file=file)
 
 
 def _job(driver: Driver, options: EvaluateOptions) -> Job:

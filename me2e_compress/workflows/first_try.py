@@ -5,6 +5,8 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from me2e_compress import graph
+from me2e_compress.errors import GraphError
 from me2e_compress.runtime import first_opening
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.workflows.listener import Listener
@@ -40,3 +42,16 @@ def try_first(
     )
     if seconds:
         listener.on_progress(STAGE, 1, 1, f"{name}: {seconds:.1f} s")
+
+
+def try_file(file: Path, listener: Listener) -> None:
+    """Open the graph of a file apart, if this machine has not seen it.
+
+    Raises:
+        GraphError: onnxruntime dies of the graph.
+    """
+    try:
+        model = graph.load(file)
+    except GraphError:
+        return  # who opens it says what is wrong
+    try_first(model, file.name, listener, file=file)

@@ -9,6 +9,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.extras import need_closed_loop
+from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table
 from me2e_compress.zoo.stacks import STACKS, find
@@ -122,7 +123,9 @@ def _recorded(
     source: str | Path, folder: Path, options: FramesOptions, listener: Listener
 ) -> Path:
     if Path(source).is_file() or find(str(source)).trained:
-        made = _driven(model_path(source), options)
+        model = model_path(source)
+        try_file(model, listener)
+        made = _driven(model, options)
     else:
         made = _synthetic(str(source), options)
     about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
