@@ -64,8 +64,8 @@ class Remedy:
         """Write what ``--overrides`` takes; empty where nothing was found."""
         return overrides_text(
             (
-                *(Override(dtype=FLOAT, module=each) for each in self.modules),
                 *(keep_float(each.name, "") for each in self.nodes),
+                *(Override(dtype=FLOAT, module=each) for each in self.modules),
             )
         )
 

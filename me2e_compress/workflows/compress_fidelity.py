@@ -27,6 +27,7 @@ KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
 PERHAPS_SHARED = "that the saved ranges may have been measured on"
 SHIPPED_FRAMES = "that ship with the model"
+NOT_ASKED = "--measure-frames 0"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,7 @@ class SplitFrames:
             saved: whether ranges come from a file, so that nothing is calibrated.
         """
         if not most:
-            return cls(recording, None, "--measure-frames 0", samples)
+            return cls(recording, None, NOT_ASKED, samples)
         if recording is None:
             reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
             return cls(None, samples, reason, samples)

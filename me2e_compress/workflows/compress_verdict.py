@@ -5,9 +5,12 @@ from collections.abc import Iterator
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.floor import Shortfall, shown
 from me2e_compress.manager import Report
-from me2e_compress.workflows.compress_fidelity import MeasuredLoss
+from me2e_compress.workflows.compress_fidelity import NOT_ASKED, MeasuredLoss
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.result import Table, megabytes, table
+
+LEAST_SHOWN = 10_000
+"""Bytes of a rule that are worth a word."""
 
 LISTED_WEIGHTS = 5
 """Float weights that a table shows."""
@@ -21,6 +24,8 @@ def verdict(
         yield _int8_line(int8)
     if loss is None:
         yield from _exact_line(report)
+    elif loss.fidelity is None and loss.on == NOT_ASKED:
+        return
     elif loss.fidelity is None:
         yield f"fidelity: not measured ({loss.on})"
     else:
@@ -54,13 +59,13 @@ def _cure(loss: MeasuredLoss) -> Iterator[str]:
     remedy, worst = loss.remedy, loss.shortfalls[0].output
     runs = f"{remedy.trials} variants run on {_frames(remedy.fidelity)}"
     found = [
-        *(f"module {name}, all over it" for name in remedy.modules),
         *map(str, remedy.nodes),
+        *(f"many nodes of module {name}" for name in remedy.modules),
     ]
     if not found:
         yield f"no node or module is to blame alone ({runs})"
         return
-    yield f"lost at {', '.join(found)}"
+    yield f"lost at {'; '.join(found)}"
     after = ", ".join(map(str, remedy.shortfalls)) or _figure(remedy.fidelity, worst)
     left = "" if remedy.cures else ", still below the floor"
     yield f"with --overrides of these lines: {after}{left} ({runs})"
@@ -70,7 +75,11 @@ def _cure(loss: MeasuredLoss) -> Iterator[str]:
 def _int8_line(int8: Int8Outcome) -> str:
     said = f"int8: {int8.nodes} nodes"
     if int8.float_bytes:
-        rules = ", ".join(f"{k} {megabytes(v)}" for k, v in int8.float_bytes.items())
+        rules = ", ".join(
+            f"{rule} {megabytes(count)}"
+            for rule, count in int8.float_bytes.items()
+            if count >= LEAST_SHOWN
+        )
         total = megabytes(sum(int8.float_bytes.values()))
         said += f"; {total} MB of weights stay float, by rule: {rules}"
     if int8.weight_only_bytes:

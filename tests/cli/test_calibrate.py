@@ -41,7 +41,7 @@ def test_saved_ranges_make_the_file_that_frames_make(
         where = folder / ("r.json" if source == "--ranges" else "scenes")
         done = command(
             *("compress", folder / "dense.onnx", "--scheme", "prediction"),
-            *("--method", method),
+            *("--method", method, "--measure-frames", 0),
             *(source, where, "--map", folder / "map.toml"),
             *("-o", folder / f"{name}.onnx"),
         )
