@@ -18,12 +18,11 @@ from me2e_compress.errors import (
     PreconditionError,
     VerificationError,
 )
-from me2e_compress.graph import provenance
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 from me2e_compress.recipe import to_text
 
 Progress = Callable[[int, int, str], None]
@@ -89,7 +88,7 @@ class PassManager:
         )
 
     def _with_import(self, model: ir.Model) -> tuple[Pass, ...]:
-        known = not provenance.missing(model)
+        known = not needs_import(model)
         first = self.passes[0].name if self.passes else ""
         if known or first == ImportNormalize.name:
             return self.passes

@@ -18,6 +18,7 @@ from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
+from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.runtime.atomic import write_json
@@ -263,7 +264,7 @@ def _write(
     seconds: float,
 ) -> CompressResult:
     """Write the graph and its plan; the report last, it vouches for the others."""
-    graph.save(report.model, output)
+    graph.save(with_own_domains(report.model), output)
     plan = plan_of(report.model)
     if plan is not None:
         save_plan(plan, beside(output, "plan"))

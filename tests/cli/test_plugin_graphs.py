@@ -75,3 +75,14 @@ def test_ranges_of_tensorrt_make_a_plugin_graph_int8(
     assert command("compress", model, *made) == 0, capsys.readouterr().err
     small = graph.load(plugins / "int8.onnx")
     assert "QuantizeLinear" in [node.op_type for node in small.graph]
+
+
+def test_what_compress_wrote_can_be_compressed_again(
+    command: Command, plugins: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small, again = plugins / "small.onnx", plugins / "again.onnx"
+    made = ("-r", "exact", "-o")
+    assert command("compress", plugins / "shaped.onnx", *made, small) == 0
+    domains = {node.op_type: node.domain for node in graph.load(small).graph}
+    assert (domains["RotateTRT2"], domains["InverseTRT"]) == ("", "")
+    assert command("compress", small, *made, again) == 0, capsys.readouterr().err

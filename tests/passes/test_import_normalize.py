@@ -14,7 +14,10 @@ from me2e_compress.passes.import_normalize import (
     ORIGINAL_DOMAIN,
     PLUGIN_DOMAIN,
     ImportNormalize,
+    needs_import,
+    with_own_domains,
 )
+from tests.plugins import exported
 
 Array = npt.NDArray[np.float32]
 
@@ -111,6 +114,22 @@ def test_plugins_of_the_default_domain_move_to_a_private_one(plugin: str) -> Non
     assert model.opset_imports[PLUGIN_DOMAIN] == 1
     onnx.checker.check_model(ir.to_proto(model))
     assert settled(model)
+
+
+def test_plugins_go_out_under_the_domain_that_they_came_with() -> None:
+    model = exported(shapes=True)
+    normalise(model)
+    written = with_own_domains(model)
+    assert [node.domain for node in written.graph] == [""] * len(written.graph)
+    assert PLUGIN_DOMAIN not in written.opset_imports
+    assert with_own_domains(written) is written
+
+
+def test_a_graph_that_goes_out_and_comes_in_again_is_imported_again() -> None:
+    model = exported(shapes=True)
+    normalise(model)
+    assert not needs_import(model)
+    assert needs_import(with_own_domains(model))
 
 
 def test_a_plugin_in_a_branch_and_one_in_a_function_move_too() -> None:

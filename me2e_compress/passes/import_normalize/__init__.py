@@ -7,14 +7,20 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance
-from me2e_compress.graph.nodes import is_plugin
+from me2e_compress.graph.nodes import is_plugin, nodes_of
 from me2e_compress.graph.validity import PLUGIN_DOMAIN
 from me2e_compress.modules import assign
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import doubles
 from me2e_compress.rewrite import lift_constants
 
-__all__ = ["ORIGINAL_DOMAIN", "PLUGIN_DOMAIN", "ImportNormalize"]
+__all__ = [
+    "ORIGINAL_DOMAIN",
+    "PLUGIN_DOMAIN",
+    "ImportNormalize",
+    "needs_import",
+    "with_own_domains",
+]
 
 ORIGINAL_DOMAIN = "me2e.domain"
 """Node metadata with the domain that a plugin had in the file it came from."""
@@ -58,6 +64,30 @@ class ImportNormalize(Pass):
         demoted, note = doubles.demote(model, self.name)
         changes += demoted + lift_constants(model) + _declare(model)
         return PassResult(model, changes, (note,) if note else ())
+
+
+def needs_import(model: ir.Model) -> bool:
+    """Return whether nodes lack a past, or plugins of the default domain a domain."""
+    return bool(provenance.missing(model)) or any(
+        _bare_plugins(body, model) for body in _bodies(model)
+    )
+
+
+def with_own_domains(model: ir.Model) -> ir.Model:
+    """Return a graph whose plugins have the domain that they came with.
+
+    The graph itself where none was moved, else a copy.
+    """
+    if not any(ORIGINAL_DOMAIN in node.metadata_props for node in nodes_of(model)):
+        return model
+    copy = model.clone()
+    for body in _bodies(copy):
+        for node in body.all_nodes():
+            if ORIGINAL_DOMAIN in node.metadata_props:
+                node.domain = node.metadata_props.pop(ORIGINAL_DOMAIN)
+        if all(node.domain != PLUGIN_DOMAIN for node in body.all_nodes()):
+            body.opset_imports.pop(PLUGIN_DOMAIN, None)
+    return copy
 
 
 def _bodies(model: ir.Model) -> Iterator[ir.Graph | ir.Function]:
@@ -118,13 +148,7 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
     """
     count = 0
     for body in _bodies(model):
-        moved = [
-            node
-            for node in body.all_nodes()
-            if node.domain == ""
-            and is_plugin(node)
-            and node.op_identifier() not in model.functions
-        ]
+        moved = _bare_plugins(body, model)
         for node in moved:
             node.metadata_props.setdefault(ORIGINAL_DOMAIN, node.domain)
             node.domain = PLUGIN_DOMAIN
@@ -133,6 +157,17 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
             body.opset_imports.setdefault(PLUGIN_DOMAIN, 1)
         count += len(moved)
     return count
+
+
+def _bare_plugins(body: ir.Graph | ir.Function, model: ir.Model) -> list[ir.Node]:
+    """List the plugins of the default domain."""
+    return [
+        node
+        for node in body.all_nodes()
+        if node.domain == ""
+        and is_plugin(node)
+        and node.op_identifier() not in model.functions
+    ]
 
 
 def _declare(model: ir.Model) -> int:
