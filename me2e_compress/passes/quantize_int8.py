@@ -47,8 +47,8 @@ class QuantizeInt8(Pass):
         modules: module names instead of a scheme.
         rules: ``safe`` (also called ``tensorrt``), which keeps geometry, positions,
             attention weights, ego status and what kernels are too coarse for in float
-            besides; ``paper``, its two stages alone; a rule set of your own; each with
-            options, ``paper{extra=[my-rule]}``.
+            besides; ``paper``, its two stages alone; a rule set of your own, by its
+            name or, in Python, itself; each with options, ``paper{extra=[my-rule]}``.
         without: names of rules that are switched off, e.g. ``gemv``.
         target: who will run the graph.
         attention_limit: longest attention that becomes int8, in tokens; None leaves it
@@ -67,7 +67,7 @@ class QuantizeInt8(Pass):
     reads_ranges: ClassVar[bool] = True
     scheme: str = "full"
     modules: tuple[str, ...] = ()
-    rules: str = DEFAULT_RULES
+    rules: str | RuleSet = DEFAULT_RULES
     without: tuple[str, ...] = ()
     target: str = "tensorrt"
     attention_limit: int | None = None
@@ -160,7 +160,9 @@ class QuantizeInt8(Pass):
 
     def _rules(self) -> RuleSet:
         """Build the rule set; what this pass says of it counts."""
-        rules = RULE_SETS.parse(self.rules)
+        rules = self.rules
+        if isinstance(rules, str):
+            rules = RULE_SETS.parse(rules)
         options: dict[str, object] = {"without": (*rules.without, *self.without)}
         if self.attention_limit is not None:
             options["attention_limit"] = self.attention_limit

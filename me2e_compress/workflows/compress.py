@@ -21,6 +21,7 @@ from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of, save_plan
+from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.workflows.checks import (
     check_count,
@@ -53,7 +54,7 @@ class CompressOptions:
     Attributes:
         scheme: int8 after the recipe's passes: ``feature-ext``, ``prediction``,
             ``full``.
-        rules: of the int8 plan: ``safe`` or ``paper``.
+        rules: of the int8 plan: ``safe``, ``paper``, or a set of yours.
         target: runtime of the int8 graph: ``tensorrt`` or ``onnxruntime``.
         overrides: TOML file of exceptions to the int8 plan.
         weight_only_gemv: store the weights of matrix-vector products as int8.
@@ -74,7 +75,7 @@ class CompressOptions:
     """
 
     scheme: str | None = None
-    rules: str | None = None
+    rules: str | RuleSet | None = None
     target: str | None = None
     overrides: str | Path | None = None
     weight_only_gemv: bool = False

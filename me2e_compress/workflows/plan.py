@@ -23,7 +23,7 @@ from me2e_compress.quantization.plan import (
     save_plan,
 )
 from me2e_compress.quantization.plan.decision import record
-from me2e_compress.quantization.rules import DEFAULT_RULES
+from me2e_compress.quantization.rules import DEFAULT_RULES, RuleSet
 from me2e_compress.workflows.checks import lacking_shapes, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
@@ -45,7 +45,7 @@ class PlanOptions:
     """
 
     scheme: str | None = None
-    rules: str | None = None
+    rules: str | RuleSet | None = None
     overrides: str | Path | None = None
     module_map: str | Path | None = None
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)

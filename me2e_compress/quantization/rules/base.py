@@ -110,6 +110,10 @@ class Rule(abc.ABC):
         """
         return None
 
+    def __str__(self) -> str:
+        """Return its text, as rule sets name it."""
+        return RULES.text(self)
+
 
 _HERE = "me2e_compress.quantization.rules"
 
@@ -145,13 +149,18 @@ class RuleSet(abc.ABC):
 
     Attributes:
         without: names of rules that are switched off.
-        extra: more rules, asked last: ``my-rule`` or ``my-rule{limit=3}``.
+        extra: more rules, asked last: ``my-rule``, ``my-rule{limit=3}``, or the rule
+            itself, which need not be registered.
     """
 
     name: ClassVar[str]
     share_concat: ClassVar[bool] = False
     without: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
-    extra: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
+    extra: tuple[str | Rule, ...] = dataclasses.field(default=(), kw_only=True)
+
+    def __str__(self) -> str:
+        """Return its text, as recipes name it."""
+        return RULE_SETS.text(self)
 
     @abc.abstractmethod
     def own_rules(self) -> tuple[Rule, ...]:
@@ -163,7 +172,8 @@ class RuleSet(abc.ABC):
         Raises:
             RecipeError: no such extra rule, or one that cannot be switched off.
         """
-        rules = (*self.own_rules(), *(RULES.parse(text) for text in self.extra))
+        more = (RULES.parse(e) if isinstance(e, str) else e for e in self.extra)
+        rules = (*self.own_rules(), *more)
         loose = [rule.name for rule in rules if not rule.firm]
         for name in self.without:
             if name not in loose:
