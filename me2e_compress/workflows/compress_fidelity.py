@@ -10,13 +10,13 @@ from time import process_time
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import Recording, hold_out
-from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.fidelity.floor import Floor, Shortfall, unsteady_outputs
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.plan import QuantPlan, plan_of
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity.recipes import overrides_text
 from me2e_compress.sensitivity.remedy import Int8Node, Remedy, find_remedy, int8_nodes
@@ -81,6 +81,8 @@ class MeasuredLoss:
     Attributes:
         fidelity: against the graph before the first lossy pass; None: not measured.
         on: which frames, in words; where nothing was measured, why not.
+        incomparable: whether it was not measured because an output is not finite, or
+            of another shape than before.
         floor: what it is held against.
         unsteady: outputs that are not judged: the uncompressed model itself falls that
             low, in dB or metres, when its largest input is rounded to int8.
@@ -99,6 +101,7 @@ class MeasuredLoss:
     guilty: tuple[str, ...] = ()
     remedy: Remedy | None = None
     seconds: float = 0.0
+    incomparable: bool = False
 
 
 def measure_loss(
@@ -126,8 +129,10 @@ def measure_loss(
     found = MeasuredLoss(None, frames.kind, floor)
     try:
         found = measurement.judge(found)
-    except (EvaluationError, FramesError, GraphError) as error:
+    except (FramesError, GraphError) as error:
         found = dataclasses.replace(found, on=str(error))
+    except EvaluationError as error:  # not finite, or of another shape
+        found = dataclasses.replace(found, on=str(error), incomparable=True)
     return dataclasses.replace(found, seconds=process_time() - start)
 
 
@@ -172,18 +177,31 @@ class _Measurement:
         plan = plan_of(self.report.model)
         if plan is None or "overrides" not in quantizer.applied.option_names():
             return guilty
-        reference, start = self._fewer(reference, found.unsteady)
+        try:
+            remedy = self._search(quantizer, plan, reference, found.unsteady)
+        except Me2eError:  # a variant that cannot be made or compared ends the search
+            return guilty
+        return dataclasses.replace(guilty, remedy=remedy)
+
+    def _search(
+        self,
+        quantizer: LossyPass,
+        plan: QuantPlan,
+        reference: Reference,
+        unsteady: Collection[str],
+    ) -> Remedy:
+        """Try variants of the plan on as few frames as show the loss."""
+        reference, start = self._fewer(reference, unsteady)
         with TemporaryDirectory(prefix="me2e-trial-") as folder:
             trial = _Trial(quantizer, self.context, reference, Path(folder) / "o.toml")
-            remedy = find_remedy(
+            return find_remedy(
                 int8_nodes(plan),
                 start,
                 trial.measure,
                 self.floor,
-                unsteady=found.unsteady,
+                unsteady=unsteady,
                 progress=partial(self.listener.on_progress, "search"),
             )
-        return dataclasses.replace(guilty, remedy=remedy)
 
     def _fewer(
         self, reference: Reference, unsteady: Collection[str]

@@ -43,6 +43,8 @@ def alerts(int8: Int8Outcome | None, loss: MeasuredLoss | None) -> Iterator[str]
     """Say what must not be overlooked: nothing int8, or quality below the floor."""
     if int8 is not None and int8.empty:
         yield int8.empty
+    if loss is not None and loss.incomparable:
+        yield f"the outputs cannot be compared: {loss.on}"
     if loss is None or not loss.shortfalls:
         return
     yield (

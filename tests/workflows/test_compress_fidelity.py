@@ -213,6 +213,37 @@ def test_state_is_fed_forward_on_held_out_frames(tmp_path: Path) -> None:
     assert measured == pytest.approx([each.sqnr_db for each in again.outputs], abs=0.2)
 
 
+LOGARITHM = """
+<ir_version: 9, opset_import: ["" : 17]>
+net (float[1,16,16] x, float[16,16] w) => (float[1,16,16] y) {
+    ["/backbone/MatMul"] a = MatMul(x, w)
+    ["/backbone/Abs"] b = Abs(a)
+    ["/backbone/Log"] y = Log(b)
+}
+"""
+
+
+def test_an_output_that_is_no_longer_finite_is_not_overlooked(tmp_path: Path) -> None:
+    """A small product is zero in int8, and its logarithm infinite."""
+    weight = np.ones((16, 16))
+    graph.save(net(LOGARITHM, {"w": weight}), tmp_path / "in.onnx")
+    values = np.full((1, 16, 16), 1e-3, np.float32)
+    values[0, 0] = 10.0
+    record(tmp_path / "frames", [{"x": values}])
+    (tmp_path / "map.toml").write_text(MAP[: MAP.index("[modules.bev")])
+    options = me2e.CompressOptions(
+        scheme="full", rules="paper", module_map=tmp_path / "map.toml"
+    )
+
+    found = me2e.compress(
+        tmp_path / "in.onnx", tmp_path / "o.onnx", None, tmp_path / "frames", options
+    )
+
+    (alert,) = found.alerts()
+    assert "output y of the second model is infinite at frame 0" in alert
+    assert found.status == "warning"
+
+
 NO_LAYER = """
 <ir_version: 9, opset_import: ["" : 17]>
 net (float[4,1,32] x, float[1,128,32] w, float[1,128,32] r) => (float[4,1,1,32] y) {
