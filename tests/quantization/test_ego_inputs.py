@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from me2e_compress.quantization.plan import make_plan
+from me2e_compress.quantization.plan import Decision, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, net
@@ -32,10 +32,14 @@ ego (float[3,18] can_bus, float[1,3,%d,32] image, float[3,32] memory,
 SIZES = {"a": (18, 32), "b": (32, 32), "c": (32, 64), "d": (64, 32), "grid": (500, 32)}
 
 
-def rules(height: int, rule_set: str) -> dict[str, str]:
+def decisions(height: int, rule_set: str) -> dict[str, Decision]:
     model = net(NET % height, {name: np.ones(size) for name, size in SIZES.items()})
     plan = make_plan(model, HEAD, RULE_SETS.parse(rule_set))
-    return {each.output: each.rule for each in plan.decisions}
+    return {each.output: each for each in plan.decisions}
+
+
+def rules(height: int, rule_set: str) -> dict[str, str]:
+    return {name: each.rule for name, each in decisions(height, rule_set).items()}
 
 
 def test_layers_that_see_the_status_alone_stay_float() -> None:
@@ -58,3 +62,13 @@ def test_other_layers_do_not(output: str, why: str) -> None:
 
 def test_a_graph_without_sensors_has_no_status() -> None:
     assert rules(1, "safe")["e"] == "layer"
+
+
+def test_other_rules_flag_it() -> None:
+    found = decisions(32, "paper")
+
+    flagged = {name: each for name, each in found.items() if each.borderline}
+    assert set(flagged) == {"e", "f"}
+    assert all(each.dtype == "int8" for each in flagged.values())
+    assert "ego-input: encodes the ego status can_bus" in flagged["e"].borderline
+    assert "rules safe keep it float" in flagged["e"].borderline

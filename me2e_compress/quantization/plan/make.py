@@ -33,6 +33,9 @@ from me2e_compress.quantization.rules import (
 )
 from me2e_compress.quantization.scheme import QuantScheme
 
+_EGO = "encodes the ego status {}, sensitive to int8; rules safe keep it float"
+"""The remark on an int8 layer of rules that do not ask for ``ego-input``."""
+
 
 def make_plan(
     model: ir.Model,
@@ -111,6 +114,8 @@ def _decide(
     rule_id, reason, layout = _int8(node, facts)
     if pin is not None:
         rule_id, reason = "override", pin.reason
+    elif node in facts.ego_layers:
+        close = f"ego-input: {_EGO.format(facts.ego_layers[node])}"
     activations, weight = layout
     return decision(
         dtype=INT8,
