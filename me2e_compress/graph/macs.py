@@ -13,7 +13,7 @@ Counter = Callable[[ir.Node], int | None]
 
 _UNCOUNTED = frozenset(
     {
-        "AffineGrid", "Attention", "CausalConvWithState", "DFT", "Det",
+        "AffineGrid", "CausalConvWithState", "DFT", "Det",
         "LinearAttention", "STFT", "SequenceMap",
     }
 )  # fmt: skip
@@ -26,8 +26,8 @@ def macs(node: ir.Node) -> int | None:
     Conv, DeformConv and ConvTranspose: output (input) elements x kernel volume x
     channels per group. Gemm and MatMul: rows x columns x inner dimension x batch.
     Einsum of two operands: the product of all its dimensions. LSTM, GRU and RNN: steps
-    x batch x elements of both weights, which hold all gates and directions. Integer
-    forms likewise.
+    x batch x elements of both weights, which hold all gates and directions. Attention:
+    queries x keys x what is multiplied for each pair. Integer forms likewise.
 
     Returns:
         The count; None where it is not known: of a plugin, a local function, an
@@ -172,7 +172,25 @@ def _recurrent(node: ir.Node) -> int | None:
     return source[0] * source[1] * elements  # steps and batch, in either order
 
 
+def _attention(node: ir.Node) -> int | None:
+    """Count both products; the heads are an axis, or within the last one."""
+    read = [input_at(node, at) for at in (0, 1, 2, 4)]
+    known = [shape for value in read if (shape := static_shape(value))]
+    if len(known) != sum(value is not None for value in read):
+        return None
+    query, key, value, *past = known
+    if len(query) == 4:
+        width, out = query[1] * query[3], query[1] * value[3]
+    else:
+        groups = node.attributes.get_int("kv_num_heads", 1)
+        width, out = query[2], node.attributes.get_int("q_num_heads", 1) * value[2]
+        out //= groups
+    keys = key[-2] + sum(shape[2] for shape in past)
+    return query[0] * query[-2] * keys * (width + out)
+
+
 _RULES: dict[str, Counter] = {
+    "Attention": _attention,
     "Conv": _conv(1),
     "ConvInteger": _conv(1),
     "ConvTranspose": _conv_transpose,

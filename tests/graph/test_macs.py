@@ -91,6 +91,17 @@ def only_node(text: str) -> ir.Node:
             ' { y = Einsum<equation="...j,jk->...k">(x, w) }',
             7 * 2 * 3 * 4,
         ),
+        (
+            "m (float[2,8,5,16] q, float[2,4,7,16] k, float[2,4,7,24] v)"
+            " => (float[2,8,5,24] y) { y = Attention(q, k, v) }",
+            2 * 8 * 5 * 7 * (16 + 24),
+        ),
+        (
+            "m (float[2,5,128] q, float[2,7,64] k, float[2,7,96] v)"
+            " => (float[2,5,192] y)"
+            " { y = Attention<q_num_heads=8, kv_num_heads=4>(q, k, v) }",
+            2 * 8 * 5 * 7 * (16 + 24),
+        ),
         ("m (float[9] x) => (float[9] y) { y = Relu(x) }", 0),
     ],
 )
