@@ -19,8 +19,8 @@ from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
 from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
 from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.module_changes import ModuleChanges, compare_modules
 from me2e_compress.workflows.result import Result, Table
 
 CALIBRATION_FRAMES, CALIBRATION_SEED = 64, 0

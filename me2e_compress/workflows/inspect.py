@@ -8,6 +8,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph, recipe
+from me2e_compress.errors import GraphError
 from me2e_compress.graph import Port, provenance
 from me2e_compress.graph.macs import why_uncounted
 from me2e_compress.graph.opset import lowered
@@ -15,9 +16,9 @@ from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
+from me2e_compress.runtime.recurrence import recurrent_inputs
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.result import (
-    AT_LEAST,
     Result,
     Table,
     giga,
@@ -53,6 +54,7 @@ class InspectResult(Result):
         unknown_macs_nodes: how many nodes are not in ``macs``.
         uncounted: why, with the number of nodes.
         open_dimensions: of the inputs, by name: MACs wait for their sizes.
+        recurrent: inputs that are fed back from frame to frame, with the output.
     """
 
     file: str
@@ -70,6 +72,7 @@ class InspectResult(Result):
     open_dimensions: tuple[str, ...]
     lowered: str = ""
     hint: str = ""
+    recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -102,9 +105,11 @@ class InspectResult(Result):
         ]
         rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
         note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
+        pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
+        back = f"fed back: {', '.join(pairs)}" if pairs else ""
         columns = ("module", "nodes", "parameters", "MB", "GMACs")
         return (
-            table("Interface", ("", "name", "type", "shape"), ports, words=4),
+            table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
             table(f"Modules (map {self.map})", columns, rows, note),
         )
 
@@ -160,6 +165,7 @@ def inspect(
     items = itemise(loaded, modules, placed.module_of)
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
+    fed_back, wrong = _fed_back(loaded)
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
     return InspectResult(
@@ -177,8 +183,17 @@ def inspect(
         _uncounted(folded),
         open_dimensions(loaded),
         lowered(loaded),
-        lacking_shapes(loaded),
+        "; ".join(filter(None, (lacking_shapes(loaded), wrong))),
+        fed_back,
     )
+
+
+def _fed_back(model: ir.Model) -> tuple[dict[str, str], str]:
+    """Pair inputs with the outputs that are fed back; say why that cannot be done."""
+    try:
+        return recurrent_inputs(model), ""
+    except GraphError as error:
+        return {}, str(error)
 
 
 def _with_cost(item: Item, cost: Item | None) -> Item:
@@ -213,83 +228,3 @@ def _uncounted(model: ir.Model) -> dict[str, int]:
     count = graph.macs_counter(model)
     unknown = [node for node in model.graph.all_nodes() if count(node) is None]
     return dict(Counter(map(why_uncounted, unknown)).most_common())
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class ModuleChanges(Result):
-    """What the modules of a graph held before and hold now.
-
-    Attributes:
-        before: module by module.
-        after: the same; a module that is gone is not there.
-    """
-
-    before: tuple[Item, ...]
-    after: tuple[Item, ...]
-
-    @property
-    def headline(self) -> str:
-        """Nodes in all."""
-        before, after = (
-            sum(item.nodes for item in side) for side in (self.before, self.after)
-        )
-        return f"{before} nodes, now {after}"
-
-    def lines(self) -> tuple[str, ...]:
-        """Return none: the table says it."""
-        return ()
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return module by module what there was and is."""
-        rows = []
-        for item, now in self._pairs():
-            nodes, size = (now.nodes, now.weight_bytes) if now else (0, 0)
-            rows.append(
-                (
-                    item.module,
-                    f"{item.nodes} → {nodes}",
-                    number(item.parameters),
-                    f"{megabytes(item.weight_bytes)} → {megabytes(size)}",
-                    f"{_gmacs(item)} → {_gmacs(now)}",
-                )
-            )
-        columns = ("module", "nodes", "parameters", "weights MB", "GMACs")
-        note = "before: once imported, its shape arithmetic done"
-        if any(item.unknown_macs_nodes for item in (*self.before, *self.after)):
-            note += f"\n{AT_LEAST}"
-        return (table("Module by module", columns, rows, note),)
-
-    def records(self) -> list[dict[str, object]]:
-        """Return a row a module."""
-        return [
-            {
-                "module": item.module,
-                "nodes_before": item.nodes,
-                "nodes": now.nodes if now else 0,
-                "weight_bytes_before": item.weight_bytes,
-                "weight_bytes": now.weight_bytes if now else 0,
-            }
-            for item, now in self._pairs()
-        ]
-
-    def to_json(self) -> object:
-        """Return both sides."""
-        return {"before": self.before, "after": self.after}
-
-    def _pairs(self) -> list[tuple[Item, Item | None]]:
-        held = {item.module: item for item in self.after}
-        return [(item, held.get(item.module)) for item in self.before]
-
-
-def _gmacs(item: Item | None) -> str:
-    return giga(0) if item is None else giga(item.macs, item.unknown_macs_nodes)
-
-
-def compare_modules(before: Path, after: Path) -> ModuleChanges:
-    """Weigh the modules of two files, each by the preset that fits it.
-
-    Raises:
-        GraphError: not a graph.
-    """
-    loaded = [graph.load(path) for path in (before, after)]
-    return ModuleChanges(*(weigh(each, load_map(None, each)) for each in loaded))

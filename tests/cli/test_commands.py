@@ -10,6 +10,7 @@ from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
 from tests.cli.conftest import Command, strict, write_frames
 from tests.docs.documents import faults
+from tests.nets import conv_attention
 
 NAMES = sorted(COMMANDS)
 
@@ -55,6 +56,29 @@ def test_inspect_for_people(
 ) -> None:
     assert command("inspect", files / "in.onnx", "--map", files / "map.toml") == 0
     assert "3 by scope" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("metadata", "said"),
+    [
+        (None, "fed back: memory_out as memory"),
+        ('{"memory": "nowhere"}', "me2e.recurrent pairs memory with nowhere"),
+    ],
+)
+def test_inspect_says_which_outputs_are_fed_back(
+    command: Command,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    metadata: str | None,
+    said: str,
+) -> None:
+    model = conv_attention()
+    if metadata is not None:
+        model.metadata_props["me2e.recurrent"] = metadata
+    graph.save(model, tmp_path / "m.onnx")
+
+    assert command("inspect", tmp_path / "m.onnx") == 0
+    assert said in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.fixture

@@ -1,0 +1,98 @@
+"""What the modules of a graph held before a compression, and hold after it."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress import graph
+from me2e_compress.modules import Item
+from me2e_compress.workflows.checks import load_map
+from me2e_compress.workflows.inspect import weigh
+from me2e_compress.workflows.result import (
+    AT_LEAST,
+    Result,
+    Table,
+    giga,
+    megabytes,
+    number,
+    table,
+)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ModuleChanges(Result):
+    """What the modules of a graph held before and hold now.
+
+    Attributes:
+        before: module by module.
+        after: the same; a module that is gone is not there.
+    """
+
+    before: tuple[Item, ...]
+    after: tuple[Item, ...]
+
+    @property
+    def headline(self) -> str:
+        """Nodes in all."""
+        before, after = (
+            sum(item.nodes for item in side) for side in (self.before, self.after)
+        )
+        return f"{before} nodes, now {after}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the table says it."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return module by module what there was and is."""
+        rows = []
+        for item, now in self._pairs():
+            nodes, size = (now.nodes, now.weight_bytes) if now else (0, 0)
+            rows.append(
+                (
+                    item.module,
+                    f"{item.nodes} → {nodes}",
+                    number(item.parameters),
+                    f"{megabytes(item.weight_bytes)} → {megabytes(size)}",
+                    f"{_gmacs(item)} → {_gmacs(now)}",
+                )
+            )
+        columns = ("module", "nodes", "parameters", "weights MB", "GMACs")
+        note = "before: once imported, its shape arithmetic done"
+        if any(item.unknown_macs_nodes for item in (*self.before, *self.after)):
+            note += f"\n{AT_LEAST}"
+        return (table("Module by module", columns, rows, note),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a module."""
+        return [
+            {
+                "module": item.module,
+                "nodes_before": item.nodes,
+                "nodes": now.nodes if now else 0,
+                "weight_bytes_before": item.weight_bytes,
+                "weight_bytes": now.weight_bytes if now else 0,
+            }
+            for item, now in self._pairs()
+        ]
+
+    def to_json(self) -> object:
+        """Return both sides."""
+        return {"before": self.before, "after": self.after}
+
+    def _pairs(self) -> list[tuple[Item, Item | None]]:
+        held = {item.module: item for item in self.after}
+        return [(item, held.get(item.module)) for item in self.before]
+
+
+def _gmacs(item: Item | None) -> str:
+    return giga(0) if item is None else giga(item.macs, item.unknown_macs_nodes)
+
+
+def compare_modules(before: Path, after: Path) -> ModuleChanges:
+    """Weigh the modules of two files, each by the preset that fits it.
+
+    Raises:
+        GraphError: not a graph.
+    """
+    loaded = [graph.load(path) for path in (before, after)]
+    return ModuleChanges(*(weigh(each, load_map(None, each)) for each in loaded))
