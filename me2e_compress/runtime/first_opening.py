@@ -70,7 +70,7 @@ def try_apart(
     on_begin()
     with tempfile.TemporaryDirectory(prefix="me2e-opening-") as scratch:
         inputs = Path(scratch) / "inputs.npz"
-        np.savez(inputs, allow_pickle=False, **(feeds or {}))
+        _save(feeds or {}, inputs)
         if file is None:
             file = Path(scratch) / "model.onnx"
             graph.save(model, file)
@@ -80,9 +80,10 @@ def try_apart(
     if done.returncode not in _REFUSED:
         step = (done.stdout.split() or ["start"])[-1]
         raise GraphError(f"{name}: onnxruntime {_end(done.returncode)} at step {step}")
-    with contextlib.suppress(OSError):  # a home that cannot be written to
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(verdict, _SURVIVED)
+    if "open" in done.stdout:
+        with contextlib.suppress(OSError):  # a home that cannot be written to
+            folder.mkdir(parents=True, exist_ok=True)
+            write_json(verdict, _SURVIVED)
     return perf_counter() - begun
 
 
@@ -91,6 +92,11 @@ def _fingerprints(model: ir.Model) -> Iterator[str]:
     known = (graph.digest(model), ort.__version__, "CPUExecutionProvider")
     for step in ("opened", "ran"):
         yield hashlib.sha256("\n".join((*known, step)).encode()).hexdigest()
+
+
+def _save(feeds: Mapping[str, Array], path: Path) -> None:
+    """Write arrays by number, their names before them: any name is allowed."""
+    np.savez(path, np.array(list(feeds), np.str_), *feeds.values(), allow_pickle=False)
 
 
 def _is_known(verdict: Path) -> bool:
@@ -107,5 +113,6 @@ def _end(code: int) -> str:
     if code == -signal.SIGKILL:
         return "was killed (out of memory?)"
     if code < 0:
-        return f"dies of it ({signal.Signals(-code).name})"
+        names = {each.value: each.name for each in signal.Signals}
+        return f"dies of it ({names.get(-code, f'signal {-code}')})"
     return f"dies of it (exit code {code})"

@@ -27,7 +27,8 @@ def main(model: str, inputs: str, steps: str, *disabled: str) -> None:
     )
     if steps != "run":
         return
-    feeds = dict(np.load(inputs, allow_pickle=False))
+    names, *arrays = np.load(inputs, allow_pickle=False).values()
+    feeds = dict(zip(map(str, names), arrays, strict=True))
     for port in session.get_inputs():
         if port.name not in feeds:
             word = port.type.removeprefix("tensor(").removesuffix(")")
