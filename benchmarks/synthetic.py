@@ -191,7 +191,9 @@ def _points(build: Builder, tokens: str) -> str:
     return build.add("Mul", picked, build.constant(1.0, np.float32))
 
 
-BLOCKS: tuple[Callable[[Builder, str], str], ...] = (
+Block = Callable[[Builder, str], str]
+
+BLOCKS: tuple[Block, ...] = (
     _convolution,
     _attention,
     _feed_forward,
@@ -200,17 +202,20 @@ BLOCKS: tuple[Callable[[Builder, str], str], ...] = (
 )
 
 
-def synthetic(nodes: int, seed: int = 0) -> onnx.ModelProto:
+def synthetic(
+    nodes: int, seed: int = 0, blocks: Sequence[Block] = BLOCKS
+) -> onnx.ModelProto:
     """Build a graph of at least so many nodes (at most one block more).
 
     Args:
         nodes: Constant nodes included, as an exporter counts.
         seed: of the weights.
+        blocks: which kinds, in turn.
     """
     build = Builder(np.random.default_rng(seed))
     tokens, count = "tokens", 0
     while len(build.nodes) < nodes:
-        block = BLOCKS[count % len(BLOCKS)]
+        block = blocks[count % len(blocks)]
         build.scope = f"/stage.{count // 25}/layers.{count}{block.__name__}"
         tokens = block(build, tokens)
         count += 1

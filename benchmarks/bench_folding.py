@@ -1,0 +1,125 @@
+"""Exact passes beside onnxsim and onnxslim, on graphs like the original exports.
+
+    python -m benchmarks.bench_folding            # 8,000 and 30,000 nodes
+    python -m benchmarks.bench_folding --price    # what a node, a MAC, a byte take
+
+Each tool works in a process of its own, from file to file: CPU seconds of the whole
+process, imports included, and its largest resident set. Outputs are compared with the
+original's on one random frame.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+
+from benchmarks.bench_exact_passes import Job, error, nodes, onnxsim, onnxslim, ours
+from benchmarks.exported import exported
+from benchmarks.synthetic import TOKENS, WIDTH
+
+TOOLS = {"ours": ours, "onnxsim": onnxsim, "onnxslim": onnxslim}
+SIZES = (8_000, 30_000)
+
+
+def work_alone(tool: str, source: Path, target: Path) -> None:
+    """Run one tool here; the last line says what the process took."""
+    TOOLS[tool](Job(source, target, "", None))()
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    taken = {"cpu_s": time.process_time(), "rss_mb": used.ru_maxrss / 1024}
+    print(json.dumps(taken))
+
+
+def run(tool: str, source: Path, target: Path) -> dict[str, float]:
+    words = [sys.executable, "-m", "benchmarks.bench_folding", "--tool", tool]
+    done = subprocess.run(
+        [*words, str(source), str(target)], capture_output=True, text=True, check=True
+    )
+    found: dict[str, float] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
+
+
+def outputs(path: Path) -> list[np.ndarray]:
+    tokens = np.random.default_rng(1).normal(size=(1, TOKENS, WIDTH))
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    return list(session.run(None, {"tokens": tokens.astype(np.float32)}))
+
+
+def compare(count: int, tools: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        source = Path(scratch) / "source.onnx"
+        model = exported(count)
+        onnx.save(model, source)
+        print(f"\n{len(model.graph.node):,} nodes, {source.stat().st_size:,} bytes")
+        print(f"{'':9} {'nodes':>6} {'bytes':>11} {'CPU s':>6} {'RSS MB':>7}  error")
+        want = outputs(source)
+        for tool in tools:
+            target = Path(scratch) / f"{tool}.onnx"
+            taken = run(tool, source, target)
+            off = error(want, outputs(target))
+            print(
+                f"{tool:9} {nodes(target):6} {target.stat().st_size:11,}"
+                f" {taken['cpu_s']:6.1f} {taken['rss_mb']:7.0f}  {off:.1e}"
+            )
+
+
+def price() -> None:
+    """Time many small nodes, one large product and one large sum."""
+    port, kind = onnx.helper.make_tensor_value_info, onnx.TensorProto.FLOAT
+
+    def seconds(op: str, depth: int, shape: list[int]) -> float:
+        names = ["x", *(f"v{i}" for i in range(depth))]
+        made = [
+            onnx.helper.make_node(op, [names[i], "w"], [names[i + 1]])
+            for i in range(depth)
+        ]
+        ports = [port("x", kind, shape), port("w", kind, shape)]
+        body = onnx.helper.make_graph(made, "g", ports, [port(names[-1], kind, shape)])
+        model = onnx.helper.make_model(
+            body, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8
+        )
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 2
+        session = onnxruntime.InferenceSession(model.SerializeToString(), options)
+        feeds = {name: np.ones(shape, np.float32) for name in ("x", "w")}
+        best = float("inf")
+        for _ in range(7):
+            start = time.perf_counter()
+            session.run(None, feeds)
+            best = min(best, time.perf_counter() - start)
+        return best / depth
+
+    node_s = seconds("Add", 1000, [4])
+    product_s, sum_s = seconds("MatMul", 4, [1024, 1024]), seconds("Add", 8, [1 << 22])
+    print(f"a node       {1e6 * node_s:8.2f} us")
+    print(f"a product    {1024**3 / product_s / 1e9:8.1f} GMAC/s")
+    print(f"a sum        {3 * (4 << 22) / sum_s / 1e9:8.1f} GB/s")
+    print(f"MACs a node  {1024**3 / product_s * node_s:10,.0f}")
+    print(f"bytes a node {3 * (4 << 22) / sum_s * node_s:10,.0f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("files", type=Path, nargs="*", help=argparse.SUPPRESS)
+    parser.add_argument("--tool", choices=list(TOOLS), help="that one alone")
+    parser.add_argument("--nodes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--price", action="store_true")
+    given = parser.parse_args()
+    if given.files:
+        work_alone(given.tool, *given.files)
+    elif given.price:
+        price()
+    else:
+        for count in given.nodes:
+            compare(count, [given.tool] if given.tool else list(TOOLS))
+
+
+if __name__ == "__main__":
+    main()
