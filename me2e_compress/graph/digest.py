@@ -63,7 +63,7 @@ def _attribute(seal: "hashlib.blake2b", attribute: ir.Attr) -> None:
         for graph in attribute.as_graphs():
             _graph(seal, graph)
     elif attribute.type == ir.AttributeType.TENSOR:
-        seal.update(_tensor(attribute.as_tensor()))
+        seal.update(_tensor(attribute.value))  # as_tensor() checks a protocol: slow
     elif attribute.type == ir.AttributeType.TENSORS:
         for tensor in attribute.as_tensors():
             seal.update(_tensor(tensor))

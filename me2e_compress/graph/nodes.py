@@ -1,7 +1,7 @@
 """Facts about nodes and values: who makes, who reads, and what constants hold."""
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -41,9 +41,33 @@ def opset_of(imports: ir.Model | ir.Function) -> int:
 
 def nodes_of(model: ir.Model) -> Iterator[ir.Node]:
     """Walk the nodes of the graph, of its bodies and of its functions."""
-    yield from model.graph.all_nodes()
+    yield from nodes_in(model.graph)
     for function in model.functions.values():
-        yield from function.all_nodes()
+        yield from nodes_in(function)
+
+
+def nodes_in(graph: ir.Graph | ir.Function) -> Iterator[ir.Node]:
+    """Walk the nodes of a graph, those of its bodies behind the node that has them."""
+    for node in graph:
+        yield node
+        for body in _bodies(node):
+            yield from nodes_in(body)
+
+
+_WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
+"""The operators of ONNX that have bodies; to look for them in others takes time."""
+
+
+def _bodies(node: ir.Node) -> Sequence[ir.Graph]:
+    if node.op_type not in _WITH_BODIES and is_standard(node):
+        return ()
+    found: list[ir.Graph] = []
+    for attribute in node.attributes.values():
+        if attribute.type == ir.AttributeType.GRAPH:
+            found.append(attribute.as_graph())
+        elif attribute.type == ir.AttributeType.GRAPHS:
+            found.extend(attribute.as_graphs())
+    return found
 
 
 def input_at(node: ir.Node, index: int) -> ir.Value | None:
@@ -66,12 +90,8 @@ def graphs_of(graph: ir.Graph) -> Iterator[ir.Graph]:
     """Walk a graph and all the graphs inside its nodes, outermost first."""
     yield graph
     for node in graph:
-        for attribute in node.attributes.values():
-            if attribute.type == ir.AttributeType.GRAPH:
-                yield from graphs_of(attribute.as_graph())
-            elif attribute.type == ir.AttributeType.GRAPHS:
-                for inner in attribute.as_graphs():
-                    yield from graphs_of(inner)
+        for body in _bodies(node):
+            yield from graphs_of(body)
 
 
 def array_of(value: ir.Value | None) -> npt.NDArray[np.generic] | None:

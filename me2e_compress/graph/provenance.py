@@ -6,11 +6,12 @@ keeps metadata. The manager refuses a pass that loses it.
 
 import dataclasses
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.nodes import nodes_in
 
 MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
 
@@ -92,7 +93,7 @@ def missing(model: ir.Model) -> list[str]:
     """List the nodes of the main graph without provenance."""
     return [
         node.name or node.op_type
-        for node in _nodes_of(model.graph)
+        for node in nodes_in(model.graph)
         if MODULE not in node.metadata_props or ORIGINS not in node.metadata_props
     ]
 
@@ -127,11 +128,11 @@ def foreign(before: ir.Model, after: ir.Model) -> list[str]:
     """
     if missing(before):
         return []
-    texts = {node.metadata_props[ORIGINS] for node in _nodes_of(before.graph)}
-    names = {name for node in _nodes_of(before.graph) for name in _names(node, ORIGINS)}
+    texts = {node.metadata_props[ORIGINS] for node in nodes_in(before.graph)}
+    names = {name for node in nodes_in(before.graph) for name in _names(node, ORIGINS)}
     return [
         node.name or node.op_type
-        for node in _nodes_of(after.graph)
+        for node in nodes_in(after.graph)
         if node.metadata_props[ORIGINS] not in texts
         and not names.issuperset(_names(node, ORIGINS))
     ]
@@ -139,28 +140,14 @@ def foreign(before: ir.Model, after: ir.Model) -> list[str]:
 
 def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
     known: dict[str | None, ir.Node] = {}
-    for node in _nodes_of(before.graph):
+    for node in nodes_in(before.graph):
         known.setdefault(node.name, node)  # where two bear a name, the first keeps it
     return [
         node
-        for node in _nodes_of(after.graph)
+        for node in nodes_in(after.graph)
         if f'"{by}"' not in node.metadata_props.get(PASSES, "")
         and not _same(known.get(node.name), node)
     ]
-
-
-def _nodes_of(graph: ir.Graph) -> Iterator[ir.Node]:
-    """Walk all nodes, those of bodies too; few operators of ONNX have a body."""
-    for node in graph:
-        yield node
-        if node.domain in ("", "ai.onnx") and node.op_type not in _WITH_BODIES:
-            continue
-        for attribute in node.attributes.values():
-            if attribute.type == ir.AttributeType.GRAPH:
-                yield from _nodes_of(attribute.as_graph())
-            elif attribute.type == ir.AttributeType.GRAPHS:
-                for body in attribute.as_graphs():
-                    yield from _nodes_of(body)
 
 
 def _same(old: ir.Node | None, new: ir.Node) -> bool:
@@ -177,6 +164,5 @@ def _same(old: ir.Node | None, new: ir.Node) -> bool:
     )
 
 
-_WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
 _BODIES = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
 """Kinds of attributes whose nodes are looked at one by one."""

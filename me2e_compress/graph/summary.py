@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import onnx_ir as ir
 
 from me2e_compress.graph.macs import macs_counter, total_macs
+from me2e_compress.graph.nodes import nodes_in
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Size:
 
 def size(model: ir.Model) -> Size:
     """Measure a graph."""
-    found, unknown = total_macs(map(macs_counter(model), model.graph.all_nodes()))
+    found, unknown = total_macs(map(macs_counter(model), nodes_in(model.graph)))
     return Size(
         nodes=node_count(model),
         weight_bytes=sum(
@@ -67,10 +68,10 @@ def node_count(model: ir.Model) -> int:
         if function is None:
             return 1
         if key not in bodies:
-            bodies[key] = sum(count(inner) for inner in function.all_nodes())
+            bodies[key] = sum(count(inner) for inner in nodes_in(function))
         return bodies[key]
 
-    return sum(count(node) for node in model.graph.all_nodes())
+    return sum(count(node) for node in nodes_in(model.graph))
 
 
 def _ports(values: Iterable[ir.Value]) -> tuple[Port, ...]:

@@ -18,6 +18,7 @@ from me2e_compress.errors import (
     PreconditionError,
     VerificationError,
 )
+from me2e_compress.graph.nodes import has_subgraph
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
@@ -146,14 +147,14 @@ class _Books:
         interface = graph.interface(result.model)
         if result.changes:
             graph.infer_shapes(result.model)
-        stale = any(True for _ in result.model.graph.subgraphs())
+        stale = any(has_subgraph(node) for node in result.model.graph)
         stale |= graph.interface(result.model) != interface  # an output has a shape now
         self._digest = graph.digest(result.model) if stale else found.digest
         self._enter(current, result, process_time() - start)
-        if current.exact:
-            self._stretch.append((current, model))
-        else:
+        if not current.exact:
             self.lossy.append(LossyPass(current, model, result.changes))
+        elif self.manager.verify_frames:  # else nobody asks for the graph before
+            self._stretch.append((current, model))
         return result.model
 
     def verify(self, model: ir.Model) -> None:

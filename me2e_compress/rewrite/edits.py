@@ -8,13 +8,13 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import graphs_of, provenance
-from me2e_compress.graph.nodes import Array, is_read
+from me2e_compress.graph.nodes import Array, is_read, nodes_in
 
 
 def value_names(graph: ir.Graph) -> set[str]:
     """Collect the names of all values of a graph and of the bodies inside it."""
     names: set[str] = set()
-    for body in (graph, *graph.subgraphs()):
+    for body in graphs_of(graph):
         names.update(value.name or "" for value in body.inputs)
         names.update(body.initializers)
         names.update(value.name or "" for node in body for value in node.outputs)
@@ -179,6 +179,8 @@ def lift_constants(model: ir.Model) -> int:
     have no initializers. Counts the nodes that went.
     """
     before = _constants(model)
+    if not before:
+        return 0
     for node in before:
         _spell_strings(node)
     common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)(model)
@@ -188,7 +190,7 @@ def lift_constants(model: ir.Model) -> int:
 def _constants(model: ir.Model) -> list[ir.Node]:
     return [
         node
-        for node in model.graph.all_nodes()
+        for node in nodes_in(model.graph)
         if node.op_type == "Constant"
         and node.domain == ""
         and not node.outputs[0].is_graph_output()

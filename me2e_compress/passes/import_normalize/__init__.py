@@ -7,7 +7,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance
-from me2e_compress.graph.nodes import is_plugin, nodes_of
+from me2e_compress.graph.nodes import is_plugin, nodes_in, nodes_of
 from me2e_compress.graph.validity import PLUGIN_DOMAIN
 from me2e_compress.modules import assign
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -82,10 +82,10 @@ def with_own_domains(model: ir.Model) -> ir.Model:
         return model
     copy = model.clone()
     for body in _bodies(copy):
-        for node in body.all_nodes():
+        for node in nodes_in(body):
             if ORIGINAL_DOMAIN in node.metadata_props:
                 node.domain = node.metadata_props.pop(ORIGINAL_DOMAIN)
-        if all(node.domain != PLUGIN_DOMAIN for node in body.all_nodes()):
+        if all(node.domain != PLUGIN_DOMAIN for node in nodes_in(body)):
             body.opset_imports.pop(PLUGIN_DOMAIN, None)
     return copy
 
@@ -105,7 +105,7 @@ def _name_nodes(model: ir.Model, by: str) -> int:
     """
     count = 0
     for body in _bodies(model):
-        nodes = list(body.all_nodes())
+        nodes = list(nodes_in(body))
         reserved = {node.name for node in nodes if node.name}
         taken: set[str] = set()
         counters: dict[str, int] = {}
@@ -163,7 +163,7 @@ def _bare_plugins(body: ir.Graph | ir.Function, model: ir.Model) -> list[ir.Node
     """List the plugins of the default domain."""
     return [
         node
-        for node in body.all_nodes()
+        for node in nodes_in(body)
         if node.domain == ""
         and is_plugin(node)
         and node.op_identifier() not in model.functions
@@ -176,7 +176,7 @@ def _declare(model: ir.Model) -> int:
         model.ir_version = _FUNCTIONS_SINCE_IR
         count += 1
     for body in _bodies(model):
-        for node in body.all_nodes():
+        for node in nodes_in(body):
             if node.domain not in body.opset_imports:
                 body.opset_imports[node.domain] = 1
                 count += 1

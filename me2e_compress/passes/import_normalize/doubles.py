@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import nodes_of, provenance
+from me2e_compress.graph import graphs_of, nodes_of, provenance
 
 _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
 """Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
@@ -75,7 +75,7 @@ def _keeper(model: ir.Model) -> str:
 
 def _demote_weights(model: ir.Model) -> int:
     count = 0
-    for graph in (model.graph, *model.graph.subgraphs()):
+    for graph in graphs_of(model.graph):
         for value in graph.initializers.values():
             tensor = value.const_value
             if tensor is not None and tensor.dtype == ir.DataType.DOUBLE:
@@ -115,7 +115,7 @@ def _holds_double(node: ir.Node, attribute: ir.Attr) -> bool:
         node.domain == ""
         and attribute.type == ir.AttributeType.TENSOR
         and not attribute.is_ref()
-        and attribute.as_tensor().dtype == ir.DataType.DOUBLE
+        and attribute.value.dtype == ir.DataType.DOUBLE
     )
 
 
@@ -143,7 +143,7 @@ def _single(kind: ir.TypeProtocol) -> ir.TypeProtocol:
 
 
 def _values(model: ir.Model) -> Iterator[ir.Value]:
-    for graph in (model.graph, *model.graph.subgraphs()):
+    for graph in graphs_of(model.graph):
         yield from graph.inputs
         yield from graph.initializers.values()
     for function in model.functions.values():
