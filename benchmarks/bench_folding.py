@@ -16,14 +16,16 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
 
-from benchmarks.bench_exact_passes import Job, error, nodes, onnxsim, onnxslim, ours
+from benchmarks.bench_exact_passes import Job, error, onnxsim, onnxslim, ours
 from benchmarks.exported import exported
 from benchmarks.synthetic import TOKENS, WIDTH
+from me2e_compress import graph
 
 TOOLS = {"ours": ours, "onnxsim": onnxsim, "onnxslim": onnxslim}
 SIZES = (8_000, 30_000)
@@ -46,7 +48,7 @@ def run(tool: str, source: Path, target: Path) -> dict[str, float]:
     return found
 
 
-def outputs(path: Path) -> list[np.ndarray]:
+def outputs(path: Path) -> list[Any]:
     tokens = np.random.default_rng(1).normal(size=(1, TOKENS, WIDTH))
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     return list(session.run(None, {"tokens": tokens.astype(np.float32)}))
@@ -58,14 +60,15 @@ def compare(count: int, tools: list[str]) -> None:
         model = exported(count)
         onnx.save(model, source)
         print(f"\n{len(model.graph.node):,} nodes, {source.stat().st_size:,} bytes")
-        print(f"{'':9} {'nodes':>6} {'bytes':>11} {'CPU s':>6} {'RSS MB':>7}  error")
+        print(f"{'':9} {'nodes':>6} {'weights':>11} {'CPU s':>6} {'RSS MB':>7}  error")
         want = outputs(source)
         for tool in tools:
             target = Path(scratch) / f"{tool}.onnx"
             taken = run(tool, source, target)
             off = error(want, outputs(target))
+            made = graph.size(graph.load(target))
             print(
-                f"{tool:9} {nodes(target):6} {target.stat().st_size:11,}"
+                f"{tool:9} {made.nodes:6} {made.weight_bytes:11,}"
                 f" {taken['cpu_s']:6.1f} {taken['rss_mb']:7.0f}  {off:.1e}"
             )
 
