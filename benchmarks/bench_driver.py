@@ -3,6 +3,7 @@
     python -m benchmarks.bench_driver OUT [--only NAME ...] [--workers N] [--routes N]
                                           [--model M.onnx] [--frames F --held-out H]
                                           [--target tensorrt|onnxruntime]
+                                          [--rules safe|paper]
 
 Studies, one after the other: baselines (expert, blind, the driver), ablation (each
 module away), pairs (two away), schemes (float to int8, at no latency and at each
@@ -75,6 +76,7 @@ class Bench:
     frames: Path
     held_out: Path
     target: str | None = None
+    rules: str | None = None
 
     @property
     def float(self) -> Variant:
@@ -90,10 +92,11 @@ class Bench:
         return Variant(f"minus-{'-'.join(modules)}", self.model, recipe.parse(text))
 
     def compressed(self, name: str) -> Variant:
-        """Apply a recipe; its int8 is for the target, where one is chosen."""
+        """Apply a recipe; its int8 is for the target and by the rules, if chosen."""
         passes = recipe.load(name)
-        if self.target is not None and any(each.quantizes for each in passes):
-            passes = CompressOptions(target=self.target).passes(passes)
+        if any(each.quantizes for each in passes):
+            options = CompressOptions(target=self.target, rules=self.rules)
+            passes = options.passes(passes)
         return Variant(name, self.model, passes)
 
     def study(
@@ -261,6 +264,7 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, help="to calibrate on")
     parser.add_argument("--held-out", type=Path, help="for fidelity and latency")
     parser.add_argument("--target", help="of int8: tensorrt or onnxruntime")
+    parser.add_argument("--rules", help="of int8: safe or paper")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     shipped = load_routes()
@@ -275,6 +279,7 @@ def main() -> None:
             frames_of(given.frames, given.out / "frames", model, CALIBRATION),
             frames_of(given.held_out, held_out, model, HELD_OUT),
             given.target,
+            given.rules,
         )
         for name in given.only or STUDIES:
             print(f"\n## {name}\n", flush=True)

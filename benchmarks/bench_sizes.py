@@ -2,7 +2,7 @@
 
     python -m benchmarks.bench_sizes OUT [--model MODEL.onnx]
 
-The graph after the exact passes, in the three schemes, for both rule sets and targets.
+The graph after the exact passes: three schemes, two rule sets, both targets.
 How many bytes a scale takes does not depend on its value, so nothing is calibrated:
 every activation gets the range [-1, 1]. The files are for weighing alone, and are
 removed. The paper's export is another: sizes are compared as parts of the float file.
@@ -55,7 +55,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def placed(model: ir.Model, scheme: str, rules: str, target: str) -> ir.Model:
     """Make one variant, every range [-1, 1]."""
     chosen = QuantScheme.named(scheme, ModuleMap.load("vad"))
-    plan = make_plan(model, chosen, RULE_SETS.parse(rules))
+    costs = TARGETS.parse(target).costs
+    plan = make_plan(model, chosen, RULE_SETS.parse(rules), costs=costs)
     names = TARGETS.parse(target).tensors(plan, model)
     ranges = Ranges(dict.fromkeys(names, (-1.0, 1.0)), "none", 0, "", "")
     return TARGETS.parse(target).place(model, plan, ranges)
