@@ -170,6 +170,42 @@ def test_moves_between_float32_have_no_casts() -> None:
     assert casts(half) == 0
 
 
+def test_what_a_half_and_a_float_reader_share_is_moved_in_half() -> None:
+    text = (
+        "m (float[4] x, float[4] z) => (float[4] y, float[8] u)"
+        " { a = Concat<axis=0>(x, z)\n u = Identity(a)\n y = Relu(a) }"
+    ).replace("float[4] y", "float[8] y")
+    once = converted(text)
+
+    assert types_of(once)["Concat"] == "FLOAT16"
+    assert ConvertFloat16().run(once, Context(MODULES)).changes == 0
+
+
+def test_an_input_that_only_float32_reads_stays_float32() -> None:
+    half = converted(
+        "k (float[4] x, float[4] z) => (float[4] y, float[4] u)"
+        " { y = Relu(x)\n u = Exp(z) }",
+        keep_io=False,
+    )
+
+    assert [v.dtype for v in half.graph.inputs] == [HALF, FLOAT]
+    assert [v.dtype for v in half.graph.outputs] == [HALF, FLOAT]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "s = SplitToSequence(x)\n y = ConcatFromSequence<axis=0>(s)",
+        "i = BitCast<to=6>(x)\n y = BitCast<to=1>(i)",
+    ],
+)
+def test_what_is_no_number_of_one_type_stays(body: str) -> None:
+    text = f"s (float[4] x) => (float[4] y) {{ {body} }}"
+    model = bare(OPSET.replace("17", "26") + text, {})
+
+    assert check_pass(ConvertFloat16(), model).changes == 0
+
+
 def test_readers_share_a_cast() -> None:
     half = converted(
         "m (float[4,4] x) => (float[4,4] y, float[4,4] z)"
@@ -276,6 +312,17 @@ def test_back_to_float32() -> None:
         FLOAT, ir.DataType.INT64
     }  # fmt: skip
     assert ConvertFloat32().run(back, Context(MODULES)).changes == 0
+
+
+def test_casts_to_other_types_stay_what_they_are() -> None:
+    text = (
+        "h (float16[4] x) => (int32[4] y, float16[4] z)"
+        " { y = Cast<to=6>(x)\n a = Cast<to=1>(x)\n z = Cast<to=10>(a) }"
+    )
+    back = check_pass(ConvertFloat32(), bare(OPSET + text, {})).model
+    kinds = [value.dtype for value in back.graph.outputs]
+
+    assert kinds == [ir.DataType.INT32, HALF]
 
 
 def test_float32_inside_leaves_a_half_interface() -> None:

@@ -44,7 +44,8 @@ class ConvertFloat16(Pass):
     An int8 graph becomes int8 and float16: its scales are float16 then, from opset 19.
 
     Attributes:
-        keep_io: whether inputs, outputs and recurrent state stay in float32.
+        keep_io: whether inputs, outputs and recurrent state stay in float32; else they
+            are what reads and makes them.
         keep_ops: operators that stay in float32.
         keep_modules: modules that stay in float32.
         keep_nodes: globs over names of nodes that stay in float32.
@@ -79,7 +80,8 @@ class ConvertFloat16(Pass):
             )
         types = ElementTypes(model, FLOAT, HALF)
         wide = matching(model, self.keep_ops, self.keep_modules, self.keep_nodes)
-        wide = wide_nodes(model, types, context.frames) | wide
+        frames, io = context.frames, self.keep_io
+        wide = wide_nodes(model, types, frames, keep_io=io) | wide
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
         retyping = Retyping(model, types, self.name)
         retyping.run(narrow, keep_io=self.keep_io)

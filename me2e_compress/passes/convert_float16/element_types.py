@@ -7,12 +7,14 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress import rewrite
-from me2e_compress.graph import is_standard, opset_of, provenance
+from me2e_compress.graph import has_subgraph, is_standard, opset_of, provenance
 
 FLOAT, HALF = ir.DataType.FLOAT, ir.DataType.FLOAT16
 _ONNX = {FLOAT: "tensor(float)", HALF: "tensor(float16)"}
 _FIRST_ONLY = {"Resize": 1}
 """Operators whose later inputs are scales and regions: how many inputs hold data."""
+_BY_TYPE = frozenset({"BitCast", "Cast", "CastLike", "Optional", "OptionalGetElement"})
+"""Operators that mean something else in another type, or whose schema omits one."""
 
 
 class ElementTypes:
@@ -81,8 +83,11 @@ class ElementTypes:
         return name if _ONNX[self.wanted] in allowed else None
 
     def _schema(self, node: ir.Node) -> onnx.defs.OpSchema | None:
-        if not is_standard(node) or node.op_type in ("Cast", "CastLike"):
+        if not is_standard(node) or node.op_type in _BY_TYPE or has_subgraph(node):
             return None
+        values = [each for each in (*node.inputs, *node.outputs) if each is not None]
+        if not all(isinstance(v.type, ir.TensorType | None) for v in values):
+            return None  # sequences and optionals
         if not onnx.defs.has(node.op_type, self._opset, ""):
             return None
         return onnx.defs.get_schema(node.op_type, self._opset, "")
@@ -127,8 +132,11 @@ class Retyping:
         results = {
             node.outputs[index] for node in nodes for index in types.outputs(node)
         }
+        wanted = {(n, index) for n, indices in chosen.items() for index in indices}
         if not keep_io:
-            results.update(v for v in self._graph.inputs if v.dtype == types.source)
+            given = [v for v in self._graph.inputs if _is_read_as(v, wanted)]
+            results.update(given)
+            self.changed += len(given)
         uses = {
             value: [(node, index) for node, index in value.uses()]
             for value in self._float_values(results)
@@ -136,12 +144,11 @@ class Retyping:
         for value in results:
             value.type = ir.TensorType(types.wanted)  # clones share the old one
         for node in nodes:
-            if node.op_type == "Cast":
+            if node.op_type == "Cast" and node.outputs[0] in results:
                 node.attributes["to"] = ir.AttrInt64("to", types.wanted.value)
             if chosen[node] or any(each in results for each in node.outputs):
                 provenance.inherit(node, [node], by=self._by)
                 self.changed += 1
-        wanted = {(n, index) for n, indices in chosen.items() for index in indices}
         for value, users in uses.items():
             self._serve(value, users, wanted)
         self._outputs(results, keep_io=keep_io)
@@ -218,6 +225,12 @@ class Retyping:
         value.const_value = ir.tensor(array, name=value.name)
         value.type = ir.TensorType(self._types.wanted)
         self.changed += 1
+
+
+def _is_read_as(value: ir.Value, wanted: Collection[tuple[ir.Node, int]]) -> bool:
+    """Return whether every reader of an input wants it in the other type."""
+    uses = [(node, index) for node, index in value.uses()]
+    return bool(uses) and all(use in wanted for use in uses)
 
 
 def _converted(

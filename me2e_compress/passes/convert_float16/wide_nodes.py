@@ -30,9 +30,9 @@ _RESOLUTION = 2.0**-10
 
 _SUMS = frozenset(
     {
-        "CumSum", "Exp", "Log", "Mean", "Pow", "ReduceL1", "ReduceL2", "ReduceLogSum",
-        "ReduceLogSumExp", "ReduceMean", "ReduceProd", "ReduceSum", "ReduceSumSquare",
-        "Softplus", "Sum",
+        "CumSum", "Exp", "Log", "Mean", "MeanVarianceNormalization", "Pow", "ReduceL1",
+        "ReduceL2", "ReduceLogSum", "ReduceLogSumExp", "ReduceMean", "ReduceProd",
+        "ReduceSum", "ReduceSumSquare", "Softplus", "Sum",
     }
 )  # fmt: skip
 """Sums of many elements, squares and exponentials: they leave float16 on their way."""
@@ -59,7 +59,7 @@ _MOVES = frozenset(
 
 
 def wide_nodes(
-    model: ir.Model, types: ElementTypes, frames: Recording | None
+    model: ir.Model, types: ElementTypes, frames: Recording | None, *, keep_io: bool
 ) -> dict[ir.Node, str]:
     """Map the nodes of the main graph that must stay in float32 to the reason.
 
@@ -67,6 +67,7 @@ def wide_nodes(
         model: the graph, shapes and types inferred.
         types: which inputs of a node can be float16 at all.
         frames: measured for values that float16 does not hold; None measures none.
+        keep_io: whether inputs and outputs of the graph stay in float32.
     """
     places = position_arithmetic(model, constant_values(model))
     found: dict[ir.Node, str] = {}
@@ -78,7 +79,7 @@ def wide_nodes(
             found[node] = reason
     if frames is not None:
         found |= _by_ranges(model, types, found, frames)
-    return found | _between(model, found)
+    return found | _between(model, found, keep_io=keep_io)
 
 
 def matching(
@@ -173,23 +174,38 @@ def _by_ranges(
     }
 
 
-def _between(model: ir.Model, wide: Mapping[ir.Node, str]) -> dict[ir.Node, str]:
-    """Find what only moves elements between nodes in float32, or from an input."""
-    moved: set[ir.Node] = set()
+def _between(
+    model: ir.Model, wide: Mapping[ir.Node, str], *, keep_io: bool
+) -> dict[ir.Node, str]:
+    """Find what only moves elements between nodes in float32, inputs and outputs.
 
-    def given(value: ir.Value | None) -> bool:
-        maker = None if value is None else value.producer()
-        return maker is None or maker in wide or maker in moved
+    Of all that moves elements, what reads or is read by a node in float16 is struck
+    out, forth and back through the graph until nothing more is.
+    """
+    moves = {node: None for node in model.graph if node.op_type in _MOVES}
 
-    for node in model.graph:
+    def from_wide(node: ir.Node) -> bool:
         data = node.inputs if node.op_type == "Concat" else node.inputs[:1]
-        if node.op_type in _MOVES and all(map(given, data)):
-            moved.add(node)
-    found: dict[ir.Node, str] = {}
-    for node in reversed(model.graph):
-        readers = list(itertools.chain(*(v.consumers() for v in node.outputs)))
+        makers = [None if value is None else value.producer() for value in data]
+        return all(
+            keep_io if each is None else each in wide or each in moves
+            for each in makers
+        )
+
+    def to_wide(node: ir.Node) -> bool:
         outside = any(value.is_graph_output() for value in node.outputs)
-        inside = all(reader in wide or reader in found for reader in readers)
-        if node in moved and inside and (readers or outside):
-            found[node] = "moves numbers between nodes in float32"
-    return found
+        readers = itertools.chain(*(value.consumers() for value in node.outputs))
+        return (keep_io or not outside) and all(
+            each in wide or each in moves for each in readers
+        )
+
+    before = -1
+    while len(moves) != before:
+        before = len(moves)
+        for node in list(moves):
+            if not from_wide(node):
+                del moves[node]
+        for node in reversed(list(moves)):
+            if not to_wide(node):
+                del moves[node]
+    return dict.fromkeys(moves, "moves numbers between nodes in float32")
