@@ -51,7 +51,8 @@ def test_the_code_of_a_page_runs(page: Path, folder: Path, site: Path) -> None:
     script = folder / "page.py"
     code = "".join(block.text for block in blocks(page, "python"))
     script.write_text(BEFORE.get(page.stem, "") + code)
-    run([sys.executable, str(script)], folder, site)
+    cells = "exec(open('page.py', encoding='utf-8').read())"  # as in a notebook
+    run([sys.executable, "-c", cells], folder, site)
 
 
 @pytest.mark.parametrize(
