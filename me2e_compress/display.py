@@ -2,14 +2,29 @@
 
 import abc
 import html
+import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 AT_LEAST = "≥ or -: plugins and open shapes are not counted; inspect names them"
 """What a table says of MACs that are a lower bound."""
 
 MOST_ROWS = 30
 """Rows of a table in a notebook; the last line says how many more there are."""
+
+_UNSEEN = re.compile(
+    "[\x00-\x09\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f"
+    "\ud800-\udfff\ufeff\ufff9-\ufffb]"
+)
+"""Control characters but the end of a line, marks that turn the direction of writing,
+and halves of characters: they steer a terminal, or no file can hold them."""
+
+
+def printable(text: str) -> str:
+    """Write what cannot be seen in a text, but ends of lines, as escapes."""
+    return _UNSEEN.sub(
+        lambda found: found.group().encode("unicode_escape").decode(), text
+    )
 
 
 @dataclass(frozen=True)
@@ -49,12 +64,27 @@ class Table:
     words: int = 1
     details: str = ""
 
+    def printable(self) -> "Table":
+        """Return it with what cannot be seen as escapes; a name is on one line."""
+        rows = (
+            tuple(replace(each, text=_on_one_line(each.text)) for each in row)
+            for row in self.rows
+        )
+        return replace(
+            self,
+            title=_on_one_line(self.title),
+            rows=tuple(rows),
+            note=printable(self.note),
+            details=printable(self.details),
+        )
+
     def markdown(self) -> str:
-        """Write it as GitHub shows it, intervals in brackets."""
+        """Write it as GitHub shows it, intervals in brackets, every name escaped."""
         rule = "|---|" + "---:|" * (len(self.columns) - 1)
-        rows = [[_text(cell).replace("|", "\\|") for cell in row] for row in self.rows]
+        rows = [[in_markdown(_text(cell)) for cell in row] for row in self.rows]
         lines = [_line(self.columns), rule, *map(_line, rows)]
-        parts = [f"**{self.title}**", "\n".join(lines), *filter(None, [self.note])]
+        title = f"**{in_markdown(self.title)}**"
+        parts = [title, "\n".join(lines), *filter(None, [in_markdown(self.note)])]
         return "\n\n".join(parts) + "\n"
 
     def html(self) -> str:
@@ -153,6 +183,16 @@ class Displayed(abc.ABC):
 
 def _broken(lines: str) -> str:
     return "<br>".join(html.escape(line) for line in lines.splitlines())
+
+
+def in_markdown(text: str) -> str:
+    """Write a text so that Markdown shows it as it is: no HTML, no columns."""
+    lines = html.escape(printable(text), quote=False).splitlines()
+    return " ".join(lines).replace("|", "\\|")
+
+
+def _on_one_line(text: str) -> str:
+    return printable(text).replace("\n", "\\n")
 
 
 def _line(cells: Iterable[str]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
+from me2e_compress.display import printable
 from me2e_compress.errors import Me2eError
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
@@ -35,8 +36,6 @@ def main() -> int:
 
 
 def _run() -> int:
-    from rich.markup import escape
-
     from me2e_compress.cli.app import app
     from me2e_compress.cli.console import errors
     from me2e_compress.cli.verbosity import Verbosity, set_verbosity
@@ -45,8 +44,8 @@ def _run() -> int:
     try:
         app(standalone_mode=True, prog_name="me2e-compress")
     except (Me2eError, OSError) as error:
-        line = " ".join(str(error).split())
-        errors.print(f"me2e-compress: {escape(line)}", soft_wrap=True)
+        line = printable(" ".join(str(error).split()))
+        errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
         return 1
     return 0
 

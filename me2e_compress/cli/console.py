@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
@@ -23,6 +22,7 @@ from rich.text import Text
 
 from me2e_compress.cli.progress_lines import ProgressLines
 from me2e_compress.cli.verbosity import is_quiet, is_verbose
+from me2e_compress.display import printable
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Cell, Result, Table
 
@@ -49,9 +49,11 @@ def listening(*, stages: bool = False) -> Iterator[Listener]:
         yield Listener(ProgressLines(tell, stages=stages).on_progress, _warn)
         return
     bar = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
-        TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[what]}"),
+        TextColumn(
+            "{task.completed:.0f}/{task.total:.0f} {task.fields[what]}", markup=False
+        ),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
@@ -78,7 +80,7 @@ def _warn(line: str) -> None:
 def tell(line: str) -> None:
     """Print a line on stderr, as it stands; nothing if quiet."""
     if not is_quiet():
-        errors.print(escape(line), soft_wrap=True)
+        errors.print(printable(line), soft_wrap=True, markup=False)
 
 
 def show(
@@ -102,12 +104,12 @@ def show(
     for line in found.lines():
         say(line)
     for line in found.alerts():
-        console.print(Text(line, "bold"), soft_wrap=True)
+        console.print(Text(printable(line), "bold"), soft_wrap=True)
 
 
 def say(line: str) -> None:
     """Print a line as it stands."""
-    console.print(escape(line), soft_wrap=True)
+    console.print(printable(line), soft_wrap=True, markup=False)
 
 
 def print_table(content: Table) -> None:
@@ -115,6 +117,7 @@ def print_table(content: Table) -> None:
 
     Where its words do not fit side by side, a row is a few lines: no name is broken.
     """
+    content = content.printable()
     intervals = _is_wide() or _room(content, intervals=True) >= 0
     widths = _widths(content, intervals)
     console.print(Text(content.title, "bold"), soft_wrap=True)

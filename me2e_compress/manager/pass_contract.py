@@ -5,7 +5,7 @@ import dataclasses
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import VerificationError
+from me2e_compress.errors import GraphError, Me2eError, VerificationError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.shapes import refined
 from me2e_compress.graph.validity import refusal
@@ -46,6 +46,20 @@ def check_valid(name: str, model: ir.Model) -> None:
     _check_order(name, model.graph)
     if reason := refusal(model):
         raise VerificationError(f"{name} left an invalid graph: {reason}")
+
+
+def blame_file(name: str, before: ir.Model, found: Me2eError) -> None:
+    """Refuse a graph that was as invalid before the pass that left it invalid.
+
+    Raises:
+        GraphError: it was; no pass is to blame.
+    """
+    try:
+        check_valid(name, before)
+    except VerificationError as error:
+        if str(error) == str(found):
+            reason = str(error).partition(": ")[2] or str(error)
+            raise GraphError(f"not a valid ONNX graph: {reason}") from error
 
 
 def _check_claim(current: Pass, result: PassResult, *, changed: bool) -> None:

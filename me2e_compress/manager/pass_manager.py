@@ -139,6 +139,7 @@ class _Books:
         start = process_time()
         found = attempt(current, model, self.context, self._digest)
         if isinstance(found, PassError | VerificationError):
+            pass_contract.blame_file(current.name, model, found)
             raise self._with_reproducer(current, model, found) from found.__cause__
         if isinstance(found, Me2eError):
             raise found

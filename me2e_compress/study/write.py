@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_json
 from me2e_compress.study.outcome import StudyResult
@@ -49,7 +50,7 @@ def write_study(
     """
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
-    heading = f"# {outcome.study.title}\n\n"
+    heading = f"# {in_markdown(outcome.study.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -129,6 +129,8 @@ def check_folder(
         GraphError: it is a file or an input, or one of the files is an input.
     """
     read = list(inputs)
+    if not folder.resolve().name:
+        raise GraphError(f"{folder} is the root of all files: name a folder")
     if folder.exists() and not folder.is_dir():
         raise GraphError(f"{folder} is a file: name a folder for the output")
     if not folder.is_dir():

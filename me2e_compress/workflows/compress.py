@@ -265,8 +265,8 @@ def _write(
     seconds: float,
 ) -> CompressResult:
     """Write the graph and its plan; the report last, it vouches for the others."""
+    plan = plan_of(report.model)  # first: what the file brought may be none
     graph.save(with_own_domains(report.model), output)
-    plan = plan_of(report.model)
     if plan is not None:
         save_plan(plan, beside(output, "plan"))
     record = report.record(source, output) | loss_record(report, int8, loss)

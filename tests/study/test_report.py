@@ -135,7 +135,9 @@ def test_files_are_written_beside_each_other(
     written = write_study(found, tmp_path / "new" / "study")
 
     assert json.loads(written.record.read_text()) == found.to_json()
-    assert written.tables.read_text().startswith("# Slow & <fast>\n\n**Scoreboard, ")
+    assert written.tables.read_text().startswith(
+        "# Slow &amp; &lt;fast&gt;\n\n**Scoreboard, "
+    )
     assert written.report.read_text().startswith("<!doctype html>")
     assert len(list((tmp_path / "new" / "study").iterdir())) == 3
 

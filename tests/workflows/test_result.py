@@ -90,3 +90,22 @@ def test_markdown_keeps_its_columns() -> None:
     (made,) = Found(("a|b",)).tables()
 
     assert "| a\\|b | 3 |" in made.markdown()
+
+
+NASTY = "a\x1b[31m[red]|<b>\n\u202eb\udcff"
+
+
+def test_names_do_not_steer_a_terminal() -> None:
+    shown = table("t" + NASTY, ["name"], [[NASTY]], note="one\ntwo\x07").printable()
+
+    assert shown.rows[0][0].text == r"a\x1b[31m[red]|<b>\n\u202eb\udcff"
+    assert shown.title == r"ta\x1b[31m[red]|<b>\n\u202eb\udcff"
+    assert shown.note == "one\ntwo\\x07"
+
+
+def test_names_are_no_markup_in_markdown() -> None:
+    written = table("<i>", ["name"], [[NASTY]], note="a < b").markdown()
+
+    assert written.startswith("**&lt;i&gt;**")
+    assert r"| a\x1b[31m[red]\|&lt;b&gt; \u202eb\udcff |" in written
+    assert "a &lt; b" in written

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.errors import PassError
+from me2e_compress.errors import PassError, RecipeError
 from me2e_compress.graph import digest, load, node_count, save
 from me2e_compress.graph.restore import restore
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -38,12 +38,20 @@ class FoldWithOnnxsim(Pass):
 
     Attributes:
         timeout_s: seconds that onnxsim may take.
+
+    Raises:
+        RecipeError: it is no finite number above 0.
     """
 
     name: ClassVar[str] = "fold-with-onnxsim"
     exact: ClassVar[bool] = True
 
     timeout_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        """Check the time."""
+        if not 0.0 < self.timeout_s < float("inf"):
+            raise RecipeError(f"{self.name}: timeout_s {self.timeout_s:g} is no time")
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Fold a copy.
