@@ -8,6 +8,7 @@ import onnx_ir as ir
 from me2e_compress.graph import input_at
 from me2e_compress.graph.shapes import is_one_matrix
 from me2e_compress.quantization.find_attention import behind
+from me2e_compress.quantization.geometry import depth, is_few
 
 _POSITIONS: dict[str, tuple[int, ...]] = {
     "DeformConv": (2,),
@@ -80,8 +81,9 @@ def find_coordinates(
 
     From whatever takes positions (samplers, gathers, rotations) one walk goes back
     through arithmetic and changes of layout to the layers that they come from: sampling
-    offsets, reference points, refinements of boxes. It enters no node twice, so it is
-    linear in the graph. Sampling weights whose layer reads the same tensor as such a
+    offsets, reference points, refinements of boxes; and on through products that sum
+    over 4 numbers at most, which turn and shift points. It enters no node twice, so it
+    is linear in the graph. Sampling weights whose layer reads the same tensor as such a
     layer are mapped too.
 
     Args:
@@ -99,6 +101,8 @@ def find_coordinates(
         seen.add(node)
         if node.op_type in _LAYERS:
             found[node] = f"positions that {reader} reads come from it"
+        if node.op_type in _LAYERS and is_few(depth(node)):  # a matrix by points
+            queue.extend((each, reader) for each in node.inputs if each is not None)
         elif node.op_type in _ARITHMETIC:
             data = node.inputs[: _DATA_ONLY.get(node.op_type, len(node.inputs))]
             queue.extend((each, reader) for each in data if each is not None)

@@ -141,19 +141,19 @@ class _Flow:
         if not any(each in self._learned for each in reads):
             return True
         shape = open_shape(node.outputs[0])
-        return shape is not None and shape[-1:] != () and _few(shape[-1])
+        return shape is not None and shape[-1:] != () and is_few(shape[-1])
 
     def _passes(self, product: ir.Node) -> bool:
         """Return whether a product gives points or matrices, not features."""
         left, right = product.inputs[0], product.inputs[1]
         if left in self.sources and right in self.sources:
             return True
-        if not _few(_depth(product)):
+        if not is_few(depth(product)):
             return False
         one = left if left in self.sources else right
         if one is not None and one in self.sources and self.sources[one].is_matrix:
             return _is_stacked(one) or _is_small(product.outputs[0])
-        return _few(_width(product, flipped=one is right))
+        return is_few(_width(product, flipped=one is right))
 
 
 def _width(product: ir.Node, *, flipped: bool) -> int | None:
@@ -191,14 +191,15 @@ def _data(node: ir.Node) -> list[ir.Value | None]:
     return [input_at(node, index) for index in indices]
 
 
-def _few(size: int | None) -> bool:
+def is_few(size: int | None) -> bool:
+    """Return whether so many numbers may be one point's: homogeneous at most."""
     return size is not None and size <= WIDEST
 
 
 def _is_small(value: ir.Value) -> bool:
     """Return whether a value is a batch of matrices of a few rows and columns."""
     shape = open_shape(value)
-    return shape is not None and len(shape) > 1 and all(map(_few, shape[-2:]))
+    return shape is not None and len(shape) > 1 and all(map(is_few, shape[-2:]))
 
 
 def _is_stacked(value: ir.Value) -> bool:
@@ -210,12 +211,12 @@ def _is_stacked(value: ir.Value) -> bool:
     if shape is None or len(shape) < 2:
         return True
     rows, columns = shape[-2:]
-    if _few(rows) and _few(columns):
+    if is_few(rows) and is_few(columns):
         return columns in (3, 4) and rows in (2, 3, 4)
     return 4 in (rows, columns) and (rows or 0) % 4 == 0 and (columns or 0) % 4 == 0
 
 
-def _depth(product: ir.Node) -> int | None:
+def depth(product: ir.Node) -> int | None:
     """Return how many numbers a product sums over for each that it gives."""
     if product.op_type in ("Gemm", "MatMul"):
         return extent(product, weight=False).depth

@@ -344,3 +344,24 @@ def test_tensorrt_is_a_name_of_the_default() -> None:
 
     assert safe.decisions == alias.decisions == make_plan(model, HEAD).decisions
     assert safe.groups == alias.groups
+
+
+def test_what_turns_points_before_they_are_looked_up_is_a_position_too() -> None:
+    """A chain of products of small matrices, made of no input that is a matrix."""
+    text = (
+        OPSETS
+        + """
+    turned (float[1,18] can_bus, float[1,3,9,9] value, float[18,16] w,
+            float[4,400] cells) => (float[1,3,20,20] y)
+        <int64[2] square = {4, 4}, int64[1] axis = {0}, int64[1] zero = {0},
+         int64[1] two = {2}, int64[4] grid = {1, 20, 20, 2}> {
+        a = MatMul(can_bus, w) c = Cos(a) m = Reshape(c, square)
+        p = MatMul(m, cells) q = MatMul(m, p) xy = Slice(q, zero, two, axis)
+        t = Transpose(xy) g = Reshape(t, grid) y = GridSample(value, g)
+    }
+    """
+    )
+    model = net(text, {"w": np.ones((18, 16)), "cells": np.ones((4, 400))})
+    found = by_output(planned(model, "paper{extra=[coordinates], without=[gemv]}"))
+
+    assert (found["p"].rule, found["a"].rule) == ("coordinates", "coordinates")
