@@ -36,7 +36,9 @@ def rank_of(value: ir.Value | None) -> int | None:
     return None if value is None or value.shape is None else len(value.shape)
 
 
-def infer_shapes(model: ir.Model, *, strict: bool = False) -> None:
+def infer_shapes(
+    model: ir.Model, *, strict: bool = False, written: onnx.ModelProto | None = None
+) -> None:
     """Infer types and shapes by ONNX, data propagation included, in place.
 
     A node of an unknown domain stops nothing: what it gives keeps the shape that the
@@ -45,12 +47,19 @@ def infer_shapes(model: ir.Model, *, strict: bool = False) -> None:
     dimensions that the file leaves open become numbers: an exporter's symbol
     (``Gathery_dim_0``) hides what is known, and shape arithmetic behind it would stay.
 
+    Args:
+        model: the graph.
+        strict: refuse shapes that contradict each other.
+        written: this very graph by :func:`without_weights`; None writes it.
+
     Raises:
         onnx.shape_inference.InferenceError: strict, and shapes contradict each other.
     """
     try:
         proto = onnx.shape_inference.infer_shapes(
-            without_weights(model), strict_mode=strict, data_prop=True
+            without_weights(model) if written is None else written,
+            strict_mode=strict,
+            data_prop=True,
         )
     except (
         onnx.checker.ValidationError,

@@ -1,5 +1,8 @@
 """Whether ONNX's own checker takes a graph."""
 
+import contextlib
+from collections.abc import Iterator
+
 import onnx
 import onnx_ir as ir
 
@@ -11,7 +14,9 @@ PLUGIN_DOMAIN = "me2e.plugin"
 domain."""
 
 
-def refusal(model: ir.Model, *, plugins: bool = False) -> str | None:
+def refusal(
+    model: ir.Model, *, plugins: bool = False, written: onnx.ModelProto | None = None
+) -> str | None:
     """Return why ONNX's checker refuses a graph, in one line; None if it takes it.
 
     An output without a shape is let pass: exporters leave out what they do not know,
@@ -21,17 +26,36 @@ def refusal(model: ir.Model, *, plugins: bool = False) -> str | None:
         model: the graph; it stays as it is.
         plugins: whether operators of the default domain that ONNX does not have are
             taken for plugins, as TensorRT takes them.
+        written: this very graph by :func:`~me2e_compress.graph.shapes.without_weights`;
+            None writes it.
     """
     try:
-        proto = without_weights(_apart(model) if plugins else model)
-        for value in proto.graph.output:
-            if value.type.HasField("tensor_type"):
-                value.type.tensor_type.shape.SetInParent()
-        onnx.checker.check_model(proto)
+        if written is None:
+            written = without_weights(_apart(model) if plugins else model)
+        with _shaped(written):
+            onnx.checker.check_model(written)
     except (onnx.checker.ValidationError, ir.serde.SerdeError) as error:
         reason = str(error.__cause__ or error).strip()
         return reason.splitlines()[0] if reason else type(error).__name__
     return None
+
+
+@contextlib.contextmanager
+def _shaped(written: onnx.ModelProto) -> Iterator[None]:
+    """Give outputs without a shape an empty one as long as the checker looks."""
+    kinds = [value.type for value in written.graph.output]
+    bare = [
+        kind.tensor_type
+        for kind in kinds
+        if kind.HasField("tensor_type") and not kind.tensor_type.HasField("shape")
+    ]
+    for tensor in bare:
+        tensor.shape.SetInParent()
+    try:
+        yield
+    finally:
+        for tensor in bare:
+            tensor.ClearField("shape")
 
 
 def _apart(model: ir.Model) -> ir.Model:

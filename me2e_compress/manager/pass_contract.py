@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
@@ -12,7 +13,13 @@ from me2e_compress.graph.validity import refusal
 from me2e_compress.passes.base import Pass, PassResult
 
 
-def check(current: Pass, before: ir.Model, result: PassResult, known: str) -> str:
+def check(
+    current: Pass,
+    before: ir.Model,
+    result: PassResult,
+    known: str,
+    written: onnx.ModelProto | None = None,
+) -> str:
     """Check that a pass kept its contract.
 
     Args:
@@ -20,6 +27,7 @@ def check(current: Pass, before: ir.Model, result: PassResult, known: str) -> st
         before: the graph that a copy of was given to it; the interface is its own.
         result: what the pass returned.
         known: the digest of the graph before.
+        written: the graph after without its large weights; None writes it.
 
     Returns:
         The digest of the graph after.
@@ -33,18 +41,25 @@ def check(current: Pass, before: ir.Model, result: PassResult, known: str) -> st
     if not current.changes_interface:
         _check_interface(current, before, result)
     _check_provenance(current, before, result.model)
-    check_valid(current.name, result.model)
+    check_valid(current.name, result.model, written)
     return after
 
 
-def check_valid(name: str, model: ir.Model) -> None:
+def check_valid(
+    name: str, model: ir.Model, written: onnx.ModelProto | None = None
+) -> None:
     """Check that a graph is valid ONNX, in SSA form and topological order.
+
+    Args:
+        name: of who made it.
+        model: the graph.
+        written: the graph without its large weights; None writes it.
 
     Raises:
         VerificationError: it is not; the message names who left it so.
     """
     _check_order(name, model.graph)
-    if reason := refusal(model):
+    if reason := refusal(model, written=written):
         raise VerificationError(f"{name} left an invalid graph: {reason}")
 
 

@@ -21,6 +21,7 @@ from me2e_compress.errors import (
 from me2e_compress.graph.nodes import has_subgraph
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
+from me2e_compress.manager.attempt import attempt
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
@@ -147,7 +148,7 @@ class _Books:
         result = found.result
         interface = graph.interface(result.model)
         if result.changes:
-            graph.infer_shapes(result.model)
+            graph.infer_shapes(result.model, written=found.written)
         stale = any(has_subgraph(node) for node in result.model.graph)
         stale |= graph.interface(result.model) != interface  # an output has a shape now
         self._digest = graph.digest(result.model) if stale else found.digest
@@ -233,42 +234,6 @@ class _Books:
             folder, piece, to_text((current,)), self.context.seed, str(error)
         )
         return type(error)(f"{error}; reproducer ({len(piece.graph)} nodes): {where}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Checked:
-    """What a pass returned, found to keep its contract.
-
-    Attributes:
-        result: the graph and what to say about it.
-        digest: of the graph.
-    """
-
-    result: PassResult
-    digest: str
-
-
-def attempt(
-    current: Pass, model: ir.Model, context: Context, digest: str | None = None
-) -> Checked | Me2eError:
-    """Run a pass on a clone and check its contract; failures are values here.
-
-    Args:
-        current: the pass.
-        model: the graph, shapes inferred; it stays as it is.
-        context: what the pass may ask for.
-        digest: of the graph, if that is known.
-    """
-    known = graph.digest(model) if digest is None else digest
-    try:
-        result = current.run(model.clone(), context)
-        return Checked(result, pass_contract.check(current, model, result, known))
-    except Me2eError as error:
-        return error
-    except Exception as cause:  # whatever a pass may raise: chained, never swallowed
-        broken = PassError(f"{current.name} broke: {type(cause).__name__}: {cause}")
-        broken.__cause__ = cause
-        return broken
 
 
 def _bisect(
