@@ -98,7 +98,7 @@ def show(
         return
     for each in found.tables() if tables is None else tables:
         print_table(each)
-    if is_verbose():
+    if tables is None and is_verbose():
         for each in found.details():
             print_table(each)
     for line in found.lines():

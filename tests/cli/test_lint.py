@@ -41,6 +41,14 @@ def test_what_would_be_refused_is_listed_and_fails(
     assert "tensorrt refuses it, 3 errors; plugin 'a': own::Twist is neither" in line
 
 
+def test_the_verbose_see_every_node(
+    command: Command, twisted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("lint", twisted, "--shown", "1", "-v") == 1
+
+    assert "more" not in capsys.readouterr().out
+
+
 def test_findings_for_programs(
     command: Command, twisted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -246,3 +246,19 @@ def test_a_close_decision_says_so_without_markup(
     assert "[8,8]" in said
     assert "(near" in said
     assert "bold" not in said
+
+
+@pytest.mark.parametrize("words", [(), ("-v",), ("--nodes",), ("--nodes", "-v")])
+def test_nodes_are_listed_once_and_only_when_asked_for(
+    command: Command,
+    dense: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+) -> None:
+    place = ("--map", dense / "map.toml", "--scheme", "full")
+
+    assert command("plan", dense / "dense.onnx", *place, *words) == 0
+
+    said = capsys.readouterr().out
+    assert "Decisions by module and rule" in said
+    assert said.count("/plan_head/MatMul") == bool(words)

@@ -6,6 +6,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import show
+from me2e_compress.cli.verbosity import is_verbose
 from me2e_compress.workflows import lint as workflow
 
 TrtCheck = Annotated[
@@ -25,5 +26,6 @@ def lint(
 ) -> None:
     """Check a graph for the program that will run it; 1 if it would be refused."""
     found = workflow.lint(model, workflow.LintOptions(target, trt_check, sm))
-    show(found, as_json, found.tables(shown=shown))
+    most = len(found.findings) if is_verbose() else shown
+    show(found, as_json, found.tables(shown=most))
     found.check()

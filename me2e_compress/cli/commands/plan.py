@@ -47,5 +47,5 @@ def plan(
         force,
     )
     found = workflow.plan(model, output, against, options)
-    listed = found.details(every=every) if nodes or every else ()
-    show(found, as_json, (*found.tables(), *listed))
+    listed = (*found.tables(), *found.details(every=every))
+    show(found, as_json, listed if nodes or every else None)
