@@ -1,34 +1,60 @@
 """Write a recording: a folder of frames, whole or not there."""
 
+import dataclasses
 import json
 import os
 import shutil
-import tempfile
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
+from me2e_compress import documents
 from me2e_compress.errors import FramesError
+from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.frames import Array, Frame
 
 INDEX = "scenes.json"
 
 
+PROGRESS = "progress.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Begin:
+    """Where a recording goes on.
+
+    Attributes:
+        frame: the first frame that is missing; a scene begins there.
+        place: of that scene among those that its source tries, some of which may give
+            no frame.
+    """
+
+    frame: int = 0
+    place: int = 0
+
+
+Source: TypeAlias = Callable[[Begin], Iterable[Frame]]
+"""Makes the frames from the beginning of a scene on."""
+
+
 def write_recording(
-    folder: Path, frames: Iterable[Frame], about: Mapping[str, str | int]
+    folder: Path, source: Source, about: Mapping[str, str | int], key: str = ""
 ) -> Path:
     """Write a folder that `CalibrationSet` reads, all or nothing.
 
     One ``000000.npz`` a frame, keyed by input name, and ``scenes.json``, which says
     where scenes begin. A folder that holds an earlier recording of ours is replaced.
-    The same frames give the same bytes.
+    The same frames give the same bytes. Whole scenes of a run that was killed wait
+    beside the folder, and the same run goes on from them.
 
     Args:
         folder: To write.
-        frames: In order; the first starts a scene.
+        source: Of the frames; the first starts a scene.
         about: What ``scenes.json`` also says: the model, the seed.
+        key: What else decides the frames; a run goes on only from one of the same.
 
     Returns:
         The folder.
@@ -38,24 +64,79 @@ def write_recording(
     """
     _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
+    draft = _Draft(folder.with_name(f".{folder.name}.partial"), about, key)
     try:
-        draft.chmod(0o755)
-        scenes, count = list[int](), 0
-        for count, frame in enumerate(frames, 1):
-            _write_npz(draft / f"{count - 1:06d}.npz", frame.arrays)
-            if frame.starts_scene:
-                scenes.append(count - 1)
-        if not count:
+        for frame in source(draft.resume()):
+            draft.write(frame)
+        if not draft.scenes:
             raise FramesError(f"{folder}: there are no frames to write")
-        index = {"scenes": scenes, **about, "count": count}
-        (draft / INDEX).write_text(json.dumps(index, indent=1) + "\n")
+        draft.finish()
         if folder.exists():
             shutil.rmtree(folder)
-        os.replace(draft, folder)
+        os.replace(draft.folder, folder)
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        if len(draft.scenes) < 2:  # nothing to go on from
+            shutil.rmtree(draft.folder, ignore_errors=True)
     return folder
+
+
+class _Draft:
+    """A recording that is being made.
+
+    Args:
+        folder: that it is made in.
+        about: see :func:`write_recording`.
+        key: likewise.
+    """
+
+    def __init__(self, folder: Path, about: Mapping[str, str | int], key: str) -> None:
+        self.folder, self.about = folder, dict(about)
+        self.key = [key, self.about]
+        self.scenes: list[int] = []
+        self.places: list[int] = []
+        self.count = 0
+
+    def resume(self) -> Begin:
+        """Keep the whole scenes of an earlier run that made the same; else begin."""
+        kept = self._kept()
+        if kept is None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder.mkdir()
+            return Begin()
+        scenes, places = kept
+        self.scenes, self.places = scenes[:-1], places[:-1]
+        self.count = scenes[-1]
+        return Begin(scenes[-1], places[-1])
+
+    def _kept(self) -> tuple[list[int], list[int]] | None:
+        try:
+            found = documents.from_json((self.folder / PROGRESS).read_bytes())
+        except (OSError, documents.MalformedError):
+            return None
+        if not isinstance(found, dict) or found.get("key") != self.key:
+            return None
+        scenes, places = list(found["scenes"]), list(found["places"])
+        whole = all(self._frame(index).is_file() for index in range(scenes[-1]))
+        return (scenes, places) if whole else None
+
+    def write(self, frame: Frame) -> None:
+        """Write a frame; where a scene begins, those before are whole."""
+        if frame.starts_scene:
+            self.scenes.append(self.count)
+            self.places.append(frame.place)
+            record = {"scenes": self.scenes, "places": self.places}
+            write_json(self.folder / PROGRESS, {"key": self.key, **record})
+        _write_npz(self._frame(self.count), frame.arrays)
+        self.count += 1
+
+    def finish(self) -> None:
+        """Write the index: the folder is a recording now."""
+        index = {"scenes": self.scenes, **self.about, "count": self.count}
+        (self.folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
+        (self.folder / PROGRESS).unlink()
+
+    def _frame(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.npz"
 
 
 def _check_replaceable(folder: Path) -> None:

@@ -12,7 +12,9 @@ from me2e_compress.errors import Me2eError
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 """Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
-RESUMES = frozenset({"calibrate", "evaluate", "sensitivity", "study", "train"})
+RESUMES = frozenset(
+    {"calibrate", "evaluate", "frames", "sensitivity", "study", "train"}
+)
 """Commands that go on where they were interrupted."""
 
 

@@ -1,5 +1,6 @@
 """When a pass fails: the smallest piece of the graph on which it still fails."""
 
+import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -7,6 +8,9 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
+
+PIPELINE = "pipeline.txt"
+"""Says what fails, and by that whose folder it is."""
 
 Failing = Callable[[ir.Model], bool]
 
@@ -91,9 +95,21 @@ def _leaves(value: ir.Value, inside: set[ir.Node]) -> bool:
 def write(folder: Path, model: ir.Model, pipeline: str, seed: int, why: str) -> Path:
     """Write the piece, the pipeline that fails on it and the reason into a folder."""
     name = re.sub(r"[^a-z0-9]+", "-", pipeline.lower()).strip("-")[:60]
-    target = folder / f"reproducer-{name}"
+    target = _free(folder / f"reproducer-{name}", pipeline)
     target.mkdir(parents=True, exist_ok=True)
     graph.save(model, target / "model.onnx")
-    (target / "pipeline.txt").write_text(pipeline + "\n", encoding="utf-8")
+    (target / PIPELINE).write_text(pipeline + "\n", encoding="utf-8")
     (target / "why.txt").write_text(f"{why}\nseed {seed}\n", encoding="utf-8")
+    return target
+
+
+def _free(wanted: Path, pipeline: str) -> Path:
+    """Return a folder that is not there, or holds the reproducer of this pipeline."""
+    target, count = wanted, 1
+    while os.path.lexists(target):
+        about = target / PIPELINE
+        if about.is_file() and about.read_bytes() == f"{pipeline}\n".encode():
+            break
+        count += 1
+        target = wanted.with_name(f"{wanted.name}-{count}")
     return target

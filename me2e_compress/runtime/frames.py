@@ -18,11 +18,13 @@ class Frame:
         index: position in the recording, from 0.
         starts_scene: True where a new scene begins: recurrent state is reset here.
         arrays: one array for every input, by input name; recurrent ones may be missing.
+        place: of its scene among those that its source tried; some give no frame.
     """
 
     index: int
     starts_scene: bool
     arrays: dict[str, Array]
+    place: int = 0
 
     def __repr__(self) -> str:
         """Show index and shapes, not the pictures."""

@@ -4,8 +4,10 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-from me2e_compress.calibration.recording import write_recording
+from me2e_compress import graph
+from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.extras import need_closed_loop
@@ -94,6 +96,8 @@ def record_frames(
 ) -> Path:
     """Make frames of a stack or a driver and write them, all or nothing.
 
+    A run that was killed goes on after its last whole scene.
+
     Of ``vad-tiny`` a synthetic world is drawn; for ``highway``, or any ONNX file that
     keeps the policy contract, the expert drives fresh routes of highway-env.
 
@@ -125,36 +129,44 @@ def _recorded(
     if Path(source).is_file() or find(str(source)).trained:
         model = model_path(source)
         try_file(model, listener)
-        made = _driven(model, options)
+        make, of = _driven(model, options), graph.sha256_of(model)
     else:
-        made = _synthetic(str(source), options)
+        make, of = _synthetic(str(source), options), str(source)
     about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
 
-    def reported() -> Iterator[Frame]:
-        for frame in made:
+    def reported(begin: Begin) -> Iterator[Frame]:
+        for frame in make(begin):
             yield frame
             done = frame.index + 1
             listener.on_progress("frames", done, options.count, folder.name)
 
-    return write_recording(folder, reported(), about)
+    key = f"{__version__} {of} {options.count} {options.scene_length}"
+    return write_recording(folder, reported, about, key)
 
 
-def _driven(model: Path, options: FramesOptions) -> Iterator[Frame]:
+def _driven(model: Path, options: FramesOptions) -> Source:
     need_closed_loop("what frames of a driver need")
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
     from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 
-    length = options.scene_length
-    return driven_frames(
-        OnnxPolicy.open(model),
+    policy, length = OnnxPolicy.open(model), options.scene_length
+    return lambda begin: driven_frames(
+        policy,
         options.count,
         seed=options.seed,
         scene_length=DRIVEN_SCENE_LENGTH if length is None else length,
+        done=begin.frame,
+        first=begin.place,
     )
 
 
-def _synthetic(stack: str, options: FramesOptions) -> Iterator[Frame]:
+def _synthetic(stack: str, options: FramesOptions) -> Source:
     length = SCENE_LENGTH if options.scene_length is None else options.scene_length
-    made = synthetic(STACKS[stack], options.count, options.seed, length)
-    for index, arrays in enumerate(made):
-        yield Frame(index, index % length == 0, dict(arrays))
+
+    def make(begin: Begin) -> Iterator[Frame]:
+        first = begin.frame
+        made = synthetic(STACKS[stack], options.count, options.seed, length, first)
+        for index, arrays in enumerate(made, first):
+            yield Frame(index, index % length == 0, dict(arrays))
+
+    return make

@@ -24,8 +24,17 @@ SENSOR_NOISE = 2.0
 """Standard deviation of pixel noise, in 1 / 255."""
 
 
-def frames(spec: Stack, n: int, seed: int, scene_length: int = 8) -> Iterator[Frame]:
+def frames(
+    spec: Stack, n: int, seed: int, scene_length: int = 8, first: int = 0
+) -> Iterator[Frame]:
     """Make frames one by one, keyed by input name, without the recurrent inputs.
+
+    Args:
+        spec: The stack.
+        n: Frames in all.
+        seed: Of everything.
+        scene_length: Frames a scene.
+        first: The frame to begin with, the first of a scene.
 
     Raises:
         FramesError: A count below 1.
@@ -35,7 +44,8 @@ def frames(spec: Stack, n: int, seed: int, scene_length: int = 8) -> Iterator[Fr
             f"{n} frames in scenes of {scene_length}: both must be at least 1"
         )
     lidar2img = np.stack([camera.lidar2img() for camera in rig()])[None]
-    for scene, start in enumerate(range(0, n, scene_length)):
+    for start in range(first, n, scene_length):
+        scene = start // scene_length
         world = draw_world(np.random.default_rng([seed, scene]))
         for step in range(min(scene_length, n - start)):
             noise = np.random.default_rng([seed, scene, step + 1])

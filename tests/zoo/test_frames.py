@@ -23,6 +23,12 @@ def test_same_seed_same_numbers(scenes: list[Frame]) -> None:
         np.testing.assert_array_equal(again[name], array)
 
 
+def test_a_scene_is_the_same_whatever_was_made_before(scenes: list[Frame]) -> None:
+    again = next(frames(VAD_TINY, 3, seed=7, scene_length=2, first=2))
+    for name, array in scenes[2].items():
+        np.testing.assert_array_equal(again[name], array)
+
+
 def test_another_seed_another_world(scenes: list[Frame]) -> None:
     (other,) = frames(VAD_TINY, 1, seed=4, scene_length=2)
     assert not np.array_equal(other["img"], scenes[0]["img"])

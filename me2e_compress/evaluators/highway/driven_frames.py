@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -26,7 +27,13 @@ SEED_OFFSET = 1_000_000
 
 
 def driven_frames(
-    policy: OnnxPolicy, count: int, *, seed: int, scene_length: int = 16
+    policy: OnnxPolicy,
+    count: int,
+    *,
+    seed: int,
+    scene_length: int = 16,
+    done: int = 0,
+    first: int = 0,
 ) -> Iterator[Frame]:
     """Record what a model sees on fresh routes, every half second.
 
@@ -40,6 +47,8 @@ def driven_frames(
         count: Frames in all.
         seed: Of routes and stretches, 0 or more.
         scene_length: Frames a scene, fewer where the route ends before.
+        done: Frames that are there already, in whole scenes; the others are made.
+        first: Place of the route that the first missing scene is of.
 
     Yields:
         Frames keyed by the graph's input names, without the recurrent inputs.
@@ -53,15 +62,14 @@ def driven_frames(
         )
     if seed < 0:
         raise FramesError(f"seed {seed}: must be 0 or more")
-    done = 0
-    for place, route in enumerate(fresh_routes(seed)):
+    for place, route in enumerate(islice(fresh_routes(seed), first, None), first):
         random = np.random.default_rng([SEED_OFFSET + seed, place])
         spare_us = EXPERT_S[route.scenario] * 1_000_000 - scene_length * STEP_US
         begin_us = int(random.integers(0, max(1, spare_us // DT_US))) * DT_US
         for at, arrays in enumerate(
             _look(policy, route, begin_us, min(scene_length, count - done))
         ):
-            yield Frame(done, at == 0, arrays)
+            yield Frame(done, at == 0, arrays, place)
             done += 1
         if done == count:
             return

@@ -106,6 +106,17 @@ def test_same_seed_same_numbers(policy: OnnxPolicy, seen: list[Frame]) -> None:
             np.testing.assert_array_equal(array, other.arrays[name])
 
 
+def test_a_scene_is_the_same_whatever_was_made_before(
+    policy: OnnxPolicy, seen: list[Frame]
+) -> None:
+    last = seen[8]
+    again = driven_frames(policy, 10, seed=3, scene_length=4, done=8, first=last.place)
+    for one, other in zip(again, seen[8:], strict=True):
+        assert (one.index, one.starts_scene) == (other.index, other.starts_scene)
+        for name, array in one.arrays.items():
+            np.testing.assert_array_equal(array, other.arrays[name])
+
+
 def test_another_seed_other_routes() -> None:
     one, two = (itertools.islice(fresh_routes(seed), 3) for seed in (0, 1))
     assert {route.seed for route in one}.isdisjoint(route.seed for route in two)
