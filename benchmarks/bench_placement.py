@@ -183,7 +183,8 @@ def flipped(plan: QuantPlan, nodes: set[str], theirs: Reads) -> QuantPlan:
                 each, dtype=FLOAT, activations=(), weight=None, axis=None
             )
         reads = theirs[each.node]
-        if each.op in WEIGHTED and 1 in reads and each.rule != "weight":
+        computed = each.rule in ("weight", "attention-weights")
+        if each.op in WEIGHTED and 1 in reads and not computed:
             axis = 0 if each.op == "Gemm" else len(each.shapes[1] or (0, 0)) - 1
             return dataclasses.replace(
                 each, dtype=INT8, activations=(0,), weight=1, axis=axis

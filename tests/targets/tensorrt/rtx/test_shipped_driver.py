@@ -41,7 +41,7 @@ def quantized(model: ir.Model, scheme: str, rules: str) -> ir.Model:
     return placed
 
 
-@pytest.mark.parametrize("rules", RULE_SETS.names())
+@pytest.mark.parametrize("rules", ["safe", "paper"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_every_scheme_passes_the_lint(
     driver: ir.Model, scheme: str, rules: str
