@@ -16,12 +16,10 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
 from me2e_compress.graph.external import data_file, external_tensors, settle
 from me2e_compress.graph.opset import lower
+from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
-
-_PLAIN_INITIALIZERS_SINCE_IR = 4
-"""The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)."""
 
 _LOCATION = b"\n\x08location"
 """How a protobuf message begins that names a file of external data."""
@@ -55,7 +53,7 @@ def load(path: str | Path) -> ir.Model:
     settle(model, path)
     lower(model, path)
     common.RemoveInitializersFromInputsPass()(model)
-    model.ir_version = max(model.ir_version, _PLAIN_INITIALIZERS_SINCE_IR)
+    model.ir_version = max(model.ir_version, PLAIN_INITIALIZERS_SINCE_IR)
     return model
 
 

@@ -14,6 +14,10 @@ PLUGIN_DOMAIN = "me2e.plugin"
 domain."""
 
 
+PLAIN_INITIALIZERS_SINCE_IR = 4
+"""The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)."""
+
+
 def refusal(
     model: ir.Model, *, plugins: bool = False, written: onnx.ModelProto | None = None
 ) -> str | None:
@@ -32,7 +36,7 @@ def refusal(
     try:
         if written is None:
             written = without_weights(_apart(model) if plugins else model)
-        with _shaped(written):
+        with _lenient(written):
             onnx.checker.check_model(written)
     except (onnx.checker.ValidationError, ir.serde.SerdeError) as error:
         reason = str(error.__cause__ or error).strip()
@@ -41,8 +45,11 @@ def refusal(
 
 
 @contextlib.contextmanager
-def _shaped(written: onnx.ModelProto) -> Iterator[None]:
-    """Give outputs without a shape an empty one as long as the checker looks."""
+def _lenient(written: onnx.ModelProto) -> Iterator[None]:
+    """Give outputs without a shape an empty one as long as the checker looks.
+
+    Before IR version 4 every initializer had to be an input too: that is let pass.
+    """
     kinds = [value.type for value in written.graph.output]
     bare = [
         kind.tensor_type
@@ -51,9 +58,12 @@ def _shaped(written: onnx.ModelProto) -> Iterator[None]:
     ]
     for tensor in bare:
         tensor.shape.SetInParent()
+    version = written.ir_version
+    written.ir_version = max(version, PLAIN_INITIALIZERS_SINCE_IR)
     try:
         yield
     finally:
+        written.ir_version = version
         for tensor in bare:
             tensor.ClearField("shape")
 
