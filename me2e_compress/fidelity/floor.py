@@ -1,6 +1,7 @@
 """The floor under fidelity: what fell below it, and which outputs it cannot judge."""
 
 import dataclasses
+import math
 from collections.abc import Collection, Iterator
 
 import numpy as np
@@ -60,11 +61,12 @@ class Floor:
 
         Args:
             found: what was measured.
-            output: one of the outputs that were compared.
+            output: of the model; one that was not compared has no noise.
         """
         if found.plan is not None and output == found.plan_output:
             return found.plan.mean_m / self.plan_m
-        (sqnr,) = (each.sqnr_db for each in found.outputs if each.name == output)
+        names = {each.name: each.sqnr_db for each in found.outputs}
+        sqnr = names.get(output, math.inf)
         return float(min(10 ** ((self.sqnr_db - sqnr) / 20), MOST_EXCESS))
 
     def shortfalls(

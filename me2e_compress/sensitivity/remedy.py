@@ -70,8 +70,9 @@ class Remedy:
         )
 
 
-Measure: TypeAlias = Callable[[Sequence[Int8Node]], Fidelity]
-"""Builds the variant in which these nodes alone are float, and compares it."""
+Measure: TypeAlias = Callable[[Sequence[Int8Node], Sequence[Int8Node]], Fidelity]
+"""Builds the variant in which some nodes are float, and compares it; that, and the
+group that is being narrowed down: everything else is float. Without group: none is."""
 
 
 def int8_nodes(plan: QuantPlan) -> tuple[Int8Node, ...]:
@@ -149,7 +150,7 @@ class _Search:
             # A step of the bisection, and the trial that confirms it.
             if self._done + 2 > self._most or not self._keep(below[0]):
                 break
-            found = self._measure(self._floats())
+            found = self._measure(self._floats(), ())
         nodes = [each for each in self._alone if each.module not in self._modules]
         return Remedy(tuple(nodes), tuple(self._modules), found, below, self._done)
 
@@ -176,7 +177,7 @@ class _Search:
             middle = len(group) // 2
             first, second = group[:middle], group[middle:]
             floats = [each for each in self._nodes if each not in first]
-            one = self._floor.excess(self._measure(floats), worst.output)
+            one = self._floor.excess(self._measure(floats, group), worst.output)
             other = max(noise**2 - one**2, 0.0) ** 0.5
             if max(one, other) < BLAME * whole:
                 break
@@ -190,7 +191,9 @@ class _Search:
             if each in self._alone or each.module in self._modules
         ]
 
-    def _measure(self, floats: Sequence[Int8Node]) -> Fidelity:
+    def _measure(
+        self, floats: Sequence[Int8Node], group: Sequence[Int8Node]
+    ) -> Fidelity:
         self._progress(self._done, self._most, "")
         self._done += 1
-        return self._run(floats)
+        return self._run(floats, group)

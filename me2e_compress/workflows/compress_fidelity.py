@@ -1,7 +1,7 @@
 """What lossy passes did to a model, on frames kept out of calibration."""
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -18,10 +18,9 @@ from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.quantization.plan import QuantPlan, plan_of
 from me2e_compress.runtime.session import Session
-from me2e_compress.sensitivity.recipes import overrides_text
-from me2e_compress.sensitivity.remedy import Int8Node, Remedy, find_remedy, int8_nodes
-from me2e_compress.sensitivity.trials import keep_float
+from me2e_compress.sensitivity.remedy import Remedy, find_remedy, int8_nodes
 from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.remedy_trials import RemedyTrials
 
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
@@ -193,7 +192,8 @@ class _Measurement:
         """Try variants of the plan on as few frames as show the loss."""
         reference, start = self._fewer(reference, unsteady)
         with TemporaryDirectory(prefix="me2e-trial-") as folder:
-            trial = _Trial(quantizer, self.context, reference, Path(folder) / "o.toml")
+            path = Path(folder) / "overrides.toml"
+            trial = RemedyTrials(quantizer, self.context, reference, path)
             return find_remedy(
                 int8_nodes(plan),
                 start,
@@ -206,13 +206,9 @@ class _Measurement:
     def _fewer(
         self, reference: Reference, unsteady: Collection[str]
     ) -> tuple[Reference, Fidelity]:
-        """Take the first frame alone if it shows the loss; two where state is fed."""
-        count = 2 if reference.session.recurrent else 1
-        few = Reference(
-            reference.session,
-            tuple(islice(reference.frames, count)),
-            reference.answers[:count],
-        )
+        """Take the first frame alone if it shows the loss."""
+        first = tuple(islice(reference.frames, 1))
+        few = Reference(reference.session, first, reference.answers[:1])
         found = self._compare(few)
         if self.floor.shortfalls(found, unsteady):
             return few, found
@@ -223,23 +219,3 @@ class _Measurement:
 
     def _compare(self, reference: Reference) -> Fidelity:
         return reference.compare(Session(self.report.model, release=True))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Trial:
-    """The pass that quantized, run again with more nodes in float."""
-
-    quantizer: LossyPass
-    context: Context
-    reference: Reference
-    overrides: Path
-
-    def measure(self, floats: Sequence[Int8Node]) -> Fidelity:
-        """Build the variant and compare it; what the user decided still holds."""
-        asked = getattr(self.quantizer.applied, "overrides", None)
-        text = "" if asked is None else Path(asked).read_text(encoding="utf-8")
-        more = overrides_text(keep_float(each.name, "") for each in floats)
-        self.overrides.write_text(f"{text}\n{more}", encoding="utf-8")
-        again = self.quantizer.applied.with_options({"overrides": self.overrides})
-        made = again.run(self.quantizer.before.clone(), self.context).model
-        return self.reference.compare(Session(made, release=True))

@@ -14,7 +14,7 @@ NODES = [
 def made(noise: Mapping[int, float]) -> Measure:
     """Independent errors: the noise of each node, squares added; signal 1."""
 
-    def measure(floats: Sequence[Int8Node]) -> Fidelity:
+    def measure(floats: Sequence[Int8Node], group: Sequence[Int8Node]) -> Fidelity:
         power = 1e-9 + sum(
             noise.get(at, 0.0) ** 2
             for at, node in enumerate(NODES)
@@ -28,7 +28,7 @@ def made(noise: Mapping[int, float]) -> Measure:
 
 def search(noise: Mapping[int, float], most: int = 14) -> Remedy:
     measure = made(noise)
-    return find_remedy(NODES, measure([]), measure, Floor(20.0), most_trials=most)
+    return find_remedy(NODES, measure([], []), measure, Floor(20.0), most_trials=most)
 
 
 def test_one_node_among_many_is_found_in_a_trial_a_halving() -> None:
