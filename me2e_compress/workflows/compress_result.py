@@ -99,8 +99,8 @@ class CompressResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return what the report file holds."""
-        return self.record
+        """Return what the report file holds; the verdict, with times, is `lines`."""
+        return {key: each for key, each in self.record.items() if key != "verdict"}
 
 
 def beside(output: Path, what: str) -> Path:
