@@ -50,6 +50,10 @@ class Driver(abc.ABC):
             EvaluationError: It cannot drive.
         """
 
+    def resolved(self) -> "Driver":
+        """Return the driver that this one is another name for; else itself."""
+        return self
+
     @property
     def label(self) -> str:
         """What tables and pictures call it."""
@@ -98,7 +102,7 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
         MissingExtraError: The package that it needs is not installed.
     """
     if name_in(text) in POLICIES.names():
-        driver = POLICIES.parse(text)
+        driver = POLICIES.parse(text).resolved()
     else:
         driver = POLICIES.build(MODEL, {"path": text})
     if adapter is None or "adapter" not in type(driver).__dataclass_fields__:

@@ -12,6 +12,7 @@ from me2e_compress.passes import Pass
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study.definition import Condition, Study, Timing, Variant
 from me2e_compress.workflows.checks import model_path
+from me2e_compress.zoo.shipped import SHIPPED
 
 
 def load_study(path: str | Path, routes: str | None = None) -> Study:
@@ -131,6 +132,8 @@ class _Reader:
 
     def _variant(self, table: _Variant) -> Variant:
         policy, adapter = table.policy, table.adapter
+        if policy in SHIPPED:  # a file of that name beside the study wins
+            policy = str(model_path(policy, self.path.parent))
         driver = driver_named(policy)
         if isinstance(driver, OnnxDriver):
             policy = str(model_path(driver.path, self.path.parent))

@@ -15,9 +15,8 @@ class ShippedDriver(Driver):
 
     name: ClassVar[str] = "highway"
 
-    @property
-    def file(self) -> OnnxDriver:
-        """The same driver as the ONNX file that it is.
+    def resolved(self) -> Driver:
+        """Return the ONNX file that it is.
 
         Raises:
             GraphError: The file is missing or altered.
@@ -26,8 +25,8 @@ class ShippedDriver(Driver):
 
     def open(self) -> Policy:
         """Return the policy."""
-        return self.file.open()
+        return self.resolved().open()
 
     def fingerprint(self) -> str:
         """Return the digest of the file: results of either are the same."""
-        return self.file.fingerprint()
+        return self.resolved().fingerprint()
