@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -53,7 +53,7 @@ class ListResult(Result):
             table(
                 kind,
                 ("name", "what it is"),
-                [(each.name, _words(each, self.closely)) for each in found],
+                [row for each in found for row in _rows(each, self.closely)],
                 _added_to(kind),
                 words=2,
             )
@@ -145,16 +145,18 @@ def _added_to(kind: str) -> str:
     return "" if found is None else f"others add theirs by entry point: {found.group}"
 
 
-def _words(entry: Entry, closely: bool) -> str:
-    if entry.error:
-        return entry.error
+def _rows(entry: Entry, closely: bool) -> Iterator[tuple[str, str]]:
+    """Write the name with what it is, then the options on rows of their own."""
     theirs = "" if entry.source == _OURS else f" ({entry.source})"
-    said = [entry.doc + theirs]
+    yield entry.name, entry.error or _words(entry.doc + theirs)
     if closely:
-        said += [f"  {_signature(each)} {each.doc}" for each in entry.options]
+        yield from (("", _words(f"{_signature(e)} {e.doc}")) for e in entry.options)
     elif entry.options:
-        said.append(f"  {', '.join(map(_assignment, entry.options))}")
-    return "\n".join(said).replace("`", "")
+        yield "", _words(", ".join(map(_assignment, entry.options)))
+
+
+def _words(text: str) -> str:
+    return text.replace("`", "")
 
 
 def _assignment(option: Option) -> str:

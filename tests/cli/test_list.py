@@ -42,6 +42,7 @@ def test_one_kind_shows_what_its_options_mean(
     assert command("list", "observers") == 0
 
     text = " ".join(capsys.readouterr().out.split())
+    assert "\\n" not in text
     assert "percent: float = 99.99 above 0 and at most 100" in text
     assert "quantize-int8" not in text
 
