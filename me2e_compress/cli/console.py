@@ -163,15 +163,14 @@ def _widths(content: Table, intervals: bool) -> list[int] | None:
     least = _longest(content, intervals, True)
     most = _longest(content, intervals, False)
     spare = console.width - _frame(content) - sum(least)
-    wanted = sum(most) - sum(least)
     if spare < 0:
         return None
-    if wanted <= spare:
-        return most
-    return [
-        low + (high - low) * spare // wanted
-        for low, high in zip(least, most, strict=True)
-    ]
+    wanted = [high - low for low, high in zip(least, most, strict=True)]
+    # who wants little gets all of it, so that only long sentences wrap
+    for done, at in enumerate(sorted(range(len(wanted)), key=wanted.__getitem__)):
+        given = min(wanted[at], spare // (len(wanted) - done))
+        least[at], spare = least[at] + given, spare - given
+    return least
 
 
 def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:

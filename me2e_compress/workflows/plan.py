@@ -155,7 +155,7 @@ def plan(
         PreconditionError: the graph is quantized and carries no plan.
     """
     options = options or PlanOptions()
-    files = [model_path(model), *([] if against is None else [Path(against)])]
+    files = [model_path(model), *([] if against is None else [model_path(against)])]
     written = None if output is None else Path(output)
     inputs = (*files, options.overrides, options.module_map)
     with writing([written], inputs, force=options.force):

@@ -41,6 +41,15 @@ def test_words_that_fit_stand_in_columns(
     assert all(NODE in line for line in lines[3:4])
 
 
+def test_only_long_sentences_wrap(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = ("driving score", "72.22", "43.93 to 100.00", "5", "not measured: " * 4)
+    lines = printed(capsys, monkeypatch, 80, *row)
+
+    assert any("driving score" in each and "43.93 to 100.00" in each for each in lines)
+
+
 def test_words_that_do_not_fit_stand_below_each_other(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

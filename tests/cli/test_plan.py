@@ -248,6 +248,15 @@ def test_a_close_decision_says_so_without_markup(
     assert "bold" not in said
 
 
+def test_a_model_that_ships_is_compared_by_name(
+    command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = compressed(command, dense).with_name("out.plan.json")
+
+    assert command("plan", saved, "--against", "none.onnx") == 1
+    assert "none.onnx: no such file; models that ship" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [(), ("-v",), ("--nodes",), ("--nodes", "-v")])
 def test_nodes_are_listed_once_and_only_when_asked_for(
     command: Command,
