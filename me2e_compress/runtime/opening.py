@@ -39,6 +39,7 @@ REFUSALS: tuple[type[Exception], ...] = (
     _native.NoSuchFile,
     _native.NotImplemented,
     _native.RuntimeException,
+    UnicodeDecodeError,  # a message about names that are not UTF-8
     RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
 )
 """Everything raised where a graph cannot be read, built or run."""

@@ -115,9 +115,13 @@ class Session:
             self._ort, self._lent = open_graph(model, options, without)
         else:
             self._ort, self._lent = open_file(model, options, without)
-        self.inputs = _ports(self._ort.get_inputs())
-        self.outputs = _ports(self._ort.get_outputs())
-        self.metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
+        try:
+            self.inputs = _ports(self._ort.get_inputs())
+            self.outputs = _ports(self._ort.get_outputs())
+            metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
+        except UnicodeDecodeError as error:
+            raise GraphError(f"a name in the graph is not UTF-8: {error}") from error
+        self.metadata = metadata
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
     def run(

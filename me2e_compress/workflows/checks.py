@@ -15,6 +15,9 @@ from me2e_compress.modules import ModuleMap, map_of
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
+LARGEST = 1e15
+"""The largest number of an option: beyond, milliseconds are no whole microseconds."""
+
 Given: TypeAlias = str | Path | None
 """An input as the user names it; a word that does not name a file is harmless."""
 
@@ -179,12 +182,15 @@ def check_number(option: str, value: float | None, *, zero: bool = False) -> Non
         zero: whether 0 will do too.
 
     Raises:
-        RecipeError: it is NaN, infinite or too small.
+        RecipeError: it is NaN, infinite, too small or beyond `LARGEST`.
     """
-    if value is None or (math.isfinite(value) and (value > 0 or (zero and value == 0))):
+    if value is None or 0 < value <= LARGEST or (zero and value == 0):
         return
     least = "0 or above" if zero else "above 0"
-    raise RecipeError(f"{option} is {value:g}: it must be a finite number {least}")
+    most = f", {LARGEST:g} at most" if math.isfinite(value) and value > 0 else ""
+    raise RecipeError(
+        f"{option} is {value:g}: it must be a finite number {least}{most}"
+    )
 
 
 def check_count(option: str, value: int, least: int = 0) -> None:

@@ -9,7 +9,7 @@ from tests.cli.conftest import Command
 F = "dense.onnx frames -o out"
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-1"])
+@pytest.mark.parametrize("value", ["nan", "inf", "-1", "1e+308"])
 @pytest.mark.parametrize(
     ("line", "option"),
     [

@@ -186,6 +186,14 @@ def cache_cases() -> Iterator[Case]:
         yield Case(f"shard-{name}", merge, {"bad.npz": content})
 
 
+def session_cases() -> Iterator[Case]:
+    """Yield names that are not UTF-8, which onnxruntime repeats in its messages."""
+    content = graphs.seed_graph().SerializeToString()
+    broken = content.replace(b"memory_out", b"memo\xb7y_out")
+    for opener in ("evaluate", "compare", "profile", "calibrate"):
+        yield Case(f"{opener}-utf-8", OPENERS[opener], {"bad.onnx": broken})
+
+
 def output_cases() -> Iterator[Case]:
     """Yield every command that writes, its output no name of a file."""
     for name in ("", ".", "..", "/", "../good", "no/such/x", "a" * 300):
