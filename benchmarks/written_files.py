@@ -153,6 +153,10 @@ def run(line: str, folder: Path, package: Path) -> None:
     print(f"{cpu_s() - begun:6.1f} CPU s  {line}", flush=True)
 
 
+_RECORD = ".me2e-compress.json"
+"""As `me2e_compress.workflows.claims` calls it; older packages have none."""
+
+
 def cpu_s() -> float:
     """Return the CPU seconds of all commands that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -160,8 +164,12 @@ def cpu_s() -> float:
 
 
 def manifest(folder: Path, package: Path) -> dict[str, str]:
-    """Return the digest of every file below a folder, by path."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    """Return the digest of every file below a folder, by path.
+
+    The record of what was written holds times: it is left out.
+    """
+    found = (path for path in folder.rglob("*") if path.name != _RECORD)
+    files = sorted(path for path in found if path.is_file())
     names = [path.relative_to(folder).as_posix() for path in files]
     return {
         masked_name(name): hashlib.sha256(masked(folder, name, package)).hexdigest()
