@@ -32,7 +32,8 @@ def main() -> int:
     except KeyboardInterrupt:
         code = INTERRUPTED
     if code in (INTERRUPTED, TERMINATED):
-        again = "; run again to go on" if RESUMES & set(sys.argv[1:]) else ""
+        words = [word for word in sys.argv[1:] if not word.startswith("-")]
+        again = "; run again to go on" if RESUMES & set(words[:1]) else ""
         sys.stderr.write(f"me2e-compress: interrupted{again}\n")
     return code
 

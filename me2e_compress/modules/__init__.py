@@ -1,6 +1,7 @@
 """Modules: which node of a graph belongs to which part of the driving stack."""
 
-from me2e_compress.modules.assign import Assignment, Placement, assign
+from me2e_compress.modules.assign import assign
+from me2e_compress.modules.assignment import Assignment, Placement
 from me2e_compress.modules.detect import detect, map_of
 from me2e_compress.modules.inventory import (
     Inventory,

@@ -1,70 +1,16 @@
 """Assign every node to a module: by its parameters, its scope, its neighbours."""
 
-import dataclasses
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from typing import Literal
 
 import onnx_ir as ir
 
-from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import ModuleMapError
+from me2e_compress.modules.assignment import Assignment, Placement
 from me2e_compress.modules.module_map import ModuleMap
 from me2e_compress.modules.paths import parameter_path, scope_of
 
-Rule = Literal["stamp", "parameter", "scope", "neighbour"]
-
 STAMP = "me2e.module"
 """Node metadata that holds the module in a graph that was imported before."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Placement:
-    """The module of a node, and the rule that found it."""
-
-    module: str
-    rule: Rule
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class Assignment(Displayed):
-    """The module of every node of a graph, nodes in subgraphs included.
-
-    Attributes:
-        modules: the map it was made with.
-        placements: by node, in the order of the graph.
-    """
-
-    modules: ModuleMap
-    placements: Mapping[ir.Node, Placement]
-
-    @property
-    def headline(self) -> str:
-        """Count the nodes, by rule."""
-        counts = ", ".join(f"{count} by {rule}" for rule, count in self.rules().items())
-        return f"map {self.modules.name}, {len(self.placements)} nodes: {counts}"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return a row a module: its nodes."""
-        nodes = Counter(place.module for place in self.placements.values())
-        rows = [(name, str(nodes[name])) for name in self.modules.names()]
-        return (table("Nodes by module", ("module", "nodes"), rows),)
-
-    def module_of(self, node: ir.Node) -> str:
-        """Return the module of a node of the graph that was assigned."""
-        return self.placements[node].module
-
-    def rule_of(self, node: ir.Node) -> Rule:
-        """Return which rule decided."""
-        return self.placements[node].rule
-
-    def nodes(self, module: str) -> list[ir.Node]:
-        """List a module's nodes in graph order."""
-        return [n for n, place in self.placements.items() if place.module == module]
-
-    def rules(self) -> dict[Rule, int]:
-        """Count the nodes that each rule decided."""
-        return dict(Counter(place.rule for place in self.placements.values()))
 
 
 def assign(model: ir.Model, modules: ModuleMap) -> Assignment:

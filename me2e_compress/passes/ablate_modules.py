@@ -251,4 +251,5 @@ def _means_of(
             "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"
             " a mean is never made up"
         )
-    return token_means(model, frames, names), f"its mean over {len(frames)} frames"
+    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+    return token_means(model, frames, names), f"its mean over {count}"

@@ -15,6 +15,7 @@ from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
 from me2e_compress.study.report.findings import TIMES, findings, sure
 from me2e_compress.study.write import write_study
+from me2e_compress.workflows.claims import RECORD
 from tests.study.conftest import IDEAL, SLOW
 
 pytestmark = pytest.mark.xdist_group("study")
@@ -139,7 +140,8 @@ def test_files_are_written_beside_each_other(
         "# Slow &amp; &lt;fast&gt;\n\n**Scoreboard, "
     )
     assert written.report.read_text().startswith("<!doctype html>")
-    assert len(list((tmp_path / "new" / "study").iterdir())) == 3
+    found_files = {path.name for path in (tmp_path / "new" / "study").iterdir()}
+    assert found_files == {RECORD, "report.html", "study.json", "tables.md"}
 
 
 def test_a_folder_that_cannot_be_written(found: StudyResult, tmp_path: Path) -> None:
