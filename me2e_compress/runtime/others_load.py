@@ -11,6 +11,9 @@ BUSY = 0.1
 """Share of the cores that other processes may take before a latency is in doubt: their
 work moves ours between cores and out of the caches, long before all cores are taken."""
 
+SHORTEST_S = 0.5
+"""What a block must take to be judged: systems count CPU time in ticks of 10 ms."""
+
 
 class OthersLoad:
     """Counts the cores that other processes keep busy while a block runs.
@@ -21,7 +24,7 @@ class OthersLoad:
         clock: seconds that pass.
 
     Attributes:
-        cores: mean over the block; None before it ends, or if it took no time.
+        cores: mean over the block; None before it ends, or if it was too short.
         of: cores of the machine.
     """
 
@@ -49,7 +52,7 @@ class OthersLoad:
                 (self._clock(), self._machine(), self._ours()), self._begun, strict=True
             )
         )
-        self.cores = max(0.0, machine - ours) / wall if wall > 0 else None
+        self.cores = max(0.0, machine - ours) / wall if wall >= SHORTEST_S else None
 
 
 def is_busy(cores: float | None, of: int) -> bool:
