@@ -40,6 +40,7 @@ from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.interleaved import time_interleaved
@@ -177,6 +178,8 @@ def make(chosen: argparse.Namespace) -> dict[str, float]:
     cpu, wall = time.process_time(), time.perf_counter()
     modules, frames = ModuleMap.load(str(subject.map)), CalibrationSet(subject.frames)
     model = graph.load(path_of(subject, source))
+    if any(value.dtype == ir.DataType.FLOAT16 for value in model.graph.inputs):
+        model = ConvertFloat32().run(model, Context(modules)).model
     result = step.run(model, Context(modules, frames)).model
     graph.save(result, path_of(subject, chosen.file))
     return {
@@ -239,7 +242,7 @@ def weigh(chosen: argparse.Namespace) -> dict[str, object]:
             return {"refused": str(error)}
         found = {each.name: each.sqnr_db for each in fidelity.outputs}
     return {
-        "megabytes": path.stat().st_size / 1e6,
+        "megabytes": graph.file_bytes(path) / 1e6,
         "int8_macs": int8 / total if total else None,
         "kernels": sum(kernels[each] for each in KERNELS),
         "sqnr_db": found,

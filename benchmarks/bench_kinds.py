@@ -61,7 +61,7 @@ def graph_row(subject: subjects.Subject) -> str:
     """Let every tool simplify one graph; tell nodes, MB, CPU seconds and error."""
     cells = [simplified(name, subject) for name in SIMPLIFIERS]
     source = graph.node_count(graph.load(subject.source))
-    size = megabytes(subject.source)
+    size = graph.file_bytes(subject.source) / 1e6
     return f"| {subject.name} | {source}, {size:.1f} | {' | '.join(cells)} |"
 
 
@@ -75,7 +75,9 @@ def simplified(tool: str, subject: subjects.Subject) -> str:
     except FAILED as failed:
         return f"failed: {str(failed)[:100]}"
     nodes = graph.node_count(graph.load(target))
-    return f"{nodes}, {megabytes(target):.1f}, {taken.cpu_s:.1f}, {error:.1e}"
+    return (
+        f"{nodes}, {graph.file_bytes(target) / 1e6:.1f}, {taken.cpu_s:.1f}, {error:.1e}"
+    )
 
 
 def error_of(path: Path, subject: subjects.Subject) -> float:
@@ -85,12 +87,6 @@ def error_of(path: Path, subject: subjects.Subject) -> float:
         wanted = [held[name] for name in held]
     session = simplifiers.session(path)
     return simplifiers.error(wanted, list(session.run(None, frame)))
-
-
-def megabytes(path: Path) -> float:
-    """Add up a graph and the weights beside it."""
-    beside = path.with_name(path.name + ".data")
-    return sum(e.stat().st_size for e in (path, beside) if e.is_file()) / 1e6
 
 
 def int8_row(subject: subjects.Subject, chosen: argparse.Namespace) -> str:
