@@ -22,8 +22,9 @@ import numpy as np
 import onnx
 import onnxruntime
 
-from benchmarks.bench_exact_passes import Job, error, onnxsim, onnxslim, ours
+from benchmarks.bench_exact_passes import error
 from benchmarks.exported import exported
+from benchmarks.simplifiers import Job, onnxsim, onnxslim, ours
 from benchmarks.synthetic import TOKENS, WIDTH
 from me2e_compress import graph
 

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import bench_exact_passes as simplifiers
+from benchmarks import bench_exact_passes as exact
 from benchmarks import bench_int8_cpu as quantizers
-from benchmarks import subjects
+from benchmarks import simplifiers, subjects
 from benchmarks.model_kinds import KINDS, expected
 from me2e_compress import graph
 from me2e_compress.runtime.opening import REFUSALS
@@ -82,11 +82,11 @@ def simplified(tool: str, subject: subjects.Subject) -> str:
 
 def error_of(path: Path, subject: subjects.Subject) -> float:
     """Return the largest max|a - b| / max|a| of an output, ``a`` being torch's."""
-    (frame,) = simplifiers.frames(subject.held_out, 1)
+    (frame,) = exact.frames(subject.held_out, 1)
     with np.load(expected(subject.source)) as held:
         wanted = [held[name] for name in held]
-    session = simplifiers.session(path)
-    return simplifiers.error(wanted, list(session.run(None, frame)))
+    session = exact.session(path)
+    return exact.error(wanted, list(session.run(None, frame)))
 
 
 def int8_row(subject: subjects.Subject, chosen: argparse.Namespace) -> str:
@@ -94,7 +94,7 @@ def int8_row(subject: subjects.Subject, chosen: argparse.Namespace) -> str:
     given = argparse.Namespace(
         without=";".join(OTHERS),
         frames=4,
-        threads=simplifiers.THREADS,
+        threads=exact.THREADS,
         limit_gb=14.0,
         rounds=chosen.rounds,
         peer_python=chosen.peer_python,
