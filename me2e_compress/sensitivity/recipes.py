@@ -1,7 +1,7 @@
 """From what was found to a recipe."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from me2e_compress.errors import EvaluationError
@@ -105,21 +105,25 @@ def _driving_loss(trials: Trials, choice: Int8Choice) -> float:
 
 
 def write_recipe(
-    path: Path, choice: Int8Choice, passes: tuple[str, ...], rules: str, target: str
+    path: Path,
+    choice: Int8Choice,
+    passes: Mapping[str, Mapping[str, int]],
+    rules: str,
+    target: str,
 ) -> Path | None:
     """Write a recipe and, where nodes stay float, the overrides beside it.
 
     Args:
         path: of the recipe.
         choice: what is int8.
-        passes: names of the passes before int8.
+        passes: before int8, by name; the sizes of open dimensions that one gives.
         rules: rule set of the plan.
         target: runtime of the int8 graph.
 
     Returns:
         The file of overrides; None where none is needed.
     """
-    lines = [f'[[pass]]\nname = "{name}"\n' for name in passes]
+    lines = [_entry(name, dims) for name, dims in passes.items()]
     overrides = path.with_name(path.stem + ".overrides.toml")
     if choice.modules:
         options = [
@@ -148,6 +152,12 @@ def overrides_text(overrides: Iterable[Override]) -> str:
         lines = (f"{key} = {_string(text)}\n" for key, text in given.items())
         entries.append("[[override]]\n" + "".join(lines))
     return "\n".join(entries)
+
+
+def _entry(name: str, dims: Mapping[str, int]) -> str:
+    sizes = ", ".join(f"{_string(dim)} = {size}" for dim, size in dims.items())
+    given = f"dims = {{{sizes}}}\n" if dims else ""
+    return f"[[pass]]\nname = {_string(name)}\n{given}"
 
 
 def _array(names: tuple[str, ...]) -> str:

@@ -1,6 +1,7 @@
 """What ``sensitivity`` and ``search`` have in common: a model, calibrated once."""
 
 import dataclasses
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
+from me2e_compress.passes import Pass
+from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
@@ -37,6 +40,7 @@ class TrialOptions:
         module_map: preset or TOML file; None finds the preset.
         count: frames to judge on.
         threads: of onnxruntime; 0 takes all.
+        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
         force: replace outputs that are not as we left them, too.
 
     Raises:
@@ -50,11 +54,16 @@ class TrialOptions:
     module_map: str | Path | None = None
     count: int = 4
     threads: int = 0
+    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
     force: bool = False
 
     def __post_init__(self) -> None:
         """Check the number of threads."""
         check_count("--threads", self.threads)
+
+    def exact(self) -> tuple[Pass, ...]:
+        """Return the passes before int8."""
+        return with_sizes(recipe.load("exact"), self.dims)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +114,9 @@ class TrialFiles:
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
         name = self.model.name
         try_first(loaded, name, listener, file=self.model, frames=recording)
-        ready = PreparedGraph.of(self.model, loaded, options.module_map)
+        ready = PreparedGraph.of(
+            self.model, loaded, options.module_map, options.exact()
+        )
         made = Trials(
             ready.model,
             ready.modules,
@@ -118,10 +129,13 @@ class TrialFiles:
         )
         return made, scheme.modules
 
-    def write(self, choice: Int8Choice, rules: str, target: str) -> str:
+    def write(self, choice: Int8Choice, options: TrialOptions, target: str) -> str:
         """Write the recipe, and return a line that says what it makes int8."""
-        before = tuple(each.name for each in recipe.load("exact"))
-        overrides = write_recipe(self.output, choice, before, rules, target)
+        before = {
+            each.name: each.dims if isinstance(each, FixShapes) else {}
+            for each in options.exact()
+        }
+        overrides = write_recipe(self.output, choice, before, options.rules, target)
         listed = ", ".join(choice.modules) or "no module"
         more = f", {len(choice.floats)} of their nodes in float" if overrides else ""
         return f"{self.output}: int8 in {listed}{more}"

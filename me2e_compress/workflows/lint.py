@@ -2,13 +2,16 @@
 
 import dataclasses
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.passes import Context
+from me2e_compress.passes.fix_shapes import FixShapes
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
-from me2e_compress.workflows.checks import model_path
+from me2e_compress.workflows.checks import load_map, model_path
 from me2e_compress.workflows.result import Result, Status, Table, table
 
 
@@ -20,6 +23,7 @@ class LintOptions:
         target: ``tensorrt`` or ``onnxruntime``.
         trt_check: also parse and build the graph by TensorRT-RTX.
         sm: GPU generation that is built for.
+        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
 
     Raises:
         RecipeError: TensorRT-RTX is asked about a graph for another target.
@@ -28,6 +32,7 @@ class LintOptions:
     target: str = "tensorrt"
     trt_check: bool = False
     sm: int = 86
+    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that TensorRT-RTX is asked about its own."""
@@ -137,10 +142,14 @@ def lint(model: str | Path, options: LintOptions | None = None) -> LintResult:
     Raises:
         GraphError: no such model.
         RecipeError: no such target.
+        PreconditionError: no input has such an open dimension.
         MissingExtraError: TensorRT-RTX is not installed and was asked.
     """
     options, path = options or LintOptions(), model_path(model)
     loaded = graph.load(path)
+    if options.dims:
+        modules = load_map(None, loaded)
+        loaded = FixShapes(options.dims).run(loaded, Context(modules)).model
     found = tuple(TARGETS.parse(options.target).lint(loaded))
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, found, build)

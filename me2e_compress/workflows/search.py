@@ -151,7 +151,7 @@ def _search(
     report = partial(listener.on_progress, "modules")
     tried = find(trials, modules, budget, progress=report)
     choice = Int8Choice(tried[-1].modules)
-    written = files.write(choice, options.rules, options.runs_on)
+    written = files.write(choice, options, options.runs_on)
     return SearchResult(files.output, tried, budget.unit, written)
 
 

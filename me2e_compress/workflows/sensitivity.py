@@ -202,7 +202,7 @@ def _measured(
         progress=partial(listener.on_progress, "modules"),
     )
     choice = advise(trials, found, options.limit, options.drive_limit)
-    written = files.write(choice, options.rules, target)
+    written = files.write(choice, options, target)
     score = trials.score(choice) if choice.modules else None
     driving = trials.driving(choice) if choice.modules else None
     return SensitivityResult(

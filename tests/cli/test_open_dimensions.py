@@ -70,6 +70,29 @@ def test_plan_calibrate_and_compress_agree_on_the_graph_of_one_size(
     assert str(small.graph.inputs[0].shape) == "[1,16,8,8]"
 
 
+def test_search_and_sensitivity_write_the_sizes_into_the_recipe(
+    command: Command, batched: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, frames = batched / "m.onnx", batched / "frames"
+    asked = {"search": ("--max-mb", "1"), "sensitivity": ("--limit", "9")}
+    for name, limit in asked.items():
+        found = batched / f"{name}.toml"
+        words = (name, model, frames, "-o", found, *limit, "--set-dim", "batch=1")
+        assert command(*words) == 0, capsys.readouterr().err
+        made = batched / f"{name}.onnx"
+        words = ("compress", model, "-r", found, "--frames", frames, "-o", made)
+        assert command(*words) == 0, capsys.readouterr().err
+        assert str(graph.load(made).graph.inputs[0].shape) == "[1,16,8,8]"
+
+
+def test_lint_reads_the_graph_of_one_size(
+    command: Command, batched: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("lint", batched / "m.onnx", "--set-dim", "batch=1") == 0
+    assert command("lint", batched / "m.onnx", "--set-dim", "rows=1") == 1
+    assert "no open dimension is called 'rows'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -8,6 +8,7 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import show
 from me2e_compress.cli.verbosity import is_verbose
 from me2e_compress.workflows import lint as workflow
+from me2e_compress.workflows.checks import sizes
 
 TrtCheck = Annotated[
     bool, typer.Option("--trt-check", help="also parse and build it by TensorRT-RTX")
@@ -21,11 +22,13 @@ def lint(
     ] = "tensorrt",
     trt_check: TrtCheck = False,
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,
+    set_dim: given.SetDim = None,
     shown: Annotated[int, typer.Option(min=0, help="nodes shown of each rule")] = 3,
     as_json: given.Json = False,
 ) -> None:
     """Check a graph for the program that will run it; 1 if it would be refused."""
-    found = workflow.lint(model, workflow.LintOptions(target, trt_check, sm))
+    options = workflow.LintOptions(target, trt_check, sm, sizes(set_dim or ()))
+    found = workflow.lint(model, options)
     most = len(found.findings) if is_verbose() else shown
     show(found, as_json, found.tables(shown=most))
     found.check()

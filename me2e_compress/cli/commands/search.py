@@ -7,6 +7,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.workflows import search as workflow
+from me2e_compress.workflows.checks import sizes
 
 MaxMb = Annotated[float | None, typer.Option(help="most MB of weights")]
 MaxMs = Annotated[
@@ -25,6 +26,7 @@ def search(
     target: given.Target = None,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
+    set_dim: given.SetDim = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
     force: given.Force = False,
@@ -34,7 +36,7 @@ def search(
     options = workflow.SearchOptions(
         max_mb=max_mb, max_ms=max_ms, scheme=scheme, rules=rules, target=target,
         ranges=ranges, module_map=module_map, count=count, threads=threads,
-        force=force,
+        dims=sizes(set_dim or ()), force=force,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.search(model, frames, output, options, listener)

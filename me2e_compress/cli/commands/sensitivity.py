@@ -7,6 +7,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.workflows import sensitivity as workflow
+from me2e_compress.workflows.checks import sizes
 
 Limit = Annotated[
     float,
@@ -38,6 +39,7 @@ def sensitivity(
     node_trials: NodeTrials = 24,
     ranges: given.SavedRanges = None,
     module_map: given.ModuleMap = None,
+    set_dim: given.SetDim = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
     force: given.Force = False,
@@ -54,7 +56,7 @@ def sensitivity(
         scheme=scheme, rules=rules, target=target, limit=limit, drive=drive,
         drive_limit=drive_limit, adapter=adapter, workers=workers,
         node_trials=node_trials, ranges=ranges, module_map=module_map, count=count,
-        threads=threads, force=force,
+        threads=threads, dims=sizes(set_dim or ()), force=force,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.measure_sensitivity(model, frames, output, options, listener)
