@@ -6,7 +6,7 @@ from pathlib import Path
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators.highway.conditions import Conditions, step_us
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.evaluation_options import (
     engine_of,
@@ -185,7 +185,7 @@ def _job(driver: Driver, options: EvaluateOptions) -> Job:
     )
     conditions = Conditions(
         latency,
-        round(options.dt_ms * 1000),
+        step_us(options.dt_ms),
         image_size_of(driver.open()),
         weather_of(options.weather),
     )

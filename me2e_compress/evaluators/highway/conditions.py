@@ -39,3 +39,16 @@ class Conditions:
                 f"a step of {self.dt_us / 1e3:g} ms: it must divide "
                 f"{FRAME_US // 1000} ms"
             )
+
+
+def step_us(dt_ms: float) -> int:
+    """Return a step of the world in whole microseconds.
+
+    Raises:
+        EvaluationError: it is longer than a frame, or no number above 0.
+    """
+    if not 0 < dt_ms <= FRAME_US / 1000:
+        raise EvaluationError(
+            f"a step of {dt_ms:g} ms: it must divide {FRAME_US // 1000} ms"
+        )
+    return round(dt_ms * 1000)

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators.highway.conditions import Conditions, step_us
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
@@ -81,7 +81,7 @@ class HighwayEvaluation:
         driver = driver_named(self.policy, self.adapter)
         conditions = Conditions(
             parse_latency(self.latency, seed=self.seed),
-            round(self.dt_ms * 1000),
+            step_us(self.dt_ms),
             image_size_of(driver.open()),
             weather_of(self.weather),
         )
