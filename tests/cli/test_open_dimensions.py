@@ -71,17 +71,16 @@ def test_plan_calibrate_and_compress_agree_on_the_graph_of_one_size(
 
 
 def test_search_and_sensitivity_write_the_sizes_into_the_recipe(
-    command: Command, batched: Path, capsys: pytest.CaptureFixture[str]
+    command: Command, batched: Path
 ) -> None:
     model, frames = batched / "m.onnx", batched / "frames"
     asked = {"search": ("--max-mb", "1"), "sensitivity": ("--limit", "9")}
     for name, limit in asked.items():
-        found = batched / f"{name}.toml"
-        words = (name, model, frames, "-o", found, *limit, "--set-dim", "batch=1")
-        assert command(*words) == 0, capsys.readouterr().err
-        made = batched / f"{name}.onnx"
-        words = ("compress", model, "-r", found, "--frames", frames, "-o", made)
-        assert command(*words) == 0, capsys.readouterr().err
+        found, made = batched / f"{name}.toml", batched / f"{name}.onnx"
+        sized = (*limit, "--set-dim", "batch=1")
+        assert command(name, model, frames, "-o", found, *sized) == 0
+        given = ("--frames", frames, "-o", made)
+        assert command("compress", model, "-r", found, *given) == 0
         assert str(graph.load(made).graph.inputs[0].shape) == "[1,16,8,8]"
 
 
