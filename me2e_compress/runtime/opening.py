@@ -23,6 +23,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import is_standard
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
+from me2e_compress.graph.nodes import is_read
 
 # The compiled module has no stubs.
 
@@ -143,6 +144,7 @@ def open_graph(
         and tensor.dtype in _LENDABLE
         and (tensor.nbytes >= LENT_BYTES or isinstance(tensor, ir.ExternalTensor))
         and tensor.nbytes
+        and is_read(value)  # onnxruntime drops the others, and then misses them
     }
     if _needs_file(model, lent):
         with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:

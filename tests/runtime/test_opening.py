@@ -145,3 +145,10 @@ def test_zeros_around_a_max_pool_stay_zeros() -> None:
     found = Session(ir.from_onnx_text(PADDED_POOL), threads=1).run(below)["y"]
 
     assert not found.any()  # -1 where onnxruntime folds the Pad into the pool
+
+
+def test_a_large_weight_that_nothing_reads_is_not_lent(model: ir.Model) -> None:
+    idle = ir.tensor(np.ones(2000, np.float32), name="idle")
+    model.graph.register_initializer(ir.Value(name="idle", const_value=idle))
+
+    assert set(Session(model, threads=1).run(image())) == {"y"}
