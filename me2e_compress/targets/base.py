@@ -103,10 +103,12 @@ class Target(abc.ABC):
         name: what recipes and the command line call it.
         half_since: the first opset in which it takes int8 in a float16 graph, scales
             in float16; None where it has no such kernels.
+        opens: whether :meth:`read_back` opens the graph, in onnxruntime.
     """
 
     name: ClassVar[str]
     half_since: ClassVar[int | None] = None
+    opens: ClassVar[bool] = False
 
     @abc.abstractmethod
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
@@ -164,3 +166,13 @@ class Target(abc.ABC):
         graph.infer_shapes(copy)
         found = [finding for rule in self.lint_rules() for finding in rule(copy)]
         return tuple(sorted(found, key=lambda each: each.severity))
+
+    def read_back(self, model: ir.Model) -> tuple[LintFinding, ...]:
+        """Open a graph, and list what runs otherwise than it says; errors first.
+
+        A target whose program is not at hand finds nothing.
+
+        Args:
+            model: a graph in which :meth:`lint` found no error; it stays as it is.
+        """
+        return ()

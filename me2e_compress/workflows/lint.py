@@ -5,6 +5,8 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
+import onnx_ir as ir
+
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.passes import Context
@@ -12,6 +14,8 @@ from me2e_compress.passes.fix_shapes import FixShapes
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import load_map, model_path
+from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, table
 
 
@@ -132,15 +136,22 @@ class LintResult(Result):
         return {"findings": self.findings, "tensorrt_rtx": self.build}
 
 
-def lint(model: str | Path, options: LintOptions | None = None) -> LintResult:
+def lint(
+    model: str | Path,
+    options: LintOptions | None = None,
+    listener: Listener = SILENT,
+) -> LintResult:
     """Check a graph for the program that will run it.
+
+    For onnxruntime it is opened too, if no rule says that it would be refused.
 
     Args:
         model: an ONNX file, or the name of one that ships.
         options: None takes the defaults.
+        listener: is called with progress.
 
     Raises:
-        GraphError: no such model.
+        GraphError: no such model, or onnxruntime dies of it.
         RecipeError: no such target.
         PreconditionError: no input has such an open dimension.
         MissingExtraError: TensorRT-RTX is not installed and was asked.
@@ -150,9 +161,27 @@ def lint(model: str | Path, options: LintOptions | None = None) -> LintResult:
     if options.dims:
         modules = load_map(None, loaded)
         loaded = FixShapes(options.dims).run(loaded, Context(modules)).model
-    found = tuple(TARGETS.parse(options.target).lint(loaded))
+    found = _found(loaded, path.name, options.target, listener)
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, found, build)
+
+
+def _found(
+    model: ir.Model, name: str, target: str, listener: Listener
+) -> tuple[LintFinding, ...]:
+    """List what rules find and, where they find no error, what opening the graph does.
+
+    A node of which a rule has said already that it runs in float is named once.
+    """
+    judge = TARGETS.parse(target)
+    found = judge.lint(model)
+    if any(each.severity == "error" for each in found):
+        return found
+    if judge.opens:
+        try_first(model, name, listener)
+    known = {each.node for each in found if each.rule == "float-answer"}
+    opened = [each for each in judge.read_back(model) if each.node not in known]
+    return tuple(sorted((*found, *opened), key=lambda each: each.severity))
 
 
 def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:

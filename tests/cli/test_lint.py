@@ -7,6 +7,7 @@ import pytest
 from me2e_compress import graph
 from tests.cli.conftest import Command
 from tests.docs.documents import faults
+from tests.targets.onnxruntime.lowered import MATMUL_RELU
 
 TWIST = (
     '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>'
@@ -87,3 +88,16 @@ def test_trt_check_is_not_for_other_targets(
 
     assert command("lint", twisted, *words) == 1
     assert "--trt-check is for tensorrt, not for onnx" in capsys.readouterr().err
+
+
+def test_int8_that_onnxruntime_runs_in_float_is_named(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph.save(ir.from_onnx_text(MATMUL_RELU), tmp_path / "m.onnx")
+
+    assert (
+        command("lint", tmp_path / "m.onnx", "--target", "onnxruntime", "--json") == 0
+    )
+
+    (found,) = json.loads(capsys.readouterr().out)["findings"]
+    assert (found["rule"], found["node"]) == ("float-kernel", "/head/fc")

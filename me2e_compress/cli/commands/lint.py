@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from me2e_compress.cli import arguments as given
-from me2e_compress.cli.console import show
+from me2e_compress.cli.console import listening, show
 from me2e_compress.cli.verbosity import is_verbose
 from me2e_compress.workflows import lint as workflow
 from me2e_compress.workflows.checks import sizes
@@ -28,7 +28,8 @@ def lint(
 ) -> None:
     """Check a graph for the program that will run it; 1 if it would be refused."""
     options = workflow.LintOptions(target, trt_check, sm, sizes(set_dim or ()))
-    found = workflow.lint(model, options)
+    with listening() as listener:
+        found = workflow.lint(model, options, listener)
     most = len(found.findings) if is_verbose() else shown
     show(found, as_json, found.tables(shown=most))
     found.check()

@@ -1,6 +1,7 @@
 """Lower a graph that was quantized for TensorRT, by this package or by another."""
 
 import dataclasses
+from collections.abc import Collection
 
 import onnx_ir as ir
 
@@ -53,16 +54,22 @@ def unranged(model: ir.Model) -> tuple[str, ...]:
     return tuple(name for name in region.ranged if name not in draft.reach)
 
 
-def int8_layers(model: ir.Model) -> tuple[ir.Node, ...]:
+def int8_layers(
+    model: ir.Model, kinds: Collection[str] = graph.WEIGHTED
+) -> tuple[ir.Node, ...]:
     """List the layers whose two operands both come through a DequantizeLinear.
 
     Whether a program computes them in integers is its own affair: on onnxruntime's CPU
     those of a graph placed for TensorRT run in float.
+
+    Args:
+        model: the graph.
+        kinds: operators that count as layers.
     """
     return tuple(
         node
         for node in model.graph
-        if node.op_type in graph.WEIGHTED and all(map(_dequantized, node.inputs[:2]))
+        if node.op_type in kinds and all(map(_dequantized, node.inputs[:2]))
     )
 
 

@@ -10,6 +10,7 @@ from me2e_compress import rewrite
 from me2e_compress.errors import FramesError
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
 from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
+from me2e_compress.targets.onnxruntime.screens import screen_products
 from me2e_compress.targets.onnxruntime.writer import Writer
 from me2e_compress.targets.weights import QuantizedWeight
 
@@ -55,6 +56,7 @@ def lower(draft: Draft) -> ir.Model:
     _write_pairs(writer, region, grids)
     for layer, weight, step in jobs:
         write_layer(writer, layer, weight, step)
+    screen_products(writer)
     rewrite.sweep(draft.model)
     return draft.model
 

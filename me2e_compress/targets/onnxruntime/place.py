@@ -9,11 +9,12 @@ import onnx_ir as ir
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
-from me2e_compress.targets.base import LintRule, Target
+from me2e_compress.targets.base import LintFinding, LintRule, Target
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.kernels import objection
 from me2e_compress.targets.onnxruntime.lint_rules import RULES
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
+from me2e_compress.targets.onnxruntime.read_back import read_back
 from me2e_compress.targets.onnxruntime.region import Region, find_region
 from me2e_compress.targets.weights import weights_of
 
@@ -23,6 +24,7 @@ class OnnxRuntime(Target):
     """onnxruntime's CPU kernels: uint8 activations, quantized answers, 2-D products."""
 
     name: ClassVar[str] = "onnxruntime"
+    opens: ClassVar[bool] = True
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
         """Return the activations whose range is needed: read or made by layers."""
@@ -66,6 +68,10 @@ class OnnxRuntime(Target):
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its kernels."""
         return RULES
+
+    def read_back(self, model: ir.Model) -> tuple[LintFinding, ...]:
+        """Open a graph, and list the layers that are int8 in it and run in float."""
+        return tuple(read_back(model))
 
 
 def _layers_of(plan: QuantPlan) -> tuple[Decision, ...]:

@@ -66,6 +66,23 @@ LINEAR_SHAPES = {
 }  # fmt: skip
 
 
+MATMUL_RELU = """
+<ir_version: 9, opset_import: ["" : 17]>
+m (float[2,6,8] x) => (float[2,6,8] y)
+<int8[1,1] i = {3}, float s = {0.5}, int8 n = {0}, uint8 z = {128},
+ int64[2] full = {8, 8}> {
+    q = QuantizeLinear(x, s, z)
+    d = DequantizeLinear(q, s, z)
+    e = Expand(i, full)
+    v = DequantizeLinear(e, s, n)
+    ["/head/fc"] p = MatMul(d, v)
+    ["/head/act"] r = Relu(p)
+    y = Neg(r)
+}
+"""
+"""A layer that is int8 in the file, and that onnxruntime runs in float."""
+
+
 def drawn(text: str, shapes: dict[str, tuple[int, ...]], seed: int = 0) -> ir.Model:
     generator = np.random.default_rng(seed)
     return net(text, {n: generator.standard_normal(s) for n, s in shapes.items()})

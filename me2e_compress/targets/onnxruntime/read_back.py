@@ -1,0 +1,50 @@
+"""Open a graph in onnxruntime, and find what of its int8 runs in float there."""
+
+from collections.abc import Iterator
+
+import onnx_ir as ir
+
+from me2e_compress.errors import GraphError
+from me2e_compress.quantization.plan import plan_of
+from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
+from me2e_compress.targets.base import LintFinding, error, warning
+from me2e_compress.targets.onnxruntime.convert import int8_layers
+
+_FLOAT_KERNELS = frozenset(
+    {
+        "Conv", "ConvTranspose", "FusedConv", "FusedGemm", "FusedMatMul", "Gemm",
+        "MatMul", "NhwcFusedConv",
+    }
+)  # fmt: skip
+"""Layers as onnxruntime's optimizer leaves them where they compute in float."""
+
+
+def read_back(model: ir.Model) -> Iterator[LintFinding]:
+    """Find layers that are int8 in a graph, and in float in the session that runs it.
+
+    onnxruntime looks for int8 after its first fusions, and for whole patterns: a bias,
+    a ReLU or a second reader of what a layer answers hides the layer from it.
+
+    Args:
+        model: the graph; it stays as it is.
+    """
+    source = with_unique_names(model)
+    try:
+        found = optimized(source)
+    except GraphError as refusal:
+        yield error("refused", None, str(refusal))
+        return
+    plan = plan_of(model)
+    meant = set() if plan is None else {each.output for each in plan.weight_only}
+    known = origins(source, found)
+    for node in int8_layers(found, _FLOAT_KERNELS):
+        layer = known.get(str(node.name), node)
+        if layer.outputs[0].name not in meant:
+            yield warning("float-kernel", layer, _what(layer, node.op_type))
+
+
+def _what(layer: ir.Node, kernel: str) -> str:
+    """Say what runs, and who reads its result: that is mostly the reason."""
+    readers = dict.fromkeys(each.op_type for each in layer.outputs[0].consumers())
+    told = f"; {' and '.join(readers)} reads it" if readers else ""
+    return f"reads int8, and runs in float, as {kernel}{told}"
