@@ -13,6 +13,8 @@ PLUGIN_DOMAIN = "me2e.plugin"
 """Where plugins of the default domain live in our graphs: checker and functions need a
 domain."""
 
+ORIGINAL_DOMAIN = "me2e.domain"
+"""Node metadata with the domain that a plugin had in the file it came from."""
 
 PLAIN_INITIALIZERS_SINCE_IR = 4
 """The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)."""

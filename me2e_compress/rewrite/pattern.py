@@ -106,7 +106,7 @@ class Constant(Pattern):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Operator(Pattern):
+class OperatorPattern(Pattern):
     """A node of one of some types, with operands that match."""
 
     types: tuple[str, ...]
@@ -214,7 +214,7 @@ def op(
     shared: bool = False,
     where: Callable[[ir.Node], bool] | None = None,
     domain: str = "",
-) -> Operator:
+) -> OperatorPattern:
     """Build the pattern of an operator's first output.
 
     Args:
@@ -226,7 +226,7 @@ def op(
         domain: of the operator; that of ONNX by default.
     """
     names = (types,) if isinstance(types, str) else types
-    return Operator(names, inputs, more, shared, where, domain)
+    return OperatorPattern(names, inputs, more, shared, where, domain)
 
 
 def either(*options: Pattern) -> Either:

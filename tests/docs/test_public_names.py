@@ -21,6 +21,7 @@ ROOMS = (
     "me2e_compress.manager",
     "me2e_compress.metrics.episode",
     "me2e_compress.modules",
+    "me2e_compress.operators",
     "me2e_compress.passes",
     "me2e_compress.quantization.plan",
     "me2e_compress.quantization.rules",

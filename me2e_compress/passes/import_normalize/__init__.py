@@ -8,7 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import provenance
 from me2e_compress.graph.nodes import is_plugin, nodes_in, nodes_of
-from me2e_compress.graph.validity import PLUGIN_DOMAIN
+from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.modules import assign
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import doubles
@@ -21,9 +21,6 @@ __all__ = [
     "needs_import",
     "with_own_domains",
 ]
-
-ORIGINAL_DOMAIN = "me2e.domain"
-"""Node metadata with the domain that a plugin had in the file it came from."""
 
 _FUNCTIONS_SINCE_IR = 8
 """The first ONNX IR version whose models may hold functions (onnx/docs/IR.md)."""

@@ -1,0 +1,35 @@
+"""The fused operators: every plugin dialect, body, float64 reference and cost of each.
+
+An operator stands in a graph as one node: in the toolkit's own form, in the domain
+``me2e``, or in the dialect of a plugin library of TensorRT.
+"""
+
+from me2e_compress.operators.base import Cost, Operator
+from me2e_compress.operators.call import FusedCall
+from me2e_compress.operators.dialect import OWN_DOMAIN, Attribute, Dialect, Operand
+from me2e_compress.operators.lookup import (
+    OPERATORS,
+    dialect_names,
+    dialect_of,
+    find,
+    operators,
+)
+from me2e_compress.operators.replace import expand, set_output, translate
+
+__all__ = [
+    "OPERATORS",
+    "OWN_DOMAIN",
+    "Attribute",
+    "Cost",
+    "Dialect",
+    "FusedCall",
+    "Operand",
+    "Operator",
+    "dialect_names",
+    "dialect_of",
+    "expand",
+    "find",
+    "operators",
+    "set_output",
+    "translate",
+]

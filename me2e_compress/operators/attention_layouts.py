@@ -1,0 +1,218 @@
+"""The two layouts of deformable attention that differ from TensorRT OSS's."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import array_of
+from me2e_compress.graph.nodes import maker
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
+
+
+@dataclasses.dataclass(frozen=True)
+class JoinedHeads(Dialect):
+    """A library whose output is [N, Q, M * D] instead of [N, Q, M, D]."""
+
+    def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
+        """Part the heads."""
+        value, _, _, locations, _ = five(own)
+        sizes = (call.size(value, 0), call.size(locations, 1))
+        return call.reshape(result, (*sizes, call.size(value, 2), call.size(value, 3)))
+
+    def result_from_own(
+        self, call: FusedCall, result: ir.Value, own: Values
+    ) -> ir.Value:
+        """Join the heads."""
+        value, _, _, locations, _ = five(own)
+        width = call.product(call.size(value, 2), call.size(value, 3))
+        sizes = (call.size(value, 0), call.size(locations, 1), width)
+        return call.reshape(result, sizes)
+
+    def options_from_own(self, attributes: Attributes) -> Attributes:
+        """Add the attributes that only this library has."""
+        return {each.name: each.default for each in self.attributes}
+
+    def options_to_own(self, attributes: Attributes) -> Attributes:
+        """Drop the attributes that only this library has."""
+        return {}
+
+    def result_from_own_array(self, result: NdArray) -> NdArray:
+        """Join the heads."""
+        return result.reshape(*result.shape[:2], -1)
+
+    def shape_from_own(self, shape: Dims) -> Dims:
+        """Join the heads."""
+        heads, width = shape[2], shape[3]
+        known = None if heads is None or width is None else heads * width
+        return (*shape[:2], known)
+
+
+@dataclasses.dataclass(frozen=True)
+class RawAttention(Dialect):
+    """A library that takes reference points, offsets in pixels and raw weights.
+
+    Of P points, point p stands at reference point p % g, where there are g; the softmax
+    is over all levels and points (BEVFormer_tensorrt,
+    multiScaleDeformableAttnKernel.cu).
+    """
+
+    def inputs_to_own(
+        self, call: FusedCall, inputs: Values, attributes: Attributes
+    ) -> Values:
+        """Write locations, the softmax and where each level begins."""
+        value, shapes, reference, offsets, weights = five(inputs)
+        levels, group = _levels_and_group(call, shapes, reference, offsets, weights)
+        batch, queries, heads = (call.size(offsets, axis) for axis in range(3))
+        split = call.reshape(offsets, (batch, queries, heads, levels, -1, group, 2))
+        scale = _columns_and_rows(call, shapes, offsets)
+        split = call.add("Div", [split, call.unsqueeze(scale, (1, 2))])
+        points = call.reshape(reference, (batch, queries, 1, 1, 1, group, 2))
+        locations = call.add("Add", [split, points])
+        locations = call.reshape(locations, (batch, queries, heads, levels, -1, 2))
+        softmax = call.add("Softmax", [weights], {"axis": -1})
+        softmax = call.reshape(softmax, (batch, queries, heads, levels, -1))
+        return (value, shapes, _starts(call, shapes), locations, softmax)
+
+    def inputs_from_own(
+        self, call: FusedCall, inputs: Values, attributes: Attributes
+    ) -> Values:
+        """Write offsets from a reference point at 0; take the softmax away.
+
+        Raises:
+            PreconditionError: the weights do not come from a softmax over all levels
+                and points.
+        """
+        value, shapes, _, locations, weights = five(inputs)
+        batch, queries, heads = (call.size(locations, axis) for axis in range(3))
+        scale = _columns_and_rows(call, shapes, locations)
+        pixels = call.add("Mul", [locations, call.unsqueeze(scale, (1,))])
+        offsets = call.reshape(pixels, (batch, queries, heads, -1))
+        reference = call.zeros((batch, queries, 1, 2), locations)
+        raw = self._before_softmax(call, weights)
+        raw = call.reshape(raw, (batch, queries, heads, -1))
+        given = {
+            "value": value,
+            "spatial_shapes": shapes,
+            "reference_points": reference,
+            "sampling_offsets": offsets,
+            "attention_weights": raw,
+        }
+        return self.in_types(call, given)
+
+    def _before_softmax(self, call: FusedCall, weights: ir.Value) -> ir.Value:
+        values = math.prod(dim for dim in _tail(weights, 2) if dim)
+        source: ir.Value | None = weights
+        while node := maker(source, "Reshape", "Identity", "Cast"):
+            source = node.inputs[0]
+        softmax = maker(source, "Softmax")
+        last = None if source is None or source.shape is None else source.shape[-1]
+        if softmax is None or softmax.inputs[0] is None or last != values:
+            raise PreconditionError(
+                f"node {call.node.name}: {self.op_type} of {self.source} takes weights"
+                f" before their softmax, and {weights.name} is not of a softmax over"
+                " all levels and points"
+            )
+        return softmax.inputs[0]
+
+    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
+        """Compute locations, the softmax and where each level begins."""
+        value, shapes, reference, offsets, raw = (np.asarray(each) for each in arrays)
+        count, (batch, queries, heads, _) = len(shapes), offsets.shape
+        group = reference.shape[-1] // 2
+        parted = offsets.reshape(batch, queries, heads, count, -1, group, 2)
+        scale = shapes[:, None, None, ::-1].astype(np.float64)
+        # an empty level has no positions: any number will do
+        parted = parted.astype(np.float64) / np.where(scale == 0, 1, scale)
+        at = parted + reference.reshape(batch, queries, 1, 1, 1, group, 2)
+        powers = np.exp(raw - raw.max(axis=-1, keepdims=True).astype(np.float64))
+        weights = powers / powers.sum(axis=-1, keepdims=True)
+        areas = shapes.astype(np.int64).prod(axis=1)
+        return (
+            value,
+            shapes,
+            np.cumsum(areas) - areas,
+            at.reshape(batch, queries, heads, count, -1, 2),
+            weights.reshape(batch, queries, heads, count, -1),
+        )
+
+    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+        """Part the last axes into levels, points and x, y."""
+        value, sizes, _, offsets, weights = shapes
+        levels = None if sizes is None else sizes[0]
+        if offsets is None or weights is None:
+            return (value, sizes, (levels,), None, None)
+        both = weights[3]
+        points = None if both is None or not levels else both // levels
+        own = (*offsets[:3], levels, points)
+        return (value, sizes, (levels,), (*own, 2), own)
+
+
+def five(inputs: Values) -> tuple[ir.Value, ir.Value, ir.Value, ir.Value, ir.Value]:
+    """Return the five inputs of a call, none of which may be left out."""
+    one, two, three, four, five = (each for each in inputs if each is not None)
+    return one, two, three, four, five
+
+
+def _tail(value: ir.Value, count: int) -> list[int | None]:
+    shape = value.shape
+    if shape is None:
+        return [None] * count
+    return [dim if isinstance(dim, int) else None for dim in list(shape)[-count:]]
+
+
+def _levels_and_group(
+    call: FusedCall,
+    shapes: ir.Value,
+    reference: ir.Value,
+    offsets: ir.Value,
+    weights: ir.Value,
+) -> tuple[int, int]:
+    """Return how many levels and reference points there are; both must be known."""
+    levels, pairs = _tail(shapes, 2)[0], _tail(reference, 1)[0]
+    (steps,), (points,) = _tail(offsets, 1), _tail(weights, 1)
+    name = f"node {call.node.name}: {call.node.op_type}"
+    if levels is None or pairs is None:
+        raise PreconditionError(
+            f"{name}: the shapes of {shapes.name} and {reference.name} must be known"
+        )
+    group = pairs // 2
+    whole = (
+        steps is None
+        or points is None
+        or (steps == 2 * points and points % max(levels * group, 1) == 0)
+    )
+    if pairs % 2 or not group or not whole:
+        raise PreconditionError(
+            f"{name}: offsets [.., {steps}] and weights [.., {points}] do not go with"
+            f" {levels} levels and reference points [.., {pairs}]"
+        )
+    return levels, group
+
+
+def _columns_and_rows(call: FusedCall, shapes: ir.Value, like: ir.Value) -> ir.Value:
+    """Write the sizes of the levels as (W, H), [L, 2], at least 1 each."""
+    known = array_of(shapes)
+    kind = like.dtype or ir.DataType.FLOAT
+    if known is not None:
+        turned = np.maximum(known[:, ::-1], 1)
+        return call.constant(turned.astype(kind.numpy()), "sizes")
+    turned = call.add("Gather", [shapes, call.integers([1, 0])], {"axis": 1})
+    sizes = call.cast(turned, kind)
+    return call.add("Max", [sizes, call.numbers(1.0, sizes)])
+
+
+def _starts(call: FusedCall, shapes: ir.Value) -> ir.Value:
+    """Write where each level begins, [L] int64, from the sizes of all."""
+    known = array_of(shapes)
+    if known is not None:
+        areas = known.astype(np.int64).prod(axis=1)
+        return call.integers((np.cumsum(areas) - areas).tolist())
+    wide = call.cast(shapes, ir.DataType.INT64)
+    areas = call.add("Mul", call.split_last(wide, 2))
+    return call.add("CumSum", [areas, call.integers(0)], {"exclusive": 1})

@@ -1,0 +1,223 @@
+"""Bilinear samples of feature maps that lie behind each other in one tensor.
+
+A position 0..1 of a map of W columns is column position * W - 0.5; what lies outside of
+the map is zero (``grid_sample`` with ``align_corners=False``, zeros). Once with
+GridSample, where the graph tells the sizes of the maps, once with Gather, which any
+opset has; and in numpy.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of
+from me2e_compress.operators.call import FusedCall, Size
+
+GRID_SAMPLE_OPSET = 16
+"""The first opset of ONNX's GridSample."""
+
+Numbers = npt.NDArray[np.float64]
+Sizes = npt.NDArray[np.integer]
+
+
+def sample_levels(
+    call: FusedCall,
+    value: ir.Value,
+    sizes: ir.Value,
+    starts: ir.Value,
+    locations: ir.Value,
+    weights: ir.Value,
+) -> ir.Value:
+    """Write the weighted sum of samples of several maps.
+
+    Args:
+        call: where to write.
+        value: [N, S, M, D], the maps one behind the other.
+        sizes: [L, 2], height and width of each map.
+        starts: [L], where each map begins among the S rows.
+        locations: [N, Q, M, L, P, 2], x and y in 0..1.
+        weights: [N, Q, M, L, P].
+
+    Returns:
+        [N, Q, M, D], of the element type of ``value``.
+    """
+    kind = value.dtype
+    if kind == ir.DataType.FLOAT16:  # onnxruntime's CPU has no kernels for it
+        value, locations, weights = (
+            call.cast(each, ir.DataType.FLOAT) for each in (value, locations, weights)
+        )
+    known, first = array_of(sizes), array_of(starts)
+    if known is None or first is None or call.opset < GRID_SAMPLE_OPSET:
+        result = _by_gather(call, value, sizes, starts, locations, weights)
+    else:
+        maps = [
+            (int(height), int(width), int(start))
+            for (height, width), start in zip(known, first, strict=True)
+        ]
+        result = _by_grid_sample(call, value, maps, locations, weights)
+    return call.cast(result, kind) if kind is not None else result
+
+
+def _by_grid_sample(
+    call: FusedCall,
+    value: ir.Value,
+    maps: Sequence[tuple[int, int, int]],
+    locations: ir.Value,
+    weights: ir.Value,
+) -> ir.Value:
+    batch, heads, width = (call.size(value, axis) for axis in (0, 2, 3))
+    queries, points = call.size(locations, 1), call.size(locations, 4)
+    both = call.product(batch, heads)
+    scaled = call.add("Mul", [locations, call.numbers(2.0, locations)])
+    grids = call.add("Sub", [scaled, call.numbers(1.0, locations)])
+    grids = call.transpose(grids, (0, 2, 3, 1, 4, 5))  # [N, M, L, Q, P, 2]
+    by_head = call.transpose(value, (0, 2, 3, 1))  # [N, M, D, S]
+    samples, kept = [], []
+    for level, (height, columns, start) in enumerate(maps):
+        if not height * columns:
+            continue
+        rows = call.slice(by_head, start, start + height * columns, 3)
+        image = call.reshape(rows, (both, width, height, columns))
+        grid = call.slice(grids, level, level + 1, 2)
+        grid = call.reshape(grid, (both, queries, points, 2))
+        taken = call.add("GridSample", [image, grid], {"align_corners": 0})
+        samples.append(taken)  # [N*M, D, Q, P]
+        kept.append(level)
+    if not samples:
+        return call.zeros((batch, queries, heads, width), value)
+    weights = call.transpose(weights, (0, 2, 1, 3, 4))  # [N, M, Q, L, P]
+    if len(kept) < len(maps):
+        weights = call.add("Gather", [weights, call.integers(kept)], {"axis": 3})
+    flat = call.product(len(kept), points)
+    weights = call.reshape(weights, (both, 1, queries, flat))
+    weighted = call.add("Mul", [call.concat(samples, 3), weights])
+    summed = call.reshape(call.sum(weighted, (3,)), (batch, heads, width, queries))
+    return call.transpose(summed, (0, 3, 1, 2))
+
+
+def _by_gather(
+    call: FusedCall,
+    value: ir.Value,
+    sizes: ir.Value,
+    starts: ir.Value,
+    locations: ir.Value,
+    weights: ir.Value,
+) -> ir.Value:
+    """Take the four rows around each position; a row of zeros stands for outside."""
+    heads, width = call.size(value, 2), call.size(value, 3)
+    sizes = call.cast(sizes, ir.DataType.INT64)
+    height, columns = (
+        _by_level(call, call.add("Gather", [sizes, call.integers(axis)], {"axis": 1}))
+        for axis in (0, 1)
+    )
+    x, y = call.split_last(locations, 2)
+    axes = [_neighbours(call, at, count) for at, count in ((x, columns), (y, height))]
+    padded = call.add("Pad", [value, call.integers([0, 1, 0, 0, 0, 0, 0, 0])])
+    rows = call.reshape(padded, (-1, width))
+    base = _first_rows(call, padded, starts)
+    many = call.value_of(heads)
+    nothing, zero = call.integers(0), call.numbers(0.0, weights)
+    parts = []
+    for row, row_inside, row_part in axes[1]:
+        for column, inside, part in axes[0]:
+            where = call.add("And", [inside, row_inside])
+            at = call.add("Add", [call.add("Mul", [row, columns]), column])
+            index = call.add("Add", [base, call.add("Mul", [at, many])])
+            index = call.add("Where", [where, index, nothing])
+            share = call.add("Mul", [call.add("Mul", [part, row_part]), weights])
+            share = call.add("Where", [where, share, zero])
+            taken = call.add("Gather", [rows, index], {"axis": 0})
+            taken = call.add("Mul", [taken, call.unsqueeze(share, (5,))])
+            parts.append(call.sum(taken, (3, 4)))
+    return functools.reduce(lambda one, two: call.add("Add", [one, two]), parts)
+
+
+def _by_level(call: FusedCall, numbers: ir.Value) -> ir.Value:
+    """Put one number a level [L] along the axes of weights, [L, 1]."""
+    return call.unsqueeze(numbers, (1,))
+
+
+def _as(call: FusedCall, count: ir.Value, like: ir.Value) -> ir.Value:
+    return call.cast(count, like.dtype or ir.DataType.FLOAT)
+
+
+def _neighbours(
+    call: FusedCall, position: ir.Value, count: ir.Value
+) -> list[tuple[ir.Value, ir.Value, ir.Value]]:
+    """Write the two pixels around a position along one axis: index, inside, share."""
+    size = _as(call, count, position)
+    scaled = call.add("Mul", [position, size])
+    pixel = call.add("Sub", [scaled, call.numbers(0.5, position)])
+    low = call.add("Floor", [pixel])
+    part = call.add("Sub", [pixel, low])
+    one = call.numbers(1.0, pixel)
+    found = []
+    for edge, share in (
+        (low, call.add("Sub", [one, part])),
+        (call.add("Add", [low, one]), part),
+    ):
+        inside = call.add(
+            "And",
+            [
+                call.add("GreaterOrEqual", [edge, call.numbers(0.0, pixel)]),
+                call.add("Less", [edge, size]),
+            ],
+        )
+        found.append((call.cast(edge, ir.DataType.INT64), inside, share))
+    return found
+
+
+def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value:
+    """Write where each map of each head begins among the rows, [N, 1, M, L, 1]."""
+    batch, length, heads = (call.size(padded, axis) for axis in (0, 1, 2))
+    many = call.value_of(heads)
+    starts = call.cast(starts, ir.DataType.INT64)
+    level = call.add("Mul", [call.add("Add", [starts, call.integers([1])]), many])
+    level = call.unsqueeze(level, (1,))
+    head = call.unsqueeze(_counting(call, heads), (1, 2))
+    first = call.add("Add", [head, level])  # [M, L, 1]
+    if batch == 1:
+        return first
+    step = call.value_of(call.product(length, heads))
+    image = call.add("Mul", [_counting(call, batch), step])
+    return call.add("Add", [call.unsqueeze(image, (1, 2, 3, 4)), first])
+
+
+def _counting(call: FusedCall, size: Size) -> ir.Value:
+    """Write 0, 1, ... below a size."""
+    if isinstance(size, int):
+        return call.integers(list(range(size)))
+    end = call.add("Squeeze", [size, call.integers([0])])
+    return call.add("Range", [call.integers(0), end, call.integers(1)])
+
+
+def sample_levels_array(
+    value: Numbers, sizes: Sizes, starts: Sizes, locations: Numbers, weights: Numbers
+) -> Numbers:
+    """Compute :func:`sample_levels` in numpy; a position that is not finite is outside.
+
+    Returns:
+        [N, Q, M, D] float64.
+    """
+    batch, _, heads, _ = value.shape
+    total = np.zeros((batch, locations.shape[1], heads, value.shape[3]))
+    image = np.arange(batch).reshape(-1, 1, 1, 1)
+    head = np.arange(heads).reshape(1, 1, -1, 1)
+    for level, ((height, width), start) in enumerate(zip(sizes, starts, strict=True)):
+        if not height * width:
+            continue
+        size = np.array([width, height], np.float64)
+        pixel = locations[:, :, :, level] * size - 0.5
+        pixel = np.where(np.isfinite(pixel), pixel, -2.0).clip(-2, size + 1)
+        low = np.floor(pixel)
+        for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            at = low + corner
+            inside = ((at >= 0) & (at < size)).all(axis=-1)
+            share = (1 - np.abs(pixel - at)).prod(axis=-1) * weights[:, :, :, level]
+            x, y = np.moveaxis(at.clip(0, size - 1).astype(np.int64), -1, 0)
+            taken = value[image, start + y * width + x, head]
+            total += (np.where(inside, share, 0)[..., None] * taken).sum(axis=3)
+    return total

@@ -1,0 +1,131 @@
+"""Multi-scale deformable attention (Deformable DETR, arXiv 2010.04159, equation 3)."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.attention_layouts import JoinedHeads, RawAttention, five
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    INT8_TOO,
+    INT32,
+    INTEGERS,
+    OWN_DOMAIN,
+    Arrays,
+    Attribute,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+)
+
+
+def _operands(integers: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
+    return (
+        Operand("value", "N S M D"),
+        Operand("spatial_shapes", "L 2", integers),
+        Operand("level_start_index", "L", integers),
+        Operand("sampling_locations", "N Q M L P 2", positions=True),
+        Operand("attention_weights", "N Q M L P"),
+    )
+
+
+_RAW = (
+    Operand("value", "N S M D", INT8_TOO),
+    Operand("spatial_shapes", "L 2", INT32),
+    Operand("reference_points", "N Q 1 *", INT8_TOO, positions=True),
+    Operand("sampling_offsets", "N Q M *", INT8_TOO, positions=True),
+    Operand("attention_weights", "N Q M *", INT8_TOO),
+)
+
+
+_OSS, _DL4AGX, _DERRYHUB = "TensorRT OSS", "DL4AGX", "BEVFormer_tensorrt"
+_ATTENTION = "MultiscaleDeformableAttnPlugin_TRT"
+_DERRYHUB_NAME = "MultiScaleDeformableAttnTRT"
+_JOINED = "MultiScaleDeformableAttentionPlugin"
+_MMCV = "MMCVMultiScaleDeformableAttention"
+
+
+@dataclasses.dataclass(frozen=True)
+class DeformableAttention(Operator):
+    """A weighted sum of samples of several feature maps, for each query and head.
+
+    Own form ``me2e::MultiScaleDeformableAttention``, inputs as TensorRT OSS's plugin:
+    value [N, S, M, D]; spatial_shapes int32 or int64 [L, 2] (H, W); level_start_index
+    [L]; sampling_locations [N, Q, M, L, P, 2] (x, y) in 0..1; attention_weights
+    [N, Q, M, L, P] after their softmax. Output [N, Q, M, D].
+    """
+
+    name: ClassVar[str] = "deformable-attention"
+    own: ClassVar[Dialect] = Dialect(
+        "me2e", "MultiScaleDeformableAttention", OWN_DOMAIN, _operands(INTEGERS), "me2e"
+    )
+    dialects: ClassVar[tuple[Dialect, ...]] = (
+        Dialect("tensorrt", _ATTENTION, "trt.plugins", _operands(INT32), _OSS),
+        Dialect(
+            "tensorrt-v2", _ATTENTION, "trt.plugins", _operands(INT32), _OSS, (), "2"
+        ),
+        Dialect("far3d", _ATTENTION, "trt", _operands(INT32), "DL4AGX far3d"),
+        JoinedHeads("dl4agx", _JOINED, "custom_op", _operands(INT32), _DL4AGX),
+        JoinedHeads("autoware", _JOINED, "", _operands(INT32), "Autoware"),
+        JoinedHeads(
+            "mmdeploy", _MMCV, "mmdeploy", _operands(INT32), "mmdeploy",
+            (Attribute("im2col_step", 64, required=False),),
+        ),
+        RawAttention("derryhub", _DERRYHUB_NAME, "", _RAW, _DERRYHUB),
+        RawAttention("derryhub-trt2", f"{_DERRYHUB_NAME}2", "", _RAW, _DERRYHUB),
+        RawAttention(
+            "dl4agx-uniad", _DERRYHUB_NAME, "",
+            tuple(
+                dataclasses.replace(each, types=(ir.DataType.INT64,))
+                if each.types == INT32 else each for each in _RAW
+            ),
+            "DL4AGX uniad-trt",
+        ),
+        Dialect("msda-plugin", "MSDAPlugin", "", _operands(INT32), _DL4AGX),
+    )  # fmt: skip
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Sample every level; GridSample where sizes are constant, else Gather."""
+        return sample_levels(call, *five(inputs))
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, [N, Q, M, D] float64."""
+        given = (np.asarray(each) for each in inputs)
+        value, shapes, starts, locations, weights = given
+        return sample_levels_array(
+            value.astype(np.float64),
+            shapes.astype(np.int64),
+            starts.astype(np.int64),
+            locations.astype(np.float64),
+            weights.astype(np.float64),
+        )
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return [N, Q, M, D]."""
+        value, locations = shapes[0], shapes[3]
+        if value is None and locations is None:
+            return None
+        value, locations = value or (None,) * 4, locations or (None,) * 6
+        batch = value[0] if value[0] is not None else locations[0]
+        heads = value[2] if value[2] is not None else locations[2]
+        return (batch, locations[1], heads, value[3])
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count four neighbours for each of N * Q * M * L * P samples of D numbers."""
+        value, weights = shapes[0], shapes[4]
+        if value is None or weights is None or value[3] is None:
+            return None
+        known = [dim for dim in weights if dim is not None]
+        if len(known) < len(weights):
+            return None
+        return 4 * math.prod(known) * value[3]

@@ -1,0 +1,90 @@
+"""Which fused operator a node is, and in whose spelling."""
+
+import functools
+
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.graph.nodes import is_plugin, is_standard
+from me2e_compress.graph.validity import PLUGIN_DOMAIN
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.dialect import OWN_DOMAIN, Dialect
+from me2e_compress.registry import Registry
+
+_HERE = "me2e_compress.operators"
+
+OPERATORS: Registry[Operator] = Registry(
+    "operator",
+    _HERE,
+    RecipeError,
+    {"deformable-attention": f"{_HERE}.deformable_attention:DeformableAttention"},
+)
+
+_RESERVED = (OWN_DOMAIN, "com.microsoft")
+"""Domains whose names mean what that domain says, and nothing else."""
+
+
+def find(node: ir.Node) -> tuple[Operator, Dialect] | None:
+    """Return the fused operator that a node is, and its dialect; None if it is none.
+
+    TensorRT finds a plugin by the operator's name, and exporters put it in any domain
+    or none: so the name decides. Among several dialects of one name, the domain and
+    ``plugin_version`` choose, then the types and shapes that the node's inputs have.
+    """
+    rows = _rows().get(node.op_type)
+    if rows is None or (is_standard(node) and not is_plugin(node)):
+        return None
+    domain = "" if is_standard(node) or node.domain == PLUGIN_DOMAIN else node.domain
+    if domain in _RESERVED:
+        rows = [row for row in rows if row[1].domain == domain]
+    else:
+        rows = [row for row in rows if row[1].domain not in _RESERVED]
+    version = node.attributes.get_string("plugin_version", "1")
+    return max(
+        rows,
+        key=lambda row: (
+            row[1].domain == domain,
+            row[1].version == version,
+            _fits(row[1], node),
+        ),
+        default=None,
+    )
+
+
+def dialect_of(operator: Operator, name: str) -> Dialect | None:
+    """Return an operator's dialect of this name; None if that library has none."""
+    return next((each for each in operator.all_dialects() if each.name == name), None)
+
+
+def dialect_names() -> tuple[str, ...]:
+    """List the names of all dialects, in the order of the operators."""
+    return tuple(
+        dict.fromkeys(
+            dialect.name
+            for operator in operators()
+            for dialect in operator.all_dialects()
+        )
+    )
+
+
+@functools.cache
+def operators() -> tuple[Operator, ...]:
+    """Build every operator that can be imported, ours first."""
+    return tuple(OPERATORS.build(name, {}) for name in OPERATORS.usable())
+
+
+@functools.cache
+def _rows() -> dict[str, list[tuple[Operator, Dialect]]]:
+    rows: dict[str, list[tuple[Operator, Dialect]]] = {}
+    for operator in operators():
+        for dialect in operator.all_dialects():
+            rows.setdefault(dialect.op_type, []).append((operator, dialect))
+    return rows
+
+
+def _fits(dialect: Dialect, node: ir.Node) -> bool:
+    try:
+        dialect.check(node)
+    except PreconditionError:
+        return False
+    return True

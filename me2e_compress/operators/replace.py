@@ -1,0 +1,146 @@
+"""A fused node in other words: its body, or the same call in another dialect."""
+
+import onnx_ir as ir
+
+from me2e_compress.errors import GraphError, PreconditionError
+from me2e_compress.graph.nodes import is_read
+from me2e_compress.graph.shapes import open_shape
+from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    OWN_DOMAIN,
+    PLUGIN_ATTRIBUTES,
+    Dialect,
+    Values,
+)
+from me2e_compress.operators.lookup import find
+from me2e_compress.rewrite import replace_value
+
+
+def expand(
+    node: ir.Node, *, opset: int, by: str, names: set[str] | None = None
+) -> None:
+    """Put standard operators in the place of a fused node.
+
+    Args:
+        node: recognised by :func:`~me2e_compress.operators.find`; it is removed, and
+            what read its output reads the same name.
+        opset: of ONNX's own operators, 13 or later.
+        by: the name of the pass, for the provenance.
+        names: of all values of the model, where many nodes are expanded.
+
+    Raises:
+        PreconditionError: the node's attributes, or its inputs' number, types or
+            shapes, are of no such call.
+        GraphError: it is no fused operator.
+    """
+    operator, dialect = _found(node)
+    call = FusedCall(node, opset=opset, by=by, names=names)
+    inputs, attributes = _own_call(call, dialect)
+    result = operator.body(call, inputs, attributes)
+    _take_place(call, dialect.result_from_own(call, result, inputs))
+
+
+def translate(
+    node: ir.Node,
+    to: Dialect,
+    *,
+    opset: int,
+    by: str,
+    names: set[str] | None = None,
+) -> None:
+    """Put the same call in another dialect in the place of a fused node.
+
+    A node whose dialect has no domain stands in ``me2e.plugin`` afterwards, and says in
+    its metadata that it had none, as import-normalize does it.
+
+    Args:
+        node: see :func:`expand`.
+        to: a dialect of the same operator.
+        opset: of ONNX's own operators.
+        by: the name of the pass, for the provenance.
+        names: of all values of the model, where many nodes are translated.
+
+    Raises:
+        PreconditionError: see :func:`expand`; or the dialect cannot say it.
+        GraphError: it is no fused operator.
+    """
+    operator, dialect = _found(node)
+    call = FusedCall(node, opset=opset, by=by, names=names)
+    own, attributes = _own_call(call, dialect)
+    inputs = to.inputs_from_own(call, own, attributes)
+    options = {**to.options_from_own(attributes), **_plugin_attributes(to)}
+    result = call.add(to.op_type, inputs, options, domain=to.domain)
+    made = result.producer()
+    assert made is not None
+    if not to.domain:
+        made.domain = PLUGIN_DOMAIN
+        made.metadata_props[ORIGINAL_DOMAIN] = ""
+    set_output(made, operator, to)
+    result = to.result_to_own(call, result, own)
+    _take_place(call, dialect.result_from_own(call, result, own))
+
+
+def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
+    """Write the type and shape of what a fused node gives, as far as inputs tell.
+
+    Returns:
+        Whether anything that was not known is known now.
+    """
+    shapes = dialect.shapes_to_own([open_shape(value) for value in node.inputs])
+    attributes = dialect.options_to_own(dialect.attributes_of(node))
+    shape = operator.output_shape(shapes, attributes)
+    result, known = node.outputs[0], False
+    if shape is not None and None in (found := open_shape(result) or (None,)):
+        own = dialect.shape_from_own(shape)
+        merged = [a if a is not None else b for a, b in zip(found, own, strict=False)]
+        dims = own if result.shape is None else merged
+        if len(dims) == len(own) and (result.shape is None or tuple(dims) != found):
+            result.shape, known = ir.Shape(list(dims)), True
+    value = node.inputs[0]
+    if result.type is None and value is not None and value.dtype is not None:
+        result.type, known = ir.TensorType(value.dtype), True
+    return known
+
+
+def _found(node: ir.Node) -> tuple[Operator, Dialect]:
+    found = find(node)
+    if found is None:
+        raise GraphError(f"node {node.name}: {node.op_type} is no fused operator")
+    if read := [value.name for value in node.outputs[1:] if is_read(value)]:
+        raise PreconditionError(f"node {node.name}: it has no output {read[0]}")
+    return found
+
+
+def _own_call(call: FusedCall, dialect: Dialect) -> tuple[Values, Attributes]:
+    dialect.check(call.node)
+    attributes = dialect.attributes_of(call.node)
+    inputs = dialect.inputs_to_own(call, tuple(call.node.inputs), attributes)
+    return inputs, dialect.options_to_own(attributes)
+
+
+def _plugin_attributes(dialect: Dialect) -> dict[str, str]:
+    if dialect.domain == OWN_DOMAIN:
+        return {}
+    both = (dialect.version, dialect.namespace)
+    return dict(zip(PLUGIN_ATTRIBUTES, both, strict=True))
+
+
+def _take_place(call: FusedCall, result: ir.Value) -> None:
+    """Let what was written stand for the node's output, under its name."""
+    node, old = call.node, call.node.outputs[0]
+    made, body = result.producer(), node.graph
+    assert body is not None
+    if made is None or result in node.inputs:  # an output needs a node that makes it
+        result = call.add("Identity", [result])
+    if result.shape is None or not result.shape.is_static():
+        result.shape = old.shape if old.shape is not None else result.shape
+    result.type = result.type if result.type is not None else old.type
+    name = old.name
+    if isinstance(body, ir.Graph):
+        replace_value(old, result)
+    else:
+        old.replace_all_uses_with(result, replace_graph_outputs=True)
+    body.remove(node, safe=True)
+    result.name = name

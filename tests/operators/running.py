@@ -1,0 +1,112 @@
+"""One fused node in a graph of its own: drawn inputs, its body run, its reference."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+import onnxruntime
+
+from me2e_compress.graph.shapes import infer_shapes
+from me2e_compress.operators import Dialect, Operator, expand
+from me2e_compress.operators.call import AttributeValue
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+
+def graph_of(
+    dialect: Dialect,
+    arrays: Arrays,
+    *,
+    opset: int,
+    constants: Sequence[str] = (),
+    attributes: Mapping[str, AttributeValue] | None = None,
+    open_dims: bool = False,
+) -> ir.Model:
+    """Build the graph of one node whose inputs are those of the graph, in order.
+
+    Args:
+        dialect: how the node is spelt.
+        arrays: by name, in the order of the operands.
+        opset: of ONNX's own operators.
+        constants: the inputs that are initializers.
+        attributes: of the node.
+        open_dims: whether the graph says no dimension of its inputs.
+    """
+    values = []
+    for name, array in arrays.items():
+        dims: list[str | int] = list(array.shape)
+        if open_dims and name not in constants:
+            dims = [f"{name}_{axis}" for axis in range(array.ndim)]
+        value = ir.Value(
+            name=name,
+            shape=ir.Shape(dims),
+            type=ir.TensorType(ir.DataType.from_numpy(array.dtype)),
+        )
+        if name in constants:
+            value.const_value = ir.tensor(array, name=name)
+        values.append(value)
+    node = ir.node(
+        dialect.op_type,
+        values,
+        attributes,
+        domain=dialect.domain,
+        name="fused",
+        num_outputs=1,
+    )
+    node.outputs[0].name = "result"
+    graph = ir.Graph(
+        [value for value in values if value.name not in constants],
+        node.outputs,
+        nodes=[node],
+        initializers=[value for value in values if value.name in constants],
+        opset_imports={"": opset, dialect.domain: opset if not dialect.domain else 1},
+        name="one",
+    )
+    return ir.Model(graph, ir_version=9)
+
+
+def run(model: ir.Model, arrays: Arrays) -> npt.NDArray[Any]:
+    """Run a graph of standard operators by onnxruntime; return its output."""
+    infer_shapes(model)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 3
+    written = ir.to_proto(model).SerializeToString()
+    session = onnxruntime.InferenceSession(
+        written, options, providers=["CPUExecutionProvider"]
+    )
+    asked = {port.name for port in session.get_inputs()}
+    found = session.run(None, {n: a for n, a in arrays.items() if n in asked})
+    return np.asarray(found[0])
+
+
+def body_and_reference(
+    operator: Operator,
+    dialect: Dialect,
+    arrays: Arrays,
+    *,
+    opset: int,
+    constants: Sequence[str] = (),
+    attributes: Mapping[str, AttributeValue] | None = None,
+    open_dims: bool = False,
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Run the body of one call, and compute its reference on the same arrays."""
+    model = graph_of(
+        dialect,
+        arrays,
+        opset=opset,
+        constants=constants,
+        attributes=attributes,
+        open_dims=open_dims,
+    )
+    node = model.graph[0]
+    options = dialect.attributes_of(node)
+    expand(node, opset=opset, by="test")
+    assert all(each.domain == "" for each in model.graph)
+    for domain in [each for each in model.graph.opset_imports if each]:
+        del model.graph.opset_imports[domain]
+    return run(model, arrays), operator.dialect_reference(
+        dialect, list(arrays.values()), options
+    )
