@@ -14,7 +14,14 @@ from me2e_compress.operators.lookup import (
     find,
     operators,
 )
-from me2e_compress.operators.replace import expand, set_output, translate
+from me2e_compress.operators.replace import (
+    FusedNode,
+    expand,
+    fused_nodes,
+    import_domains,
+    set_output,
+    translate,
+)
 
 __all__ = [
     "OPERATORS",
@@ -23,12 +30,15 @@ __all__ = [
     "Cost",
     "Dialect",
     "FusedCall",
+    "FusedNode",
     "Operand",
     "Operator",
     "dialect_names",
     "dialect_of",
     "expand",
     "find",
+    "fused_nodes",
+    "import_domains",
     "operators",
     "set_output",
     "translate",

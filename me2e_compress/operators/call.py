@@ -41,7 +41,7 @@ class FusedCall:
             raise GraphError(f"node {node.name} is not in a graph")
         self.node, self.opset, self.by = node, opset, by
         self._where: ir.Graph | ir.Function = node.graph
-        self.names = _names_in(self._where) if names is None else names
+        self.names = names_in(self._where) if names is None else names
         self._stem = node.name or str(node.outputs[0].name)
 
     def add(
@@ -193,7 +193,8 @@ def _shape(sizes: Sequence[Size]) -> ir.Shape:
     return ir.Shape(list(dims))
 
 
-def _names_in(where: ir.Graph | ir.Function) -> set[str]:
+def names_in(where: ir.Graph | ir.Function) -> set[str]:
+    """Collect the names of all values of a graph or function."""
     if isinstance(where, ir.Graph):
         return value_names(where)
     values = (value.name or "" for node in where for value in node.outputs)

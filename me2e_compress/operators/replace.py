@@ -1,13 +1,16 @@
 """A fused node in other words: its body, or the same call in another dialect."""
 
+import dataclasses
+
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError, PreconditionError
-from me2e_compress.graph.nodes import is_read
+from me2e_compress.graph import opset_of
+from me2e_compress.graph.nodes import STANDARD, is_read, nodes_in
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.call import Attributes, FusedCall, names_in
 from me2e_compress.operators.dialect import (
     OWN_DOMAIN,
     PLUGIN_ATTRIBUTES,
@@ -15,7 +18,61 @@ from me2e_compress.operators.dialect import (
     Values,
 )
 from me2e_compress.operators.lookup import find
-from me2e_compress.rewrite import replace_value
+from me2e_compress.rewrite import replace_value, value_names
+
+_LEAST_OPSET = 13
+"""ReduceSum and Unsqueeze take their axes as inputs from here on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FusedNode:
+    """A fused node of a model, and what is needed to rewrite it.
+
+    Attributes:
+        node: where it stands.
+        operator: what it is.
+        dialect: how it is spelt.
+        opset: of ONNX's own operators, where it stands.
+        names: of all values and nodes there.
+    """
+
+    node: ir.Node
+    operator: Operator
+    dialect: Dialect
+    opset: int
+    names: set[str]
+
+
+def fused_nodes(model: ir.Model) -> list[FusedNode]:
+    """List the fused nodes of a graph, of its bodies and of its functions."""
+    names = value_names(model.graph)
+    names.update(node.name or "" for node in nodes_in(model.graph))
+    found = _found_in(model.graph, opset_of(model), names)
+    for function in model.functions.values():
+        found += _found_in(function, opset_of(function), names_in(function))
+    return found
+
+
+def _found_in(
+    body: ir.Graph | ir.Function, opset: int, names: set[str]
+) -> list[FusedNode]:
+    return [
+        FusedNode(node, *row, opset, names)
+        for node in nodes_in(body)
+        if (row := find(node)) is not None
+    ]
+
+
+def import_domains(model: ir.Model) -> None:
+    """Import every domain that is used, and no plugin domain that no longer is."""
+    bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
+    for body in bodies:
+        used = {node.domain for node in nodes_in(body)}
+        for domain in [each for each in body.opset_imports if each not in STANDARD]:
+            if domain not in used:
+                del body.opset_imports[domain]
+        for domain in sorted(used - {*STANDARD, *body.opset_imports}):
+            body.opset_imports[domain] = 1
 
 
 def expand(
@@ -36,6 +93,10 @@ def expand(
         GraphError: it is no fused operator.
     """
     operator, dialect = _found(node)
+    if opset < _LEAST_OPSET:
+        raise PreconditionError(
+            f"{by} needs opset {_LEAST_OPSET} or later; the graph is of {opset}"
+        )
     call = FusedCall(node, opset=opset, by=by, names=names)
     inputs, attributes = _own_call(call, dialect)
     result = operator.body(call, inputs, attributes)

@@ -20,6 +20,8 @@ PASSES: Registry[Pass] = Registry(
         "eliminate-redundant": f"{_HERE}.eliminate_redundant:EliminateRedundant",
         "ablate-modules": f"{_HERE}.ablate_modules:AblateModules",
         "fuse-basic": f"{_HERE}.fuse_basic:FuseBasic",
+        "expand-operators": f"{_HERE}.expand_operators:ExpandOperators",
+        "translate-plugins": f"{_HERE}.translate_plugins:TranslatePlugins",
         "quantize-int8": f"{_HERE}.quantize_int8:QuantizeInt8",
         "convert-float16": f"{_HERE}.convert_float16:ConvertFloat16",
         "convert-float32": f"{_HERE}.convert_float32:ConvertFloat32",

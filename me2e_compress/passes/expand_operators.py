@@ -1,0 +1,46 @@
+"""Standard operators instead of fused ones."""
+
+import dataclasses
+from collections import Counter
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress import operators, rewrite
+from me2e_compress.passes.base import Context, Pass, PassResult
+
+
+@dataclasses.dataclass(frozen=True)
+class ExpandOperators(Pass):
+    """Write every fused operator, in whatever dialect, in standard operators.
+
+    Given:   y = me2e.MultiScaleDeformableAttention(value, sizes, starts, at, weights)
+    Result:  y = Transpose(... ReduceSum(Mul(GridSample(value, 2 * at - 1), weights)))
+
+    Of the operators that the graph's opset has: GridSample from opset 16 on where the
+    sizes of the maps are constants, else Gather. A plugin that no dialect names stays
+    as it is.
+    """
+
+    name: ClassVar[str] = "expand-operators"
+    exact: ClassVar[bool] = True
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Expand the nodes of the graph, of its bodies and of its functions.
+
+        Raises:
+            PreconditionError: an opset below 13; or a plugin has an attribute, or
+                inputs, that its dialect does not know.
+        """
+        counts: Counter[str] = Counter()
+        for fused in operators.fused_nodes(model):
+            counts[fused.operator.name] += 1
+            operators.expand(
+                fused.node, opset=fused.opset, by=self.name, names=fused.names
+            )
+        if counts:
+            operators.import_domains(model)
+            rewrite.sweep(model)
+        done = ", ".join(f"{count} {name}" for name, count in counts.items())
+        notes = (f"expanded: {done}",) if done else ()
+        return PassResult(model, counts.total(), notes)

@@ -1,0 +1,77 @@
+"""Plugins of one library in the words of another."""
+
+import dataclasses
+from collections import Counter
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress import operators, rewrite
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.passes.base import Context, Pass, PassResult
+
+
+@dataclasses.dataclass(frozen=True)
+class TranslatePlugins(Pass):
+    """Write every fused operator in one dialect: the plugin library of a target.
+
+    Given:   y = MultiScaleDeformableAttnTRT(value, sizes, points, offsets, raw)
+    Result:  y = trt.plugins.MultiscaleDeformableAttnPlugin_TRT(value, sizes, starts,
+             points + offsets / sizes, Softmax(raw))       with dialect=tensorrt
+
+    Operator, domain, ``plugin_version``, ``plugin_namespace``, the order and the types
+    of the inputs and the layout of the output become those of the library. What has no
+    domain there has none in the file that is written.
+
+    Attributes:
+        dialect: the library; ``me2e`` is the toolkit's own form.
+
+    Raises:
+        RecipeError: no such dialect.
+    """
+
+    name: ClassVar[str] = "translate-plugins"
+    exact: ClassVar[bool] = True
+
+    dialect: str
+
+    def __post_init__(self) -> None:
+        """Check the name."""
+        known = operators.dialect_names()
+        if self.dialect not in known:
+            there = ", ".join(known)
+            raise RecipeError(
+                f"{self.name}: no dialect {self.dialect!r}; there are {there}"
+            )
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Translate the nodes of the graph, of its bodies and of its functions.
+
+        Raises:
+            PreconditionError: the library has no such operator, or cannot say it; or a
+                plugin has an attribute, or inputs, that its dialect does not know.
+        """
+        counts: Counter[str] = Counter()
+        for fused in operators.fused_nodes(model):
+            to = operators.dialect_of(fused.operator, self.dialect)
+            if to is None:
+                raise PreconditionError(self._lacks(fused))
+            if to == fused.dialect:
+                continue
+            counts[fused.operator.name] += 1
+            operators.translate(
+                fused.node, to, opset=fused.opset, by=self.name, names=fused.names
+            )
+        if counts:
+            operators.import_domains(model)
+            rewrite.sweep(model)
+        done = ", ".join(f"{count} {name}" for name, count in counts.items())
+        notes = (f"in the dialect {self.dialect}: {done}",) if done else ()
+        return PassResult(model, counts.total(), notes)
+
+    def _lacks(self, fused: operators.FusedNode) -> str:
+        there = ", ".join(each.name for each in fused.operator.all_dialects())
+        return (
+            f"node {fused.node.name}: the dialect {self.dialect} has no"
+            f" {fused.operator.name} ({fused.node.op_type}); it is in {there}"
+        )
