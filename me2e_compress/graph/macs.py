@@ -3,10 +3,10 @@
 import math
 from collections.abc import Callable, Iterable
 
-import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import graphs_of, input_at, is_standard
+from me2e_compress.graph.nodes import graphs_of, input_at, is_plugin
+from me2e_compress.graph.plugins import knowledge
 from me2e_compress.graph.shapes import static_shape
 
 Counter = Callable[[ir.Node], int | None]
@@ -27,15 +27,16 @@ def macs(node: ir.Node) -> int | None:
     channels per group. Gemm and MatMul: rows x columns x inner dimension x batch.
     Einsum of two operands: the product of all its dimensions. LSTM, GRU and RNN: steps
     x batch x elements of both weights, which hold all gates and directions. Attention:
-    queries x keys x what is multiplied for each pair. Integer forms likewise.
+    queries x keys x what is multiplied for each pair. Integer forms likewise. Plugins
+    of known dialects: what their operator counts.
 
     Returns:
-        The count; None where it is not known: of a plugin, a local function, an
-        operator that no rule counts, a loop around one that multiplies, or a shape
+        The count; None where it is not known: of an unknown plugin, a local function,
+        an operator that no rule counts, a loop around one that multiplies, or a shape
         that is open.
     """
-    if not is_standard(node) or not onnx.defs.has(node.op_type, domain=""):
-        return None
+    if is_plugin(node):
+        return knowledge().macs(node)
     if node.op_type in ("Loop", "Scan"):  # nobody knows how often it runs
         return 0 if all(macs(inner) == 0 for inner in _inside(node)) else None
     if node.op_type in _UNCOUNTED:
@@ -46,8 +47,9 @@ def macs(node: ir.Node) -> int | None:
 
 def why_uncounted(node: ir.Node) -> str:
     """Name a node's operator, and why nobody knows its MACs."""
-    if not is_standard(node) or not onnx.defs.has(node.op_type, domain=""):
-        return f"{node.op_type} (plugin or function)"
+    if is_plugin(node):
+        known = knowledge().knows(node)
+        return f"{node.op_type} ({'open shape' if known else 'plugin or function'})"
     if node.op_type in ("Loop", "Scan"):
         return f"{node.op_type} (a loop)"
     if node.op_type in _UNCOUNTED or _has_shapes(node):

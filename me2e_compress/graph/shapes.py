@@ -6,7 +6,8 @@ import math
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import input_at, is_plugin, nodes_of
+from me2e_compress.graph.nodes import input_at, is_plugin, nodes_in, nodes_of
+from me2e_compress.graph.plugins import knowledge
 
 INLINE_BYTES = 1024
 """Weights up to this size are shown to ONNX's inference: shapes and axes are."""
@@ -41,8 +42,9 @@ def infer_shapes(
 ) -> None:
     """Infer types and shapes by ONNX, data propagation included, in place.
 
-    A node of an unknown domain stops nothing: what it gives keeps the shape that the
-    file records, or none. A graph that ONNX cannot infer at all stays as it is, and
+    Plugins of known dialects tell what they give (:mod:`me2e_compress.operators`). One
+    that nobody knows stops nothing: what it gives keeps the shape that the file
+    records, or none. A graph that ONNX cannot infer at all stays as it is, and
     so do the inputs and the order of the initializers in any case. Of the outputs,
     dimensions that the file leaves open become numbers: an exporter's symbol
     (``Gathery_dim_0``) hides what is known, and shape arithmetic behind it would stay.
@@ -55,6 +57,12 @@ def infer_shapes(
     Raises:
         onnx.shape_inference.InferenceError: strict, and shapes contradict each other.
     """
+    while _infer_once(model, strict, written) and _infer_plugins(model):
+        written = None  # what is behind a plugin is known now, up to the next one
+
+
+def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) -> bool:
+    """Let ONNX infer what it can; return whether it took the graph."""
     try:
         proto = onnx.shape_inference.infer_shapes(
             without_weights(model) if written is None else written,
@@ -68,8 +76,22 @@ def infer_shapes(
     ) as error:
         if strict and isinstance(error, onnx.shape_inference.InferenceError):
             raise
-        return
+        return False
     _adopt(model.graph, proto.graph, set(model.graph.outputs))
+    return True
+
+
+def _infer_plugins(model: ir.Model) -> bool:
+    """Let plugins say what they give; return whether anything is new."""
+    bare = [
+        node
+        for node in nodes_in(model.graph)
+        if is_plugin(node) and any(static_shape(each) is None for each in node.outputs)
+    ]
+    if not bare:
+        return False
+    known = knowledge()
+    return any([known.infer(node) for node in bare])
 
 
 def _adopt(
