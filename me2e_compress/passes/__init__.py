@@ -19,6 +19,7 @@ PASSES: Registry[Pass] = Registry(
         "fold-with-onnxsim": f"{_HERE}.fold_with_onnxsim:FoldWithOnnxsim",
         "eliminate-redundant": f"{_HERE}.eliminate_redundant:EliminateRedundant",
         "ablate-modules": f"{_HERE}.ablate_modules:AblateModules",
+        "fuse-operators": f"{_HERE}.fuse_operators:FuseOperators",
         "fuse-basic": f"{_HERE}.fuse_basic:FuseBasic",
         "expand-operators": f"{_HERE}.expand_operators:ExpandOperators",
         "translate-plugins": f"{_HERE}.translate_plugins:TranslatePlugins",

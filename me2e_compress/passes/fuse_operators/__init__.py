@@ -1,0 +1,177 @@
+"""Put fused operators in the place of what exporters decompose them into."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress.errors import GraphError, PreconditionError, RecipeError
+from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
+from me2e_compress.graph.nodes import is_read
+from me2e_compress.operators import OWN_DOMAIN, FusedCall
+from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.fuse_operators import decomposed, fused_form
+from me2e_compress.passes.fuse_operators.numeric_check import (
+    Proofs,
+    nodes_between,
+    piece_of,
+    run_piece,
+)
+from me2e_compress.rewrite import (
+    add_constant,
+    inherit,
+    remove_dead,
+    replace_value,
+    value_names,
+)
+
+__all__ = ["FuseOperators"]
+
+
+@dataclasses.dataclass(frozen=True)
+class FuseOperators(Pass):
+    """Make decomposed multi-scale deformable attention one node again.
+
+    Given:   g_l = 2 * locations[level l] - 1;  s_l = GridSample(value[level l], g_l);
+             y = ReduceSum(Concat(s_0, s_1, ...) * weights, axes=[-1])
+    Result:  y = me2e::MultiScaleDeformableAttention(
+                 value, spatial_shapes, level_start_index, locations, weights)
+
+    A correctness fix for TensorRT before it is one of speed: deformable attention that
+    is decomposed into GridSample is reported silently wrong from TensorRT 10.14 to 11.1
+    (NVIDIA/TensorRT issue 4813); ``translate-plugins`` makes the plugin's node of the
+    one that this pass writes.
+
+    It is found by what the nodes compute, whatever the exporter and the names: from
+    each GridSample (bilinear, zeros outside, corners not aligned) back and forth over
+    operators that only move elements, with one level or several, with heads in the
+    batch or apart. Each find is proven: the nodes and the fused node's body run on the
+    same random numbers, positions outside of the feature maps among them, and if they
+    differ the nodes stay. The notes name every GridSample that stays, and why.
+
+    Attributes:
+        tolerance: how far both may differ, as a part of the largest result (1e-4: what
+            sums of float32 in another order, and positions rounded on the way to -1..1
+            and back, cost).
+    """
+
+    name: ClassVar[str] = "fuse-operators"
+    exact: ClassVar[bool] = True
+    tolerance: float = 1e-4
+
+    def __post_init__(self) -> None:
+        """Check the tolerance."""
+        if not 0 < self.tolerance < 1:
+            raise RecipeError(
+                f"{self.name}: tolerance={self.tolerance} is not between 0 and 1"
+            )
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Look at every GridSample of the graph and its bodies."""
+        opset = opset_of(model)
+        run = _Run(self, opset, value_names(model.graph), Proofs(opset, context.seed))
+        for body in graphs_of(model.graph):
+            for node in list(body):
+                alive = node.graph is body
+                if alive and node.op_type == "GridSample" and is_standard(node):
+                    run.attempt(body, node)
+        if run.done:
+            model.opset_imports.setdefault(OWN_DOMAIN, 1)
+            remove_dead(model.graph)
+        return PassResult(model, run.done, run.notes())
+
+
+class _Run:
+    """What stays the same while a model is fused, and what was done so far."""
+
+    def __init__(
+        self, current: FuseOperators, opset: int, names: set[str], proofs: Proofs
+    ) -> None:
+        self.current, self.opset, self.names = current, opset, names
+        self.proofs = proofs
+        self.done, self.samplers, self.worst = 0, 0, 0.0
+        self.left: list[str] = []
+
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences for the report."""
+        fused = (
+            f"fused: {self.done} deformable attentions of {self.samplers} GridSample,"
+            f" within {self.worst:.0e} of what they were"
+        )
+        return (*([fused] if self.done else ()), *self.left)
+
+    def attempt(self, body: ir.Graph, node: ir.Node) -> None:
+        """Fuse what a GridSample is a part of, or note why not."""
+        try:
+            found = decomposed.find(node)
+            self._replace(body, fused_form.plan(found))
+        except (PreconditionError, GraphError) as error:
+            self.left.append(f"left {node.name}: {error}")
+            return
+        self.done += 1
+        self.samplers += len(found.levels)
+
+    def _replace(self, body: ir.Graph, plan: fused_form.Plan) -> None:
+        old = plan.result.value
+        root, known = old.producer(), set(body.initializers)
+        if root is None:
+            raise PreconditionError(f"nothing makes {old.name}")
+        inputs = [view.value for view in plan.inputs]
+        matched = nodes_between(old, inputs)
+        call = FusedCall(root, opset=self.opset, by=self.current.name, names=self.names)
+        new = fused_form.write(plan, call)
+        made = nodes_between(new, inputs)
+        try:
+            self._prove(old, new, plan)
+        except (PreconditionError, GraphError):
+            _take_back(body, made, known)
+            raise
+        for each in made:
+            inherit(each, [root, *matched], by=self.current.name)
+        replace_value(old, new)
+        self._fold(body, new, plan)
+        _drop_dead([*matched, *made])
+
+    def _prove(self, old: ir.Value, new: ir.Value, plan: fused_form.Plan) -> None:
+        """Compare both on random numbers.
+
+        Raises:
+            PreconditionError: they differ.
+        """
+        error = self.proofs.error(old, new, plan.inputs)
+        if not error <= self.current.tolerance:
+            raise PreconditionError(
+                f"as one node it differs by {error:.1e} (allowed"
+                f" {self.current.tolerance:.0e})"
+            )
+        self.worst = max(self.worst, error)
+
+    def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
+        """Compute the operands of the fused node that come from constants alone."""
+        views = [view.value for view in plan.inputs]
+        node = next(
+            each for each in nodes_between(new, views) if each.domain == OWN_DOMAIN
+        )
+        for index, source in ((0, plan.value), (3, plan.locations), (4, plan.weights)):
+            value = node.inputs[index]
+            constant = all(array_of(view.value) is not None for view in source)
+            if value is None or value.producer() is None or not constant:
+                continue
+            array = run_piece(piece_of(value, (), self.opset), ())
+            name = f"{value.name}_constant"
+            node.replace_input_with(index, add_constant(body, array, name, self.names))
+
+
+def _take_back(body: ir.Graph, made: Sequence[ir.Node], known: set[str]) -> None:
+    """Remove what was written in vain."""
+    body.remove(reversed(made), safe=True)
+    for name in [name for name in body.initializers if name not in known]:
+        del body.initializers[name]
+
+
+def _drop_dead(nodes: Sequence[ir.Node]) -> None:
+    """Remove the nodes that nothing reads any more; these are in order."""
+    for node in reversed(nodes):
+        if node.graph is not None and not any(is_read(each) for each in node.outputs):
+            node.graph.remove(node, safe=True)

@@ -1,0 +1,219 @@
+"""The search for a deformable attention that standard operators spell out.
+
+Zhu et al., Deformable DETR, 2021, equation 3, as exporters write it: GridSample of
+every level's feature map, the levels joined, a product with the attention weights, a
+sum over points and levels.
+"""
+
+import dataclasses
+import math
+
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import array_of, input_at, is_standard, static_shape
+from me2e_compress.graph.nodes import producer_of, sole_reader
+from me2e_compress.passes.fuse_operators.digits import (
+    Digit,
+    Digits,
+    Layout,
+    flat,
+    whole,
+)
+from me2e_compress.passes.fuse_operators.views import LAYOUT_OPERATORS, View, results
+
+BATCH, CHANNEL, LEVEL, PIXEL, XY = "batch", "channel", "level", "pixel", "xy"
+ROW, COLUMN = "row", "column"
+"""The axes of what is sampled: rows and columns are those of GridSample's output."""
+
+SAMPLING = {
+    "mode": ("bilinear", "linear"),  # from opset 20 on it is called linear
+    "padding_mode": ("zeros",),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Level:
+    """One feature map and where it is sampled.
+
+    Attributes:
+        node: the GridSample.
+        image: of batch and heads, channels, pixels.
+        grid: of batch and heads, rows, columns, x and y; -1 and 1 are the edges.
+        size: height and width.
+    """
+
+    node: ir.Node
+    image: View
+    grid: View
+    size: tuple[int, int]
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels the feature map has."""
+        return math.prod(self.size)
+
+
+@dataclasses.dataclass(frozen=True)
+class Decomposed:
+    """A deformable attention in standard operators.
+
+    Attributes:
+        levels: its feature maps, in the order in which they are joined.
+        weights: what the samples are multiplied by.
+        results: the sum, and where layout operators take it; each may be replaced.
+        queries: the digits of what is left of rows and columns.
+        points: the digits of what is summed over, the level apart.
+        batch: images times heads.
+        channels: of one head.
+    """
+
+    levels: tuple[Level, ...]
+    weights: View
+    results: tuple[View, ...]
+    queries: Digits
+    points: Digits
+    batch: int
+    channels: int
+
+
+def find(node: ir.Node) -> Decomposed:
+    """Look for the deformable attention that a GridSample is a part of.
+
+    Raises:
+        PreconditionError: it is a part of none; the message says what differs.
+    """
+    levels, samples = _levels(node)
+    product, weights = _weighted(samples)
+    total = _summed(list(results(product))[-1])
+    left, before = flat(total.layout), flat(product.layout)
+    gone = _difference(before, left)
+    if any(digit.axis in (BATCH, CHANNEL) for digit in gone):
+        raise PreconditionError("the sum is over channels or heads too")
+    if any(digit.axis == LEVEL for digit in left):
+        raise PreconditionError("the levels are not summed over")
+    return Decomposed(
+        levels,
+        weights,
+        tuple(results(total)),
+        queries=tuple(each for each in left if each.axis in (ROW, COLUMN)),
+        points=tuple(each for each in gone if each.axis in (ROW, COLUMN)),
+        batch=(static_shape(levels[0].image.value) or (0,))[0],
+        channels=(static_shape(levels[0].image.value) or (0, 0))[1],
+    )
+
+
+def _difference(digits: Digits, others: Digits) -> Digits:
+    return tuple(digit for digit in digits if digit not in others)
+
+
+def _level(node: ir.Node) -> tuple[Level, View]:
+    """Return what a GridSample samples, and the view of what it gives."""
+    for name, allowed in SAMPLING.items():
+        found = node.attributes.get_string(name, allowed[0])
+        if found not in allowed:
+            raise PreconditionError(f"it samples with {name}={found}")
+    if node.attributes.get_int("align_corners", 0):
+        raise PreconditionError("it samples with align_corners=1")
+    image, grid = node.inputs[0], node.inputs[1]
+    shape, places = static_shape(image), static_shape(grid)
+    if image is None or grid is None or shape is None or places is None:
+        raise PreconditionError(
+            "its shapes are not known: run fold-constants first, open dimensions fixed"
+        )
+    if len(shape) != 4:
+        raise PreconditionError("it samples in three dimensions")
+    if image.dtype != ir.DataType.FLOAT or grid.dtype != ir.DataType.FLOAT:
+        raise PreconditionError("it samples in another type than float32")
+    batch, channels, height, width = shape
+    pixels = (
+        (Digit(PIXEL, width, height),) if height > 1 else (),
+        (Digit(PIXEL, 1, width),) if width > 1 else (),
+    )
+    first, rows, columns = (
+        whole(BATCH, batch),
+        whole(ROW, places[1]),
+        whole(COLUMN, places[2]),
+    )
+    second = whole(CHANNEL, channels)
+    level = Level(
+        node,
+        View(image, (first, second, *pixels)),
+        View(grid, (first, rows, columns, whole(XY, 2))),
+        (height, width),
+    )
+    return level, View(node.outputs[0], (first, second, rows, columns))
+
+
+def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
+    """Return all levels that are sampled alike and joined, and what they make."""
+    level, sampled = _level(node)
+    end = list(results(sampled))[-1]
+    concat = sole_reader(end.value)
+    if concat is None or concat.op_type != "Concat" or not is_standard(concat):
+        return (level,), end
+    levels: list[Level] = []
+    for value in concat.inputs:
+        sampler = _sampler(value)
+        if sampler is None:
+            raise PreconditionError("what it samples is joined with something else")
+        level, sampled = _level(sampler)
+        last = list(results(sampled))[-1]
+        if last.value is not value or last.layout != end.layout:
+            raise PreconditionError(
+                "the levels have different numbers of points or heads"
+            )
+        levels.append(level)
+    layout = list(end.layout)
+    axis = concat.attributes.get_int("axis", 0) % len(layout)
+    layout[axis] = (*whole(LEVEL, len(levels)), *layout[axis])
+    together = View(concat.outputs[0], tuple(layout))
+    return tuple(levels), list(results(together))[-1]
+
+
+def _sampler(value: ir.Value | None) -> ir.Node | None:
+    """Return the GridSample that layout operators take a value from."""
+    node = producer_of(value)
+    while node is not None and is_standard(node) and node.op_type in LAYOUT_OPERATORS:
+        node = producer_of(node.inputs[0])
+    return node if node is not None and node.op_type == "GridSample" else None
+
+
+def _weighted(samples: View) -> tuple[View, View]:
+    """Return the product of the samples with their weights, and the weights."""
+    node = sole_reader(samples.value)
+    if node is None or node.op_type != "Mul" or not is_standard(node):
+        raise PreconditionError("what it samples is not multiplied by weights")
+    other = node.inputs[1] if node.inputs[0] is samples.value else node.inputs[0]
+    shape, full = static_shape(other), static_shape(samples.value)
+    if other is None or shape is None or static_shape(node.outputs[0]) != full:
+        raise PreconditionError("what it samples is not multiplied by weights")
+    aligned = (1,) * (len(samples.layout) - len(shape)) + shape
+    layout: Layout = tuple(
+        digits if size > 1 else ()
+        for digits, size in zip(samples.layout, aligned, strict=True)
+    )
+    if any(digit.axis == CHANNEL for digit in flat(layout)):
+        raise PreconditionError("the weights differ from channel to channel")
+    product = dataclasses.replace(samples, value=node.outputs[0])
+    return product, View(other, layout[len(layout) - len(shape) :])
+
+
+def _summed(product: View) -> View:
+    """Return the sum of the product over its points."""
+    node = sole_reader(product.value)
+    if node is None or node.op_type != "ReduceSum" or not is_standard(node):
+        raise PreconditionError("the weighted samples are not summed")
+    written = node.attributes.get_ints("axes")
+    given = array_of(input_at(node, 1))
+    axes = given.reshape(-1).tolist() if given is not None else written
+    if not axes:
+        raise PreconditionError("the sum is over all axes, or over computed ones")
+    over = {int(axis) % len(product.layout) for axis in axes}
+    keep = bool(node.attributes.get_int("keepdims", 1))
+    layout = tuple(
+        () if axis in over else digits
+        for axis, digits in enumerate(product.layout)
+        if keep or axis not in over
+    )
+    return View(node.outputs[0], layout)

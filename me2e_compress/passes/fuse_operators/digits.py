@@ -1,0 +1,136 @@
+"""Indices in mixed radix: what Reshape and Transpose do to the dimensions of a tensor.
+
+A dimension of 16 that holds 2 images of 8 heads has the digits image and head. Reshape
+groups digits anew and Transpose reorders dimensions; neither moves anything else. So
+where every dimension's digits are known, the layout of a tensor is.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from typing import TypeAlias
+
+
+@dataclasses.dataclass(frozen=True)
+class Digit:
+    """One digit of an index: ``index // stride % size``.
+
+    Attributes:
+        axis: the index that it is a part of.
+        stride: what one step of it counts in that index.
+        size: how many values it takes.
+    """
+
+    axis: str
+    stride: int
+    size: int
+
+    @property
+    def end(self) -> int:
+        """What one step of the next digit counts."""
+        return self.stride * self.size
+
+
+Digits: TypeAlias = tuple[Digit, ...]
+Layout: TypeAlias = tuple[Digits, ...]
+"""The digits of every dimension, most significant first; none where its size is 1."""
+
+
+def whole(axis: str, size: int) -> Digits:
+    """Return an index as its only digit; nothing where it takes one value."""
+    return (Digit(axis, 1, size),) if size > 1 else ()
+
+
+def flat(layout: Layout) -> Digits:
+    """Return the digits of all dimensions in a row."""
+    return tuple(digit for digits in layout for digit in digits)
+
+
+def sizes(layout: Layout) -> tuple[int, ...]:
+    """Return the shape of a tensor of this layout."""
+    return tuple(math.prod(digit.size for digit in digits) for digits in layout)
+
+
+def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
+    """Return what a Reshape makes of a layout; None if it breaks digits up.
+
+    ``[16] -> [2, 8]`` splits a digit in two; ``[4, 3] -> [6, 2]`` has no digits.
+    """
+    rest = list(reversed(flat(layout)))
+    found: list[Digits] = []
+    for size in shape:
+        taken: list[Digit] = []
+        while size > 1:
+            if not rest:
+                return None
+            digit = rest.pop()
+            if digit.size > size:
+                if digit.size % size:
+                    return None
+                low = digit.size // size
+                rest.append(Digit(digit.axis, digit.stride, low))
+                digit = Digit(digit.axis, digit.stride * low, size)
+            elif size % digit.size:
+                return None
+            taken.append(digit)
+            size //= digit.size
+        found.append(tuple(taken))
+    return None if rest else tuple(found)
+
+
+def merged(digits: Iterable[Digit]) -> Digits:
+    """Return digits with those that follow each other in one index made one."""
+    found: list[Digit] = []
+    for digit in digits:
+        last = found[-1] if found else None
+        if last is not None and last.axis == digit.axis and last.stride == digit.end:
+            found[-1] = Digit(digit.axis, digit.stride, last.size * digit.size)
+        else:
+            found.append(digit)
+    return tuple(found)
+
+
+def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
+    """Return digits split wherever those of others begin or end."""
+    edges: dict[str, set[int]] = {}
+    for other in others:
+        edges.setdefault(other.axis, set()).update((other.stride, other.end))
+    found: list[Digit] = []
+    for digit in digits:
+        inner = {
+            edge
+            for edge in edges.get(digit.axis, ())
+            if digit.stride < edge < digit.end
+        }
+        bounds = [digit.stride, *sorted(inner), digit.end]
+        pieces = [
+            Digit(digit.axis, low, high // low)
+            for low, high in itertools.pairwise(bounds)
+        ]
+        found.extend(reversed(pieces))
+    return tuple(found)
+
+
+def runs(source: Digits, wanted: Digits) -> tuple[list[Digits], list[int]]:
+    """Split digits into runs that stay together on the way to another order.
+
+    Args:
+        source: digits in the order that they have.
+        wanted: some or all of them, none split, in the order that they are to have.
+
+    Returns:
+        The runs in the order of the source, and that of the wanted, as positions.
+    """
+    places = [source.index(digit) for digit in wanted]
+    starts = [
+        place
+        for before, place in zip([None, *places], places, strict=False)
+        if before is None or place != before + 1
+    ]
+    cuts = sorted(starts)
+    pieces = [
+        source[low:high]
+        for low, high in zip(cuts, [*cuts[1:], len(source)], strict=True)
+    ]
+    return pieces, [cuts.index(start) for start in starts]

@@ -1,0 +1,137 @@
+"""The proof of a fusion: what was matched, against the fused node's body."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import array_of, opset_of, static_shape
+from me2e_compress.graph.nodes import Array
+from me2e_compress.operators import OWN_DOMAIN, expand
+from me2e_compress.passes.fuse_operators.decomposed import XY
+from me2e_compress.passes.fuse_operators.digits import flat, sizes
+from me2e_compress.passes.fuse_operators.views import View
+from me2e_compress.runtime.session import Session
+
+OUTSIDE = 0.25
+"""How far beyond a feature map's edges positions are tried, as a part of its size."""
+
+IR_VERSION = 8
+"""Old enough for every onnxruntime that has GridSample."""
+
+
+def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]:
+    """List the nodes that make a value of others, and of constants, in order."""
+    known: dict[ir.Node, None] = {}
+    stops, stack = set(inputs), [(output.producer(), False)]
+    while stack:
+        node, done = stack.pop()
+        if node is None or node in known:
+            continue
+        if done:
+            known[node] = None
+            continue
+        stack.append((node, True))
+        stack.extend(
+            (value.producer(), False)
+            for value in reversed(node.inputs)
+            if value is not None and value not in stops
+        )
+    return list(known)
+
+
+def piece_of(
+    output: ir.Value, inputs: Sequence[ir.Value], opset: int
+) -> onnx.ModelProto:
+    """Write what makes a value of others as a model of its own, its names by number."""
+    names = {value: f"in{index}" for index, value in enumerate(inputs)}
+    weights: list[onnx.TensorProto] = []
+    nodes: list[onnx.NodeProto] = []
+    for node in nodes_between(output, inputs):
+        written = ir.serde.serialize_node(node)
+        del written.input[:], written.output[:], written.metadata_props[:]
+        written.name = f"node{len(nodes)}"
+        for value in node.inputs:
+            if value is not None and value not in names:
+                names[value] = f"w{len(weights)}"
+                array = array_of(value)
+                if array is None:
+                    raise PreconditionError(f"it reads {value.name} besides")
+                weights.append(onnx.numpy_helper.from_array(array, names[value]))
+            written.input.append("" if value is None else names[value])
+        for value in node.outputs:
+            names[value] = f"v{len(names)}"
+            written.output.append(names[value])
+        nodes.append(written)
+    ports = [_port(names[value], value) for value in inputs]
+    shapes = [
+        _port(name, value) for value, name in names.items() if name.startswith("v")
+    ]
+    body = onnx.helper.make_graph(
+        nodes, "piece", ports, [_port(names[output], output)], weights,
+        value_info=shapes,
+    )  # fmt: skip
+    imports = [
+        onnx.helper.make_opsetid(*each) for each in (("", opset), (OWN_DOMAIN, 1))
+    ]
+    return onnx.helper.make_model(body, opset_imports=imports, ir_version=IR_VERSION)
+
+
+def run_piece(piece: onnx.ModelProto, feeds: Sequence[Array]) -> Array:
+    """Run a piece of a graph, its fused nodes as their bodies, nodes as they stand."""
+    model = ir.from_proto(piece)
+    opset = opset_of(model)
+    for node in list(model.graph):
+        if node.domain == OWN_DOMAIN:
+            expand(node, opset=opset, by="check")
+    named = {f"in{index}": array for index, array in enumerate(feeds)}
+    (result,) = Session(model, optimize=False).run(named).values()
+    return result
+
+
+class Proofs:
+    """Compares pieces of a graph on fresh random numbers; equal pairs but once."""
+
+    def __init__(self, opset: int, seed: int) -> None:
+        self._opset, self._seed = opset, seed
+        self._known: dict[tuple[bytes, bytes], float] = {}
+
+    def error(self, before: ir.Value, after: ir.Value, views: Sequence[View]) -> float:
+        """Return max|a-b|/max|a| of two values that are computed from the same views.
+
+        Args:
+            before: what was matched.
+            after: what the fused node gives.
+            views: what both read: fed with normal numbers, and positions with those
+                of which a third lies outside of the feature maps.
+
+        Raises:
+            PreconditionError: one of them reads something else besides.
+            GraphError: onnxruntime cannot run it.
+        """
+        inputs = list(dict.fromkeys(view.value for view in views))
+        pieces = [piece_of(value, inputs, self._opset) for value in (before, after)]
+        key = (pieces[0].SerializeToString(), pieces[1].SerializeToString())
+        if key not in self._known:
+            random = np.random.default_rng(self._seed)
+            drawn = {view.value: _draw(view, random) for view in views}
+            feeds = [drawn[value] for value in inputs]
+            a, b = (run_piece(piece, feeds).astype(np.float64) for piece in pieces)
+            self._known[key] = float(np.abs(a - b).max() / np.abs(a).max())
+        return self._known[key]
+
+
+def _draw(view: View, random: np.random.Generator) -> Array:
+    """Draw what a view holds: normal numbers, or positions inside and outside."""
+    shape = sizes(view.layout)
+    if not any(digit.axis == XY for digit in flat(view.layout)):
+        return random.standard_normal(shape).astype(np.float32)
+    places = random.uniform(-1 - 2 * OUTSIDE, 1 + 2 * OUTSIDE, shape)
+    return ((places - view.shift) / view.scale).astype(np.float32)
+
+
+def _port(name: str, value: ir.Value) -> onnx.ValueInfoProto:
+    kind = value.dtype or ir.DataType.FLOAT
+    return onnx.helper.make_tensor_value_info(name, int(kind), static_shape(value))

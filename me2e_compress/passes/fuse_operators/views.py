@@ -1,0 +1,249 @@
+"""Values that hold the same elements in other places: walks over layout operators."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, input_at, is_standard, static_shape
+from me2e_compress.graph.nodes import producer_of, scalar_of, sole_reader
+from me2e_compress.passes.fuse_operators.digits import Digits, Layout, regrouped
+
+REGROUPING = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
+"""Operators that keep the order of the elements."""
+LAYOUT_OPERATORS = REGROUPING | {"Transpose"}
+"""Operators that move elements and do nothing else to them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A value that holds the elements of another, moved and perhaps scaled.
+
+    Attributes:
+        value: the value.
+        layout: which digits of the other's indices its dimensions are made of.
+        scale: the other's elements are ``scale`` times this one's ...
+        shift: ... plus ``shift``.
+    """
+
+    value: ir.Value
+    layout: Layout
+    scale: float = 1.0
+    shift: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Selection:
+    """A view of which one dimension is only a stretch of the value's.
+
+    Attributes:
+        view: the value before the selection; its layout is that of the stretch.
+        axis: the dimension.
+        start: the first index.
+        size: how many.
+    """
+
+    view: View
+    axis: int
+    start: int
+    size: int
+
+    @property
+    def length(self) -> int:
+        """How large the dimension is as a whole."""
+        shape = static_shape(self.view.value) or ()
+        return shape[self.axis]
+
+
+def sources(view: View) -> Iterator[View | Selection]:
+    """Walk from a value to where its elements come from; the value itself first.
+
+    Ends at what is no layout operator; a selection, if it meets one, is the last.
+    """
+    while True:
+        yield view
+        before = _before(view)
+        if isinstance(before, Selection):
+            yield before
+        if not isinstance(before, View):
+            return
+        view = before
+
+
+def results(view: View) -> Iterator[View]:
+    """Walk from a value to where layout operators take it; the value itself first.
+
+    Ends where several nodes read a value, or one that does more than move elements.
+    """
+    while True:
+        yield view
+        reader = sole_reader(view.value)
+        after = None if reader is None else _after(reader, view)
+        if after is None:
+            return
+        view = after
+
+
+def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
+    """Return the view that stretches make up together, in order; None if they do not.
+
+    Args:
+        selections: the stretches.
+        digits: those of the dimension as a whole.
+    """
+    first = selections[0]
+    start = 0
+    for each in selections:
+        alike = dataclasses.replace(each.view, layout=()) == dataclasses.replace(
+            first.view, layout=()
+        )
+        rest, ours = _without(each.view.layout, each.axis), first.view.layout
+        if not alike or each.axis != first.axis or each.start != start:
+            return None
+        if rest != _without(ours, first.axis):
+            return None
+        start += each.size
+    if start != first.length or math.prod(d.size for d in digits) != start:
+        return None
+    layout = list(first.view.layout)
+    layout[first.axis] = digits
+    return dataclasses.replace(first.view, layout=tuple(layout))
+
+
+def _without(layout: Layout, axis: int) -> Layout:
+    return layout[:axis] + layout[axis + 1 :]
+
+
+def _before(view: View) -> View | Selection | None:
+    """Return the view of what the maker of a value reads."""
+    node = producer_of(view.value)
+    if node is None or not is_standard(node) or not node.inputs:
+        return None
+    if node.op_type in ("Gather", "Slice", "Split"):
+        return _selected(node, view)
+    if node.op_type in ("Add", "Div", "Mul", "Sub"):
+        return _unscaled(node, view)
+    source = node.inputs[0]
+    shape = static_shape(source)
+    if source is None or shape is None:
+        return None
+    layout: Layout | None = None
+    if node.op_type in REGROUPING:
+        layout = regrouped(view.layout, shape)
+    elif node.op_type == "Transpose":
+        order = _order(node, len(shape))
+        layout = tuple(view.layout[order.index(axis)] for axis in range(len(shape)))
+    return (
+        None
+        if layout is None
+        else dataclasses.replace(view, value=source, layout=layout)
+    )
+
+
+def _after(node: ir.Node, view: View) -> View | None:
+    """Return the view that a layout operator makes of a value."""
+    if not is_standard(node) or node.inputs[0] is not view.value:
+        return None
+    result = node.outputs[0]
+    shape = static_shape(result)
+    if shape is None:
+        return None
+    layout: Layout | None = None
+    if node.op_type in REGROUPING:
+        layout = regrouped(view.layout, shape)
+    elif node.op_type == "Transpose":
+        layout = tuple(view.layout[axis] for axis in _order(node, len(shape)))
+    return (
+        None
+        if layout is None
+        else dataclasses.replace(view, value=result, layout=layout)
+    )
+
+
+def _order(node: ir.Node, rank: int) -> list[int]:
+    written = node.attributes.get_ints("perm")
+    return list(reversed(range(rank))) if written is None else list(written)
+
+
+def _unscaled(node: ir.Node, view: View) -> View | None:
+    """Undo a sum or product with a constant of one element."""
+    left, right = node.inputs[0], node.inputs[1]
+    constant, source = scalar_of(right), left
+    if constant is None and node.op_type in ("Add", "Mul"):
+        constant, source = scalar_of(left), right
+    if constant is None or source is None or source.dtype != view.value.dtype:
+        return None
+    if static_shape(source) != static_shape(view.value) or constant == 0.0:
+        return None
+    scale, shift = view.scale, view.shift
+    if node.op_type == "Mul":
+        scale *= constant
+    elif node.op_type == "Div":
+        scale /= constant
+    else:
+        shift += scale * (constant if node.op_type == "Add" else -constant)
+    return dataclasses.replace(view, value=source, scale=scale, shift=shift)
+
+
+def _selected(node: ir.Node, view: View) -> Selection | None:
+    """Return the stretch of one dimension that a node takes; None if it is none."""
+    source = node.inputs[0]
+    shape = static_shape(source)
+    if source is None or shape is None:
+        return None
+    part = {"Gather": _gathered, "Slice": _sliced, "Split": _split}[node.op_type](
+        node, view.value, shape
+    )
+    if part is None:
+        return None
+    axis, start, size, kept = part
+    layout = list(view.layout)
+    if not kept:
+        layout.insert(axis, ())
+    before = dataclasses.replace(view, value=source, layout=tuple(layout))
+    return Selection(before, axis, start, size)
+
+
+_Part = tuple[int, int, int, bool]
+"""Axis, first index, how many, and whether the dimension stays."""
+
+
+def _gathered(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
+    index = _integers(input_at(node, 1))
+    if index is None or len(index) != 1:
+        return None
+    axis = node.attributes.get_int("axis", 0) % len(shape)
+    kept = len(static_shape(made) or ()) == len(shape)
+    return axis, index[0] % shape[axis], 1, kept
+
+
+def _sliced(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
+    starts, axes = _integers(input_at(node, 1)), _integers(input_at(node, 3))
+    steps = _integers(input_at(node, 4)) if len(node.inputs) > 4 else [1]
+    found = static_shape(made)
+    if starts is None or len(starts) != 1 or steps != [1] or found is None:
+        return None
+    axis = (0 if axes is None else axes[0]) % len(shape)
+    start = min(starts[0] + shape[axis] if starts[0] < 0 else starts[0], shape[axis])
+    return axis, start, found[axis], True
+
+
+def _split(node: ir.Node, made: ir.Value, shape: tuple[int, ...]) -> _Part | None:
+    axis = node.attributes.get_int("axis", 0) % len(shape)
+    start = 0
+    for each in node.outputs:
+        parts = static_shape(each)
+        if parts is None:
+            return None
+        if each is made:
+            return axis, start, parts[axis], True
+        start += parts[axis]
+    return None
+
+
+def _integers(value: ir.Value | None) -> list[int] | None:
+    array = array_of(value)
+    if array is None or array.dtype.kind != "i":
+        return None
+    return [int(number) for number in array.reshape(-1)]

@@ -1,0 +1,285 @@
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.errors import RecipeError
+from me2e_compress.graph import digest, infer_shapes, opset_of, provenance, static_shape
+from me2e_compress.operators import expand
+from me2e_compress.operators.deformable_attention import DeformableAttention
+from me2e_compress.passes.base import PassResult
+from me2e_compress.passes.fuse_operators import FuseOperators, numeric_check
+from tests.passes.decomposed import Sizes, decomposed
+from tests.passes.small import NO_MODULES, apply, compute, ops, read
+
+FUSED = "MultiScaleDeformableAttention"
+SEED = 3
+
+
+def feeds(model: ir.Model) -> dict[str, npt.NDArray[np.float32]]:
+    """Normal numbers; positions are inside and outside alike."""
+    random = np.random.default_rng(SEED)
+    return {
+        str(port.name): random.standard_normal(static_shape(port)).astype(np.float32)
+        for port in model.graph.inputs
+    }
+
+
+def fused(model: ir.Model) -> PassResult:
+    """Fuse; the outputs stay within 1e-4 of their largest, the node as its body."""
+    before = compute(model, feeds(model))
+    result = apply(FuseOperators(), model)
+    whole = model.clone()
+    for node in [node for node in whole.graph if node.domain == "me2e"]:
+        expand(node, opset=opset_of(whole), by="test")
+    for want, got in zip(before, compute(whole, feeds(model)), strict=True):
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * np.abs(want).max())
+    return result
+
+
+def attention(model: ir.Model) -> ir.Node:
+    (node,) = (node for node in model.graph if node.domain == "me2e")
+    assert node.op_type == FUSED
+    return node
+
+
+FORMS = [
+    ("mmcv, two levels", decomposed(Sizes())),
+    ("one level", decomposed(Sizes(levels=((5, 7),)))),
+    ("one image, one head", decomposed(Sizes(n=1, m=1))),
+    ("dynamo", decomposed(Sizes(), opset=20, mode="linear", split=True)),
+    ("levels alike", decomposed(Sizes(levels=((4, 4), (4, 4), (4, 4))))),
+]
+
+
+@pytest.mark.parametrize(("form", "model"), FORMS, ids=[name for name, _ in FORMS])
+def test_what_exporters_write_is_one_node(form: str, model: ir.Model) -> None:
+    result = fused(model)
+    assert result.changes == 1
+    assert ops(model) == [FUSED, "Reshape"]  # nothing is moved to feed it
+    assert [value.name for value in attention(model).inputs if value is not None][
+        ::3
+    ] == ["value", "locations"]
+    assert "within" in result.notes[0]
+
+
+def test_it_stands_for_all_that_it_was() -> None:
+    model = decomposed(Sizes())
+    names = {node.name for node in model.graph}
+    fused(model)
+    past = provenance.read(attention(model))
+    assert past is not None
+    assert past.passes == ("fuse-operators",)
+    assert set(past.origins) == names
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.builds(
+        Sizes,
+        n=st.integers(1, 3),
+        q=st.integers(1, 4),
+        m=st.integers(1, 4),
+        p=st.integers(1, 3),
+        d=st.integers(1, 5),
+        levels=st.lists(
+            st.tuples(st.integers(1, 5), st.integers(1, 5)), min_size=1, max_size=3
+        ).map(tuple),
+    ),
+    st.booleans(),
+)
+def test_any_sizes(sizes: Sizes, split: bool) -> None:
+    fused(decomposed(sizes, split=split))
+
+
+SAMPLED = 'GridSample<mode = "bilinear", padding_mode = "zeros">'
+PLAIN = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[6,4,5,7] image, float[6,9,3,2] grid, WEIGHTS weights) => (float y) {
+    s = SAMPLER(image, grid)
+    m = Mul(weights, s)
+    y = ReduceSum<keepdims = KEEP>(m, AXES)
+}"""
+
+
+def plain(
+    sampler: str = SAMPLED,
+    weights: str = "float[6,1,9,3]",
+    axes: tuple[int, ...] = (3,),
+    keep: int = 0,
+) -> ir.Model:
+    """One level, as a graph that no exporter of an attention wrote may have it."""
+    text = PLAIN.replace("SAMPLER", sampler).replace("WEIGHTS", weights)
+    text = text.replace("AXES", "axes").replace("KEEP", str(keep))
+    rank = 4 if keep else 4 - len(axes)
+    text = text.replace("float y", f"float[{','.join('ABCD'[:rank])}] y")
+    return read(text, axes=np.array(axes, np.int64))
+
+
+def test_a_grid_is_taken_to_positions() -> None:
+    model = plain()
+    fused(model)
+    assert {"Mul", "Add", FUSED} < set(ops(model))
+
+
+@pytest.mark.parametrize("weights", ["float[6,1,9,3]", "float[1,1,9,3]", "float[3]"])
+def test_weights_are_repeated(weights: str) -> None:
+    fused(plain(weights=weights, keep=1))
+
+
+def test_points_in_two_dimensions() -> None:
+    fused(plain(axes=(2, 3)))
+
+
+APART = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[6,8,4,5] features, float[1,2,9,6,3,2] grid, float[1,2,1,9,18] weights)
+  => (float[1,9,8] y) <
+     int64[6] split = {1, 6, 2, 4, 4, 5}, int64[4] atlas = {2, 4, 4, 30},
+     int64[4] at = {2, 9, 18, 2}, int64[5] apart = {1, 2, 4, 9, 18},
+     int64[3] all = {1, 8, 9}, int64[1] last = {-1}> {
+    a = Reshape(features, split)
+    b = Transpose<perm = [0, 2, 3, 4, 1, 5]>(a)
+    image = Reshape(b, atlas)
+    places = Reshape(grid, at)
+    s = GridSample(image, places)
+    t = Reshape(s, apart)
+    m = Mul(t, weights)
+    r = ReduceSum<keepdims = 0>(m, last)
+    h = Reshape(r, all)
+    y = Transpose<perm = [0, 2, 1]>(h)
+}"""
+
+
+def test_images_side_by_side_are_one_level() -> None:
+    fused(read(APART))
+
+
+def test_operands_of_constants_are_computed() -> None:
+    model = decomposed(Sizes(n=1))
+    random = np.random.default_rng(SEED)
+    for name in ("locations", "weights"):
+        (port,) = (port for port in model.graph.inputs if port.name == name)
+        array = random.uniform(size=static_shape(port)).astype(np.float32)
+        model.graph.inputs.remove(port)
+        port.const_value = ir.tensor(array, name=name)
+        model.graph.register_initializer(port)
+    fused(model)
+    assert ops(model) == [FUSED, "Reshape"]
+
+
+LEFT: dict[str, tuple[Any, str]] = {
+    "nearest": (plain('GridSample<mode = "nearest">'), "mode=nearest"),
+    "border": (plain('GridSample<padding_mode = "border">'), "padding_mode=border"),
+    "corners": (plain("GridSample<align_corners = 1>"), "align_corners=1"),
+    "channels": (plain(weights="float[6,4,9,3]"), "from channel to channel"),
+    "spread": (plain(weights="float[2,6,4,9,3]", axes=(4,)), "not multiplied"),
+    "summed": (plain(axes=(1, 3)), "over channels or heads too"),
+    "unknown": (
+        plain(weights="float[6,1,9,3]").clone(),
+        "run fold-constants first",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LEFT)
+def test_what_is_none_is_left_with_the_reason(case: str) -> None:
+    model, reason = LEFT[case]
+    if case == "unknown":
+        model.graph.inputs[0].shape = ir.Shape(["batch", 4, 5, 7])
+    result = apply(FuseOperators(), model)
+    assert result.changes == 0
+    (note,) = result.notes
+    assert note.startswith("left n0: ")
+    assert reason in note
+
+
+JOINED = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[1,4,5,7] image, float[1,9,3,2] grid, float[1,4,9,3] other, float[6] weights)
+  => (float[1,4,9] y) <int64[1] last = {-1}> {
+    s = GridSample(image, grid)
+    c = Concat<axis = 3>(s, other)
+    m = Mul(c, weights)
+    y = ReduceSum<keepdims = 0>(m, last)
+}"""
+UNSUMMED = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights) => (float[1,4,9,3] y) {
+    s = GridSample(image, grid)
+    y = Mul(s, weights)
+}"""
+READ_TWICE = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
+  => (float[1,4,9] y, float[1,4,9,3] m) <int64[1] last = {-1}> {
+    s = GridSample(image, grid)
+    m = Mul(s, weights)
+    y = ReduceSum<keepdims = 0>(m, last)
+}"""
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (JOINED, "joined with something else"),
+        (UNSUMMED, "not summed"),
+        (READ_TWICE, "not summed"),
+    ],
+)
+def test_a_part_of_one_is_left(text: str, reason: str) -> None:
+    result = apply(FuseOperators(), read(text))
+    assert result.changes == 0
+    assert reason in result.notes[0]
+
+
+def test_what_the_body_does_not_agree_with_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    right = DeformableAttention.body
+
+    def wrong(self: Any, call: Any, inputs: Any, attributes: Any) -> Any:
+        result = right(self, call, inputs, attributes)
+        return call.add("Mul", [result, call.numbers(1.01, result)])
+
+    monkeypatch.setattr(DeformableAttention, "body", wrong)
+    model = decomposed(Sizes())
+    infer_shapes(model)
+    before = digest(model)
+    result = FuseOperators().run(model, NO_MODULES)
+    assert result.changes == 0
+    assert digest(model) == before
+    assert all("differs by 1.0e-02" in note for note in result.notes)
+    assert len(result.notes) == len(Sizes().levels)
+
+
+TWICE = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
+  => (float[1,4,9] y, float[1,4,9] z) <int64[1] last = {-1}> {
+    s = GridSample(image, grid)
+    m = Mul(s, weights)
+    y = ReduceSum<keepdims = 0>(m, last)
+    deeper = Neg(image)
+    t = GridSample(deeper, grid)
+    n = Mul(t, weights)
+    z = ReduceSum<keepdims = 0>(n, last)
+}"""
+
+
+def test_pieces_that_are_alike_are_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs, run = [], numeric_check.run_piece
+
+    def counted(piece: Any, given: Any) -> Any:
+        runs.append(piece)
+        return run(piece, given)
+
+    monkeypatch.setattr(numeric_check, "run_piece", counted)
+    model = read(TWICE)
+    infer_shapes(model)
+    assert FuseOperators().run(model, NO_MODULES).changes == 2
+    assert len(runs) == 2
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1.0, -1e-4, float("nan")])
+def test_a_tolerance_that_is_none_is_refused(tolerance: float) -> None:
+    with pytest.raises(RecipeError, match="tolerance"):
+        FuseOperators(tolerance=tolerance)
