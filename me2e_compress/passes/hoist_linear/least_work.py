@@ -1,0 +1,296 @@
+"""The cheapest way to multiply a value by a matrix, by the algebra of rows.
+
+A product of rows that are rearranged or repeated is the product, rearranged or
+repeated; a product of a sum (or of columns side by side) is the sum of products; a
+product of a linear layer is one with the product of both matrices; a product of
+constants is one.
+Each way is priced as in :mod:`me2e_compress.passes.work`: what it computes in every
+frame, what it moves, and what new weights take in the file.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import static_shape
+from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
+from me2e_compress.passes.hoist_linear.row_moves import VIEWS, broadcasts, moved_rows
+from me2e_compress.passes.hoist_linear.ways import (
+    Composed,
+    Direct,
+    Distributed,
+    Moved,
+    Stored,
+    Term,
+    Way,
+    uses_weight,
+)
+from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE, work
+from me2e_compress.rewrite import holds_numbers, is_standard, maker, sole_reader
+
+DEEPEST = 32
+"""How many nodes before a product are looked at, in a row."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Price:
+    """What a way costs.
+
+    Attributes:
+        way: the way.
+        work: what it costs a frame, in starts of a node; bytes of the file included.
+        macs: multiply-accumulates.
+    """
+
+    way: Way
+    work: float
+    macs: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Question:
+    """A product that is asked for.
+
+    Attributes:
+        value: what is multiplied, [..., K].
+        columns: N, of the product.
+        owned: whether only this product reads it, so that what computes it goes.
+        fresh: whether the matrix is a new one, which takes bytes in the file.
+        depth: how many nodes before it may still be looked at.
+    """
+
+    value: ir.Value
+    columns: int
+    owned: bool
+    fresh: bool
+    depth: int = DEEPEST
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the value."""
+        return static_shape(self.value) or ()
+
+    @property
+    def product_bytes(self) -> float:
+        """What the product takes in memory."""
+        return _size(self.shape[:-1]) * self.columns * _item(self.value)
+
+    def of(
+        self, value: ir.Value, *, owned: bool | None = None, fresh: bool = False
+    ) -> "Question":
+        """Ask for a value before this one."""
+        mine = self.owned and sole_reader(value) is not None
+        return Question(
+            value, self.columns, mine if owned is None else owned,
+            self.fresh or fresh, self.depth - 1,
+        )  # fmt: skip
+
+
+class Prices:
+    """Asks for the cheapest way, and remembers the answers while the graph stays.
+
+    Args:
+        bytes_per_node: how many bytes of the file a node that is gone may cost.
+    """
+
+    def __init__(self, bytes_per_node: int) -> None:
+        self.rate = max(bytes_per_node, 1e-9)
+        self.known: dict[tuple[int, int, bool, bool], Price] = {}
+        self.kept: dict[int, tuple[float, int]] = {}
+
+    def forget(self) -> None:
+        """Forget all answers: the graph is another now."""
+        self.known.clear()
+        self.kept.clear()
+
+    def saving(self, layer: LinearLayer) -> Price | None:
+        """Return the cheapest other way for a layer, with the work and MACs it saves.
+
+        None if there is no other way that has fewer MACs and costs less.
+        """
+        columns = (static_shape(layer.product.outputs[0]) or (0,))[-1]
+        source = layer.source
+        asked = Question(source, columns, sole_reader(source) is not None, fresh=False)
+        now, best = self.direct(asked), self.indirect(asked)
+        if best is None:
+            return None
+        saved = now.work - best.work
+        if not uses_weight(best.way) and sole_reader(layer.weight) is not None:
+            saved += self._file(layer.weight)
+        if saved < 1.0 or best.macs >= now.macs:
+            return None
+        return Price(best.way, saved, now.macs - best.macs)
+
+    def cheapest(self, asked: Question) -> Price:
+        """Return the cheapest way."""
+        key = (id(asked.value), asked.columns, asked.owned, asked.fresh)
+        found = self.known.get(key)
+        if found is None:
+            now = self.direct(asked)
+            other = self.indirect(asked) if asked.depth else None
+            found = now if other is None or other.work >= now.work else other
+            self.known[key] = found
+        return found
+
+    def direct(self, asked: Question) -> Price:
+        """Price the product of the value as it is, kept for it if it is owned."""
+        if holds_numbers(asked.value):
+            return Price(Stored(asked.value), asked.product_bytes / self.rate, 0)
+        macs = _size(asked.shape) * asked.columns
+        moved = asked.product_bytes + _size(asked.shape) * _item(asked.value)
+        cost = 1.0 + macs / MACS_PER_NODE + moved / MOVED_BYTES_PER_NODE
+        if asked.fresh:
+            matrix = asked.shape[-1] * asked.columns * _item(asked.value)
+            cost += matrix / self.rate
+        held, more = self._held(asked.value) if asked.owned else (0.0, 0)
+        return Price(Direct(asked.value), cost + held, macs + more)
+
+    def indirect(self, asked: Question) -> Price | None:
+        """Price the ways through the node that computes the value; None if none."""
+        node = asked.value.producer()
+        if node is None or node.graph is not asked.value.graph or not is_standard(node):
+            return None
+        sources = moved_rows(node)
+        if sources is not None:
+            return self._moved(asked, node, sources)
+        layer = layer_behind(asked.value)
+        if layer is not None:
+            return self._composed(asked, layer)
+        if node.op_type in ("Add", "Sub") or node.op_type == "Concat":
+            return self._distributed(asked, node)
+        return None
+
+    def _moved(
+        self, asked: Question, node: ir.Node, sources: tuple[ir.Value, ...]
+    ) -> Price:
+        parts = [self.cheapest(asked.of(value)) for value in sources]
+        cost = 1.0 + sum(part.work for part in parts)
+        if node.op_type not in VIEWS:
+            read = sum(asked.of(value).product_bytes for value in sources)
+            cost += (read + asked.product_bytes) / MOVED_BYTES_PER_NODE
+        way = Moved(node, tuple(part.way for part in parts))
+        return Price(way, cost, sum(part.macs for part in parts))
+
+    def _composed(self, asked: Question, layer: LinearLayer) -> Price:
+        owned = asked.owned and all(
+            sole_reader(node.outputs[0]) is not None for node in layer.nodes
+        )
+        source = layer.source
+        mine = owned and sole_reader(source) is not None
+        inner = self.cheapest(asked.of(source, owned=mine, fresh=True))
+        return Price(Composed(layer, inner.way), inner.work, inner.macs)
+
+    def _distributed(self, asked: Question, node: ir.Node) -> Price | None:
+        found = list(_terms(node, asked.shape))
+        if not found:
+            return None
+        terms, cost, macs = [], 0.0, 0
+        for value, owned, rows in found:
+            mine = asked.owned and owned
+            one = self.cheapest(asked.of(value, owned=mine, fresh=rows is not None))
+            shape = static_shape(value) or ()
+            terms.append(Term(one.way, shape, rows))
+            cost, macs = cost + one.work, macs + one.macs
+            cost += (
+                _size(shape[:-1])
+                * asked.columns
+                * _item(asked.value)
+                / (MOVED_BYTES_PER_NODE)
+            )
+        sums = len(terms) - 1
+        cost += sums + sums * asked.product_bytes / MOVED_BYTES_PER_NODE
+        return Price(Distributed(node, tuple(terms)), cost, macs)
+
+    def _held(self, value: ir.Value) -> tuple[float, int]:
+        """Return the work and MACs of what only this value is computed by."""
+        key = id(value)
+        if key not in self.kept:
+            self.kept[key] = (0.0, 0)  # nothing comes before itself
+            self.kept[key] = self._hold(value)
+        return self.kept[key]
+
+    def _hold(self, value: ir.Value) -> tuple[float, int]:
+        node = value.producer()
+        if node is None or node.graph is not value.graph:
+            return 0.0, 0
+        layer = layer_behind(value)
+        if layer is not None:
+            owned = all(sole_reader(each.outputs[0]) for each in layer.nodes)
+            if not owned:
+                return 0.0, 0
+            cost = sum(map(work, layer.nodes))
+            if sole_reader(layer.weight) is not None:
+                cost += self._file(layer.weight)
+            macs = (
+                _size(static_shape(layer.source) or ())
+                * ((static_shape(layer.result) or (0,))[-1])
+            )
+            sources: tuple[ir.Value, ...] = (layer.source,)
+        else:
+            inner = moved_rows(node)
+            if inner is None:
+                if node.op_type not in ("Add", "Sub", "Concat"):
+                    return 0.0, 0
+                inner = tuple(each for each in node.inputs if each is not None)
+            cost, macs, sources = work(node), 0, inner
+        for source in sources:
+            if sole_reader(source) is not None:
+                if holds_numbers(source):
+                    cost += self._file(source)
+                    continue
+                more, products = self._held(source)
+                cost, macs = cost + more, macs + products
+        return cost, macs
+
+    def _file(self, weight: ir.Value) -> float:
+        return _size(static_shape(weight) or ()) * _item(weight) / self.rate
+
+
+def _terms(
+    node: ir.Node, shape: tuple[int, ...]
+) -> Iterator[tuple[ir.Value, bool, tuple[int, int] | None]]:
+    """Take a sum apart: its values, whether only it reads them, their matrix rows.
+
+    What an Expand or Tile repeats is taken as it is where adding repeats it anyway.
+    """
+    values = [value for value in node.inputs if value is not None]
+    shapes = [static_shape(value) for value in values]
+    if len(values) < 2 or any(not each for each in shapes) or 0 in shape:
+        return
+    axis = node.attributes.get_int("axis", 0) if node.op_type == "Concat" else -1
+    if axis not in (-1, len(shape) - 1):
+        return
+    widths = [each[-1] for each in shapes if each]
+    if node.op_type != "Concat" and any(
+        width != shape[-1] and not holds_numbers(value)
+        for value, width in zip(values, widths, strict=True)
+    ):
+        return
+    leads = [each[:-1] for each in shapes if each]
+    start = 0
+    for at, value in enumerate(values):
+        owned = sole_reader(value) is not None
+        small = maker(value, "Expand", "Tile")
+        if small is not None and broadcasts(small) and moved_rows(small) is not None:
+            source = small.inputs[0]
+            assert source is not None
+            lead = (static_shape(source) or (0,))[:-1]
+            others = [*leads[:at], lead, *leads[at + 1 :]]
+            if np.broadcast_shapes(*others) == shape[:-1]:
+                leads = others
+                owned = owned and sole_reader(source) is not None
+                value = source
+        rows = (start, start + widths[at]) if node.op_type == "Concat" else None
+        start += widths[at]
+        yield value, owned, rows
+
+
+def _size(shape: tuple[int, ...]) -> int:
+    return math.prod(shape)
+
+
+def _item(value: ir.Value) -> float:
+    return 4.0 if value.dtype is None else value.dtype.itemsize

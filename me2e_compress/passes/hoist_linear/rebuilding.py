@@ -1,0 +1,246 @@
+"""Write a way to compute a linear layer into the graph, in the layer's place."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import static_shape
+from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer
+from me2e_compress.passes.hoist_linear.matrices import Matrix, plus, times, vector_of
+from me2e_compress.passes.hoist_linear.row_moves import VIEWS
+from me2e_compress.passes.hoist_linear.ways import (
+    Composed,
+    Direct,
+    Distributed,
+    Stored,
+    Term,
+    Way,
+)
+from me2e_compress.rewrite import (
+    Numbers,
+    add_constant,
+    fresh_name,
+    inherit,
+    is_read,
+    overflow,
+    replace_value,
+)
+
+
+class Rewriter:
+    """Rewrites one graph.
+
+    Args:
+        graph: the main graph, or a body.
+        names: of all values of the model; new ones are entered.
+        by: the pass's name.
+    """
+
+    def __init__(self, graph: ir.Graph, names: set[str], by: str) -> None:
+        self.graph, self.names, self.by = graph, names, by
+        self.shapes: dict[tuple[int, ...], ir.Value] = {}
+
+    def replace(self, layer: LinearLayer, way: Way) -> bool:
+        """Compute a layer another way; False if a weight would overflow."""
+        writer = _Writer(self, layer)
+        name = layer.weight.name or "weight"
+        stored = layer.weight if layer.is_plain else None
+        try:
+            new = writer.build(way, Matrix(layer.matrix(), stored, name), layer.bias())
+        except OverflowError:
+            writer.undo()
+            return False
+        self.swap(layer.result, new)
+        return True
+
+    def swap(self, old: ir.Value, new: ir.Value) -> None:
+        """Put a value in another's place, under its name; drop what nothing reads."""
+        name = old.name
+        replace_value(old, new)
+        self.drop(old)
+        new.name = name
+
+    def drop(self, value: ir.Value) -> None:
+        """Remove what makes a value that nothing reads, and what only that read."""
+        waiting = [value.producer()]
+        while waiting:
+            last = waiting.pop()
+            if last is None or last.graph is not self.graph:
+                continue
+            if not any(map(is_read, last.outputs)):
+                waiting.extend(last.predecessors())
+                self.graph.remove(last, safe=True)
+
+    def target(self, shape: tuple[int, ...], name: str) -> ir.Value:
+        """Return the initializer that holds a shape, for a Reshape or Expand."""
+        known = self.shapes.get(shape)
+        if known is None or not known.is_initializer():
+            array = np.array(shape, np.int64)
+            known = add_constant(self.graph, array, name, self.names)
+            self.shapes[shape] = known
+        return known
+
+    def move(
+        self, node: ir.Node, inputs: list[ir.Value]
+    ) -> tuple[str, list[ir.Value | None], list[ir.Attr], tuple[int, ...]]:
+        """Say what rearranges other rows as a node does its own.
+
+        Returns:
+            Operator, inputs, attributes, and the shape that comes out.
+        """
+        width = (static_shape(inputs[0]) or (0,))[-1]
+        shape = (*(static_shape(node.outputs[0]) or ())[:-1], width)
+        if node.op_type in VIEWS or node.op_type == "Expand":
+            kind = "Expand" if node.op_type == "Expand" else "Reshape"
+            target = self.target(shape, f"{node.outputs[0].name}_shape")
+            return kind, [inputs[0], target], [], shape
+        given = [*inputs, *node.inputs[len(inputs) :]]
+        return node.op_type, given, list(node.attributes.values()), shape
+
+    def write(
+        self,
+        op_type: str,
+        inputs: Sequence[ir.Value | None],
+        attributes: Sequence[ir.Attr],
+        shape: tuple[int, ...],
+        *,
+        sources: Sequence[ir.Node],
+        like: ir.Value,
+    ) -> ir.Value:
+        """Write a node before the one that makes a value, of the same type.
+
+        Args:
+            op_type: the operator.
+            inputs: what it reads.
+            attributes: its attributes.
+            shape: of what it gives.
+            sources: the nodes that it stands for, the leading one first.
+            like: the value that what is written will take the place of.
+        """
+        place = like.producer()
+        assert place is not None
+        name = fresh_name(f"{sources[0].name}_{op_type}", self.names)
+        node = ir.Node("", op_type, inputs, attributes, num_outputs=1, name=name)
+        value = node.outputs[0]
+        value.name, value.type, value.shape = name, like.type, ir.Shape(shape)
+        inherit(node, sources, by=self.by)
+        self.graph.insert_before(place, node)
+        return value
+
+
+class _Writer:
+    """Writes nodes before the end of one layer."""
+
+    def __init__(self, rewriter: Rewriter, layer: LinearLayer) -> None:
+        self.rewriter, self.layer = rewriter, layer
+        self.graph, self.names = rewriter.graph, rewriter.names
+        self.made: list[ir.Value] = []
+        self.stored: list[ir.Value] = []
+
+    def undo(self) -> None:
+        """Take back what was written."""
+        for made in reversed(self.made):
+            self.rewriter.drop(made)
+        for value in self.stored:
+            del self.graph.initializers[value.name or ""]
+
+    def build(self, way: Way, matrix: Matrix, bias: Numbers | None) -> ir.Value:
+        """Write the nodes that multiply by a matrix and add a vector."""
+        return self._write_way(way, matrix, plus(bias, vector_of(way, matrix)))
+
+    def _write_way(self, way: Way, matrix: Matrix, vector: Numbers | None) -> ir.Value:
+        """Write a way, and one vector for all that it adds to every row."""
+        if isinstance(way, Direct):
+            return self._multiply(way.value, matrix, vector)
+        if isinstance(way, Stored):
+            return self._constant(times(way.value, matrix, vector), matrix.name)
+        if isinstance(way, Composed):
+            return self._write_way(way.way, matrix.behind(way), vector)
+        if isinstance(way, Distributed):
+            return self._distribute(way, matrix, vector)
+        if len(way.parts) == 1:
+            parts = [self._write_way(way.parts[0], matrix, vector)]
+        else:
+            parts = [self.build(part, matrix, vector) for part in way.parts]
+        return self._write(*self.rewriter.move(way.node, parts), also=way.node)
+
+    def _distribute(
+        self, way: Distributed, matrix: Matrix, vector: Numbers | None
+    ) -> ir.Value:
+        """Write the terms, the fewest rows first: the vector goes there."""
+        terms, minus = list(way.terms), way.node.op_type == "Sub"
+        if not minus:
+            terms.sort(key=lambda term: math.prod(term.shape[:-1]))
+            terms, vector = _without_vectors(terms, matrix, vector)
+        total: ir.Value | None = None
+        for term in terms:
+            one = self._write_way(term.way, matrix.part(term), vector)
+            vector = None
+            if total is None:
+                total = one
+                continue
+            shapes = (static_shape(total) or (), static_shape(one) or ())
+            shape, kind = np.broadcast_shapes(*shapes), "Sub" if minus else "Add"
+            total = self._write(kind, [total, one], [], shape, also=way.node)
+        assert total is not None
+        return total
+
+    def _multiply(
+        self, value: ir.Value, matrix: Matrix, vector: Numbers | None
+    ) -> ir.Value:
+        if matrix.value is None:
+            matrix.value = self._constant(matrix.numbers, matrix.name)
+        shape = (*(static_shape(value) or ())[:-1], matrix.numbers.shape[1])
+        result = self._write("MatMul", [value, matrix.value], [], shape)
+        if vector is None:
+            return result
+        bias = self._constant(vector, f"{matrix.name}_bias")
+        return self._write("Add", [result, bias], [], shape)
+
+    def _constant(self, numbers: Numbers, name: str) -> ir.Value:
+        dtype = self.layer.result.dtype
+        assert dtype is not None
+        with np.errstate(over="ignore"):
+            array = numbers.astype(dtype.numpy())
+        if overflow(numbers, array):
+            raise OverflowError(name)
+        value = add_constant(self.graph, array, name, self.names)
+        self.stored.append(value)
+        return value
+
+    def _write(
+        self,
+        op_type: str,
+        inputs: list[ir.Value] | list[ir.Value | None],
+        attributes: list[ir.Attr],
+        shape: tuple[int, ...],
+        *,
+        also: ir.Node | None = None,
+    ) -> ir.Value:
+        layer = self.layer
+        sources = layer.nodes if also is None else (*layer.nodes, also)
+        value = self.rewriter.write(
+            op_type, inputs, attributes, shape, sources=sources, like=layer.result
+        )
+        self.made.append(value)
+        return value
+
+
+def _without_vectors(
+    terms: list[Term], matrix: Matrix, vector: Numbers | None
+) -> tuple[list[Term], Numbers | None]:
+    """Take the constant terms of one row into the vector, if others have the shape."""
+    kept = [
+        term
+        for term in terms
+        if not isinstance(term.way, Stored) or math.prod(term.shape[:-1]) != 1
+    ]
+    full = np.broadcast_shapes(*(term.shape[:-1] for term in terms))
+    if not kept or np.broadcast_shapes(*(term.shape[:-1] for term in kept)) != full:
+        return terms, vector
+    for term in terms:
+        if term not in kept and isinstance(term.way, Stored):
+            vector = times(term.way.value, matrix.part(term), vector).reshape(-1)
+    return kept, vector

@@ -1,0 +1,98 @@
+"""Operators that only rearrange or repeat rows: the last axis stays whole and in place.
+
+What is done to every row alike may be done before them: ``Tile(x) @ W`` is
+``Tile(x @ W)``.
+"""
+
+import math
+from collections.abc import Callable
+
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, is_standard, rank_of, static_shape
+
+VIEWS = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
+"""Those that move nothing, and that a Reshape can say."""
+
+REPEATS = frozenset({"Expand", "Tile"})
+
+
+def moved_rows(node: ir.Node) -> tuple[ir.Value, ...] | None:
+    """Return the inputs whose rows a node rearranges or repeats; None if it does not.
+
+    Sizes must be known, and the last axis of each input that of the output.
+    """
+    rule = _RULES.get(node.op_type)
+    if rule is None or not is_standard(node) or not node.inputs:
+        return None
+    count = len(node.inputs) if node.op_type == "Concat" else 1
+    sources = tuple(value for value in node.inputs[:count] if value is not None)
+    result = static_shape(node.outputs[0])
+    if not result or not rule(node, len(result)):
+        return None
+    for value in sources:
+        shape = static_shape(value)
+        if not shape or shape[-1] != result[-1] or math.prod(shape) == 0:
+            return None
+    return sources
+
+
+def broadcasts(node: ir.Node) -> bool:
+    """Return whether a node repeats only axes of size 1, as an Add does by itself."""
+    if node.op_type not in REPEATS:
+        return False
+    small, large = static_shape(node.inputs[0]), static_shape(node.outputs[0])
+    if small is None or large is None:
+        return False
+    ends = large[len(large) - len(small) :]
+    return all(one in (1, many) for one, many in zip(small, ends, strict=True))
+
+
+def _always(node: ir.Node, rank: int) -> bool:
+    return True
+
+
+def _axis(default: int) -> Callable[[ir.Node, int], bool]:
+    """Build the check that an operator works along another axis than the last."""
+
+    def check(node: ir.Node, rank: int) -> bool:
+        axis = node.attributes.get_int("axis", default)
+        inner = rank_of(node.inputs[0]) or 0
+        return axis % inner != inner - 1 if inner else False
+
+    return check
+
+
+def _transpose(node: ir.Node, rank: int) -> bool:
+    order = node.attributes.get("perm")
+    return order is not None and order.as_ints()[-1] == rank - 1
+
+
+def _slice(node: ir.Node, rank: int) -> bool:
+    given = node.attributes.get("axes")
+    if given is not None:
+        axes = list(given.as_ints())
+    elif len(node.inputs) > 3 and node.inputs[3] is not None:
+        array = array_of(node.inputs[3])
+        if array is None:
+            return False
+        axes = [int(axis) for axis in array.reshape(-1)]
+    else:
+        return False
+    return all(axis % rank != rank - 1 for axis in axes)
+
+
+def _gather_nd(node: ir.Node, rank: int) -> bool:
+    index, inner = static_shape(node.inputs[1]), rank_of(node.inputs[0])
+    batch = node.attributes.get_int("batch_dims", 0)
+    return bool(index) and inner is not None and batch + index[-1] < inner  # type: ignore[index]
+
+
+_RULES: dict[str, Callable[[ir.Node, int], bool]] = {
+    **dict.fromkeys(sorted(VIEWS | REPEATS), _always),
+    "Concat": _axis(0),
+    "Gather": _axis(0),
+    "GatherND": _gather_nd,
+    "Slice": _slice,
+    "Transpose": _transpose,
+}
