@@ -23,6 +23,7 @@ from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.workflows.checks import (
+    MOST_THREADS,
     Given,
     check_count,
     check_folder,
@@ -83,7 +84,7 @@ class CalibrateOptions:
         """Check what can be checked without a file."""
         OBSERVERS.parse(self.method)
         check_count("--seed", self.seed)
-        check_count("--threads", self.threads)
+        check_count("--threads", self.threads, most=MOST_THREADS)
         if self.shard is None:
             return
         _fraction(self.shard)

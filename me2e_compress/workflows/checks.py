@@ -17,6 +17,8 @@ from me2e_compress.zoo.shipped import SHIPPED, shipped
 
 LARGEST = 1e15
 """The largest number of an option: beyond, milliseconds are no whole microseconds."""
+MOST_THREADS = 1024
+"""Of one session: more than machines have cores, and onnxruntime starts them all."""
 
 Given: TypeAlias = str | Path | None
 """An input as the user names it; a word that does not name a file is harmless."""
@@ -193,14 +195,24 @@ def check_number(option: str, value: float | None, *, zero: bool = False) -> Non
     )
 
 
-def check_count(option: str, value: int, least: int = 0) -> None:
-    """Refuse a count that is too small.
+def check_count(
+    option: str, value: int, least: int = 0, most: int | None = None
+) -> None:
+    """Refuse a count that is too small, or too large.
+
+    Args:
+        option: its name, for the message.
+        value: what was given.
+        least: that it may be.
+        most: that it may be; None for any.
 
     Raises:
-        RecipeError: it is below the least.
+        RecipeError: it is below the least or above the most.
     """
     if value < least:
         raise RecipeError(f"{option} is {value}: it must be {least} or more")
+    if most is not None and value > most:
+        raise RecipeError(f"{option} is {value}: it must be {most:,} at most")
 
 
 def sizes(texts: Iterable[str]) -> dict[str, int]:

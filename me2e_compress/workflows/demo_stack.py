@@ -9,7 +9,7 @@ from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.interleaved import RunTimes, time_interleaved
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.checks import check_folder
+from me2e_compress.workflows.checks import MOST_THREADS, check_count, check_folder
 from me2e_compress.workflows.compare import CompareResult, compare
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import CompressResult
@@ -117,7 +117,7 @@ class StackDemo:
         force: replace files that are not as we left them, too.
 
     Raises:
-        RecipeError: no such recipe.
+        RecipeError: no such recipe, or more threads than can be.
         GraphError: the folder is a file.
     """
 
@@ -130,8 +130,9 @@ class StackDemo:
     _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        """Check recipe and folder."""
+        """Check recipe, threads and folder."""
         recipe.load(self.scheme)
+        check_count("--threads", self.threads, most=MOST_THREADS)
         check_folder(self.out, ())
 
     @property

@@ -17,6 +17,7 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.checks import (
+    MOST_THREADS,
     Given,
     check_count,
     load_map,
@@ -59,7 +60,7 @@ class TrialOptions:
 
     def __post_init__(self) -> None:
         """Check the number of threads."""
-        check_count("--threads", self.threads)
+        check_count("--threads", self.threads, most=MOST_THREADS)
 
     def exact(self) -> tuple[Pass, ...]:
         """Return the passes before int8."""

@@ -9,12 +9,14 @@ from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.others_load import BUSY, OthersLoad, is_busy
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
-from me2e_compress.workflows.checks import check_count, model_path
+from me2e_compress.workflows.checks import MOST_THREADS, check_count, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table
 
+MOST_SAMPLES = 10**9
+"""Inferences that can be asked for: at a millisecond each, a fortnight."""
 BEYOND_P99 = 5
 """Samples that must lie beyond the 99th percentile: with fewer, one disturbance more or
 less moves it."""
@@ -31,7 +33,7 @@ class ProfileOptions:
         force: replace outputs that are not as we left them, too.
 
     Raises:
-        RecipeError: threads below 0.
+        RecipeError: a number below 0, or beyond all measure.
     """
 
     samples: int | None = None
@@ -40,8 +42,10 @@ class ProfileOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Check the number of threads."""
-        check_count("--threads", self.threads)
+        """Check the numbers."""
+        check_count("--threads", self.threads, most=MOST_THREADS)
+        check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
+        check_count("--warm-up", self.warm_up, most=MOST_SAMPLES)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
