@@ -42,6 +42,10 @@ class GraphError(Me2eError):
     """A file is not a graph we can read, or lacks something we need."""
 
 
+class ProviderError(Me2eError):
+    """A provider of onnxruntime is missing, or a library of its operators."""
+
+
 class FramesError(Me2eError):
     """Calibration frames are missing, of another model, or not finite."""
 

@@ -23,6 +23,7 @@ from me2e_compress.calibration.stream import (
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.opening import unsupported
+from me2e_compress.runtime.providers import CPU, Provider
 
 Progress: TypeAlias = Callable[[int, int], None]
 
@@ -40,6 +41,7 @@ class Calibrator:
         checkpoint: a file that holds the progress of a calibration; where it exists,
             the calibration resumes from it. It is removed at the end. None keeps none.
         every: frames between two checkpoints.
+        provider: what runs the model.
     """
 
     method: str = "max-min"
@@ -47,6 +49,7 @@ class Calibrator:
     optimize: bool = True
     checkpoint: Path | None = None
     every: int = 8
+    provider: Provider = CPU
 
     def run(
         self,
@@ -97,7 +100,7 @@ class Calibrator:
         if not tensors:
             nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
             return dataclasses.replace(blank, measured=nothing)
-        if reason := unsupported(model):
+        if reason := unsupported(model, self.provider):
             raise GraphError(
                 f"{reason}; ranges that TensorRT measured are taken by `calibrate"
                 " --import CACHE`, and then by `compress --ranges`"
@@ -182,6 +185,7 @@ class _Job:
             probe,
             threads=self.settings.threads,
             optimize=self.settings.optimize,
+            provider=self.settings.provider,
         )
         state = self.begun.state if begin else None
         readings = stream(session, self.frames, probe.width, begin, state)

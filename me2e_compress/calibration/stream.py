@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
@@ -12,6 +13,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.probes import Probe
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
 
 READINGS = "me2e_readings"
@@ -79,26 +81,29 @@ def probed_session(
     *,
     threads: int,
     optimize: bool,
+    provider: Provider = CPU,
 ) -> Session:
     """Open a model with probes, in the memory and nearly the time of the model.
 
     onnxruntime optimizes the graph with its probes; then the nodes are put into an
-    order in which every watched tensor is freed as early as without them.
+    order in which every watched tensor is freed as early as without them. A provider
+    that compiles parts of the graph puts them into an order of its own.
 
     Raises:
         GraphError: no such tensor, or onnxruntime cannot run the graph.
     """
     probed = insert_probes(model, tensors, probe)
-    if not optimize:
-        return Session(probed, threads=threads, optimize=False, frugal=True)
+    run = partial(Session, threads=threads, frugal=True, provider=provider)
+    if not optimize or provider.native != CPU.native:
+        return run(probed, optimize=optimize)
     with tempfile.TemporaryDirectory(prefix="me2e-probed-") as folder:
         path = Path(folder) / "optimized.onnx"
-        Session(probed, threads=1, rewritten=path)
+        Session(probed, threads=1, rewritten=path, provider=provider)
         rewritten = ir.load(path)
         schedule_probes(rewritten)
         scheduled = path.with_name("scheduled.onnx")
         ir.save(rewritten, scheduled)
-        return Session(scheduled, threads=threads, optimize=False, frugal=True)
+        return run(scheduled, optimize=False)
 
 
 def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:

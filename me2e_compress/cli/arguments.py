@@ -36,6 +36,14 @@ RECIPE = "a TOML file, or a shipped recipe's name"
 Recipe = Annotated[str | None, typer.Option("-r", "--recipe", help=RECIPE)]
 Count = Annotated[int, typer.Option("-n", "--count", help="frames: so many")]
 Seed = Annotated[int, typer.Option(min=0, help="of everything random")]
+Provider = Annotated[
+    str,
+    typer.Option(help="runs the graph: cpu, cuda, tensorrt, tensorrt-rtx, or see list"),
+]
+Plugins = Annotated[
+    list[Path] | None,
+    typer.Option(help="a library of onnxruntime operators; once for each"),
+]
 Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; 0 takes all")]
 Workers = Annotated[int, typer.Option(min=1, help="processes: as many at a time")]
 Engine = Annotated[str, typer.Option(help="local or ray")]

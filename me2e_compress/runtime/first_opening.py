@@ -24,7 +24,8 @@ from me2e_compress.errors import GraphError
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.opening import WRONG_FUSIONS, unsupported
+from me2e_compress.runtime.opening import unsupported
+from me2e_compress.runtime.providers import CPU
 
 _SCRIPT = Path(__file__).with_name("opening_main.py")
 _SURVIVED = {"onnxruntime": ort.__version__, "survived": True}
@@ -75,7 +76,7 @@ def try_apart(
             file = Path(scratch) / "model.onnx"
             graph.save(model, file)
         steps = "open" if feeds is None else "run"
-        words = [str(file), str(inputs), steps, *WRONG_FUSIONS]
+        words = [str(file), str(inputs), steps, *CPU.left_out]
         done = run_script(_SCRIPT, words)
     if done.returncode not in _REFUSED:
         step = (done.stdout.split() or ["start"])[-1]
@@ -89,7 +90,7 @@ def try_apart(
 
 def _fingerprints(model: ir.Model) -> Iterator[str]:
     """Name a graph that was opened, and one that was run, by this onnxruntime."""
-    known = (graph.digest(model), ort.__version__, "CPUExecutionProvider")
+    known = (graph.digest(model), ort.__version__, CPU.native, *CPU.left_out)
     for step in ("opened", "ran"):
         yield hashlib.sha256("\n".join((*known, step)).encode()).hexdigest()
 

@@ -24,6 +24,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph import is_standard
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import is_read
+from me2e_compress.runtime.providers import CPU, Provider
 
 # The compiled module has no stubs.
 
@@ -55,10 +56,11 @@ def operators() -> frozenset[tuple[str, str]]:
     )
 
 
-def unsupported(model: ir.Model) -> str | None:
-    """Return why the CPU cannot run a graph; None if it knows every operator.
+def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
+    """Return why a graph cannot be run; None if every operator is known.
 
-    A known operator may still lack a kernel for its element type; only building a
+    What the libraries of a provider bring is not known before a session is built. A
+    known operator may still lack a kernel for its element type; only building a
     :class:`~me2e_compress.runtime.session.Session` finds that.
     """
     known = operators()
@@ -69,16 +71,13 @@ def unsupported(model: ir.Model) -> str | None:
         if node.op_identifier() not in model.functions
         and ("" if is_standard(node) else node.domain, node.op_type) not in known
     }
-    if not unknown:
+    if not unknown or provider.plugins:
         return None
     node = next(iter(unknown.values()))
     return f"onnxruntime has no operator {', '.join(unknown)} (node {node.name!r})"
 
 
 _INT8_STAYS = "session.qdqisint8allowed"
-WRONG_FUSIONS = ("Pad_Fusion",)
-"""Optimizations of onnxruntime (1.31) that sessions leave out: this one folds a Pad of
-zeros into the MaxPool behind it, whose own padding is minus infinity."""
 LENT_BYTES = 1024
 """Smaller tensors are left in the graph: shape inference reads those."""
 
@@ -94,12 +93,15 @@ _LENDABLE = frozenset(
 
 
 def open_file(
-    path: Path, options: ort.SessionOptions, without: Sequence[str] = WRONG_FUSIONS
+    path: Path,
+    options: ort.SessionOptions,
+    provider: Provider = CPU,
+    without: Sequence[str] | None = None,
 ) -> tuple[ort.InferenceSession, Weights]:
     """Open an ONNX file: as it stands or, where onnxruntime refuses that, as read here.
 
     So a graph opens that is newer than onnxruntime, or whose shapes lie in a file of
-    weights.
+    weights. The arguments are those of :func:`open_graph`.
 
     Returns:
         The session, and what must live as long.
@@ -110,24 +112,27 @@ def open_file(
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     try:
-        return _build(str(path), options, without), {}
+        return _build(str(path), options, provider, without), {}
     except GraphError:
         model = graph.load(path)
-    return open_graph(model, options, without)
+    return open_graph(model, options, provider, without)
 
 
 def open_graph(
     model: ir.Model,
     options: ort.SessionOptions,
-    without: Sequence[str] = WRONG_FUSIONS,
+    provider: Provider = CPU,
+    without: Sequence[str] | None = None,
 ) -> tuple[ort.InferenceSession, Weights]:
     """Open a graph in memory.
 
     Args:
         model: the graph; it stays as it is, and its weights are not to be changed
             while the session lives.
-        options: of the session.
-        without: optimizations that onnxruntime is not to make.
+        options: of the session, to which the provider is attached.
+        provider: what runs it.
+        without: optimizations that onnxruntime is not to make; None takes those that
+            the provider leaves out.
 
     Returns:
         The session, and what must live as long.
@@ -135,7 +140,7 @@ def open_graph(
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
     """
-    if reason := unsupported(model):
+    if reason := unsupported(model, provider):
         raise GraphError(reason)
     lent = {
         name: tensor
@@ -150,14 +155,14 @@ def open_graph(
         with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:
             path = Path(folder) / "model.onnx"
             graph.save(model, path)
-            return _build(str(path), options, without), {}
+            return _build(str(path), options, provider, without), {}
     weights = {
         name: ort.OrtValue.ortvalue_from_numpy(np.ascontiguousarray(tensor.numpy()))
         for name, tensor in lent.items()
     }
     options.add_external_initializers(list(weights), list(weights.values()))
     bare = _without(model, lent).SerializeToString()
-    return _build(bare, options, without), weights
+    return _build(bare, options, provider, without), weights
 
 
 def _without(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> onnx.ModelProto:
@@ -191,31 +196,41 @@ def _needs_file(model: ir.Model, lent: Mapping[str, ir.TensorProtocol]) -> bool:
 
 
 def _build(
-    source: str | bytes, options: ort.SessionOptions, without: Sequence[str]
+    source: str | bytes,
+    options: ort.SessionOptions,
+    provider: Provider,
+    without: Sequence[str] | None,
 ) -> ort.InferenceSession:
     """Open a graph; where that fails, again without the step that makes int8 uint8.
 
     From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
     ``output_dtype`` is not that of their zero point, and then refuses them.
     """
+    left_out = provider.left_out if without is None else without
     try:
-        return _opened(source, options, without)
+        return _opened(source, options, provider, left_out)
     except REFUSALS as error:
         refusal = error
     options.add_session_config_entry(_INT8_STAYS, "1")
     try:
-        return _opened(source, options, without)
+        return _opened(source, options, provider, left_out)
     except REFUSALS:
         line = " ".join(str(refusal).split())
         raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
 
 
 def _opened(
-    source: str | bytes, options: ort.SessionOptions, without: Sequence[str]
+    source: str | bytes,
+    options: ort.SessionOptions,
+    provider: Provider,
+    left_out: Sequence[str],
 ) -> ort.InferenceSession:
-    return ort.InferenceSession(
+    found = ort.InferenceSession(
         source,
         options,
-        providers=["CPUExecutionProvider"],
-        disabled_optimizers=list(without),
+        providers=provider.chain(),
+        disabled_optimizers=list(left_out),
+        enable_fallback=False,  # to another provider, with a print
     )
+    provider.confirm(found.get_providers())
+    return found

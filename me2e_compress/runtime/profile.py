@@ -10,6 +10,7 @@ from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session, replay
 
 WARM_UP = 10
@@ -22,6 +23,7 @@ def profile(
     samples: int | None = None,
     warm_up: int = WARM_UP,
     threads: int = 1,
+    provider: Provider = CPU,
     on_sample: Callable[[int, int], None] = lambda done, total: None,
 ) -> LatencyTrace:
     """Measure the latency of a model on every frame, one at a time.
@@ -35,20 +37,24 @@ def profile(
         samples: How many latencies; None for one a frame.
         warm_up: Inferences before the first that counts.
         threads: Of onnxruntime; the closed loop uses one.
+        provider: What runs it.
         on_sample: Called with samples done and to do.
 
     Raises:
         EvaluationError: There is nothing to measure.
         GraphError: The model cannot be run.
+        ProviderError: The provider is not there.
         FramesError: A frame does not fit.
     """
     wanted = len(frames) if samples is None else samples
     check_work(wanted, warm_up, frames)
-    session = TimedSession(model, threads=threads)
+    session = TimedSession(model, threads=threads, provider=provider)
     endless = chain.from_iterable(repeat(frames))
     for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
         on_sample(max(0, done - warm_up), wanted)
     machine = f"{processor()}, onnxruntime on {threads or 'all'} threads"
+    if provider != CPU:
+        machine += f", {PROVIDERS.text(provider)}"
     taken = tuple(session.taken_us[warm_up:])
     return LatencyTrace(graph.sha256_of(model), machine, taken)
 
@@ -73,8 +79,8 @@ class TimedSession(Session):
         taken_us: Microseconds, one a run.
     """
 
-    def __init__(self, model: Path, *, threads: int) -> None:
-        super().__init__(model, threads=threads)
+    def __init__(self, model: Path, *, threads: int, provider: Provider = CPU) -> None:
+        super().__init__(model, threads=threads, provider=provider)
         self.taken_us = list[int]()
 
     def run(

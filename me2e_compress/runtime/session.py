@@ -1,4 +1,4 @@
-"""Sessions: one graph, ready to run on the CPU."""
+"""Sessions: one graph, ready to run."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,12 +13,12 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.opening import (
     REFUSALS,
-    WRONG_FUSIONS,
     InvalidArgument,
     Weights,
     open_file,
     open_graph,
 )
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.recurrence import SessionPort, not_fed_back, recurrence
 
 __all__ = [
@@ -51,14 +51,14 @@ _WEIGHTS_FILE = "session.optimized_model_external_initializers_file_name"
 
 
 class Session:
-    """An onnxruntime CPU session.
+    """An onnxruntime session.
 
     Args:
         model: the graph, or the file that holds it.
         threads: threads within an operator; 0 lets onnxruntime take every core.
         optimize: False runs the nodes exactly as they stand (``ORT_DISABLE_ALL``).
         stock: True makes every optimization that onnxruntime makes elsewhere, those
-            of :data:`~me2e_compress.runtime.opening.WRONG_FUSIONS` too.
+            that the provider leaves out too.
         frugal: True runs nodes in the priority-based order, in which a reduction
             written right after its producer frees that tensor at once, and without the
             memory pattern, which reserves one block for everything that ever lives.
@@ -66,6 +66,7 @@ class Session:
             sessions stand side by side in the memory of one.
         rewritten: a file to write the graph to as onnxruntime's optimizations leave
             it, its weights in a file beside it; it fits this machine's kernels only.
+        provider: what runs the nodes, and the libraries of operators it knows.
 
     Attributes:
         inputs: by name, what must be fed, in order.
@@ -75,6 +76,7 @@ class Session:
 
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
+        ProviderError: the provider is not installed, or cannot start here.
     """
 
     def __init__(
@@ -87,8 +89,10 @@ class Session:
         frugal: bool = False,
         release: bool = False,
         rewritten: Path | None = None,
+        provider: Provider = CPU,
     ) -> None:
         options = ort.SessionOptions()
+        provider.attach(options)
         options.intra_op_num_threads = threads
         options.log_severity_level = 4
         # Idle threads that spin slow down whatever else runs on the machine.
@@ -110,11 +114,11 @@ class Session:
         if release:
             self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
         self._lent: Weights = {}
-        without = () if stock else WRONG_FUSIONS
+        without = () if stock else None
         if isinstance(model, ir.Model):
-            self._ort, self._lent = open_graph(model, options, without)
+            self._ort, self._lent = open_graph(model, options, provider, without)
         else:
-            self._ort, self._lent = open_file(model, options, without)
+            self._ort, self._lent = open_file(model, options, provider, without)
         try:
             self.inputs = _ports(self._ort.get_inputs())
             self.outputs = _ports(self._ort.get_outputs())

@@ -22,6 +22,7 @@ from me2e_compress.calibration.sample import Part, draw, shard
 from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.passes.fix_shapes import with_sizes
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
@@ -59,6 +60,7 @@ class CalibrateOptions:
         onnxruntime_table: write onnxruntime's table too, into this folder.
         threads: of onnxruntime; 0 takes all.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        provider: what runs the graph.
         force: replace outputs that are not as we left them, too.
 
     Raises:
@@ -78,6 +80,7 @@ class CalibrateOptions:
     onnxruntime_table: str | Path | None = None
     threads: int = 0
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -177,6 +180,7 @@ def calibrate(
         PreconditionError: the graph is quantized already, or nothing can be int8.
         GraphError: no such model, or an output would harm an input.
         RecipeError: no such recipe.
+        ProviderError: the provider is not there.
     """
     options = options or CalibrateOptions()
     source, output = model_path(model), output_path(output)
@@ -198,7 +202,14 @@ def _calibrate(
     passes = with_sizes(recipe.load(options.recipe), options.dims)
     loaded = read_graph(source, listener)
     part = None if frames is None else _part(loaded, Path(frames), options)
-    try_first(loaded, source.name, listener, file=source, frames=part)
+    try_first(
+        loaded,
+        source.name,
+        listener,
+        file=source,
+        frames=part,
+        provider=options.provider,
+    )
     ready = PreparedGraph.of(source, loaded, options.module_map, passes)
     tensors = ready.tensors()
     del loaded  # 150 MB of VAD-tiny; graphs are cycles
@@ -208,7 +219,9 @@ def _calibrate(
         return _written(found, output, options)
     method = options.method
     checkpoint = _checkpoint(output)
-    calibrator = Calibrator(method, options.threads, checkpoint=checkpoint)
+    calibrator = Calibrator(
+        method, options.threads, checkpoint=checkpoint, provider=options.provider
+    )
     seen = calibrator.collect(
         ready.model,
         tensors,

@@ -8,6 +8,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.first_try import try_first
@@ -66,6 +67,7 @@ def compare(
     listener: Listener = SILENT,
     *,
     as_it_stands: bool = False,
+    provider: Provider = CPU,
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
@@ -76,10 +78,12 @@ def compare(
         listener: is called with progress and warnings.
         as_it_stands: run the first graph without onnxruntime's optimizations, and the
             second with all of them: a graph held against itself shows what they change.
+        provider: what runs both.
 
     Raises:
         GraphError: no such model, or onnxruntime cannot run it.
         FramesError: a frame fits one of the graphs not.
+        ProviderError: the provider is not there.
         EvaluationError: no output in common, or one that is not finite.
     """
     paths = model_path(reference), model_path(candidate)
@@ -87,13 +91,17 @@ def compare(
     for path in dict.fromkeys(paths):
         model = graph.load(path)
         recording.check(model)
-        try_first(model, path.name, listener, file=path, frames=recording)
+        try_first(
+            model, path.name, listener, file=path, frames=recording, provider=provider
+        )
     total = len(recording)
 
     def reported(frame: Frame) -> Frame:
         listener.on_progress("frames", frame.index, total, "")
         return frame
 
-    left = Session(paths[0], optimize=not as_it_stands, release=True)
-    right = Session(paths[1], stock=as_it_stands, release=True)
+    left, right = (
+        Session(paths[0], optimize=not as_it_stands, release=True, provider=provider),
+        Session(paths[1], stock=as_it_stands, release=True, provider=provider),
+    )
     return CompareResult(*paths, measure(left, right, map(reported, recording)))

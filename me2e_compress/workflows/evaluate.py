@@ -18,6 +18,7 @@ from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.claims import writing
@@ -47,6 +48,7 @@ class EvaluateOptions:
         engine: ``local`` or ``ray``.
         address: of a Ray cluster.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
+        provider: what runs the model; one of other policies is not asked.
         force: replace outputs that are not as we left them, too.
 
     Raises:
@@ -66,6 +68,7 @@ class EvaluateOptions:
     engine: str = "local"
     address: str | None = None
     render: str | None = None
+    provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -131,6 +134,7 @@ def evaluate(
         EvaluationError: no such policy, route, latency, weather or engine; the policy
             cannot drive; the folder is of another evaluation.
         GraphError: the folder is a file or an input.
+        ProviderError: the provider is not there.
     """
     options, output, policy = options or EvaluateOptions(), Path(output), str(policy)
     trace = options.latency.removeprefix("trace:")
@@ -146,7 +150,9 @@ def _evaluated(
     picked, set_size = routes_named(options.routes)
     shown = () if options.render is None else pick_routes(picked, options.render)
     driver = driver_of(policy, options.adapter)
-    if isinstance(driver, OnnxDriver):
+    if isinstance(driver, OnnxDriver) and options.provider != CPU:
+        driver = dataclasses.replace(driver, provider=PROVIDERS.text(options.provider))
+    elif isinstance(driver, OnnxDriver):
         try_file(driver.path, listener)
     job = _job(driver, options)
 

@@ -9,6 +9,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime import first_opening
 from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.listener import Listener
 
 STAGE = "first opening"
@@ -21,8 +22,12 @@ def try_first(
     *,
     file: Path | None = None,
     frames: Frames | None = None,
+    provider: Provider = CPU,
 ) -> None:
     """Open a graph apart, if this machine has not seen it; run its first frame there.
+
+    Not for another provider than the CPU with its own operators: what they do to a
+    graph is not known from there.
 
     Args:
         model: the graph.
@@ -30,10 +35,13 @@ def try_first(
         listener: is told how long it took: no other time counts it.
         file: that holds this very graph.
         frames: a recording that fits it; without one, the graph is not run.
+        provider: what runs it.
 
     Raises:
         GraphError: onnxruntime dies of the graph.
     """
+    if provider != CPU:
+        return
     first = None if frames is None else next(iter(frames), None)
     feeds = None if first is None else first.arrays
     begins = partial(listener.on_progress, STAGE, 0, 1, name)

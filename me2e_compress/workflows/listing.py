@@ -17,6 +17,7 @@ from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES
 from me2e_compress.registry import Entry, Option, Registry, describe
+from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.result import Result, Table, table
 from me2e_compress.zoo.stacks import STACKS
@@ -114,6 +115,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "policies": POLICIES,
     "latency-sources": LATENCY_SOURCES,
     "evaluators": EVALUATORS,
+    "providers": PROVIDERS,
 }
 """To which other packages add."""
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {

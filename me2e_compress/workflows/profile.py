@@ -9,6 +9,7 @@ from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.others_load import BUSY, OthersLoad, is_busy
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import MOST_THREADS, check_count, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
@@ -30,6 +31,7 @@ class ProfileOptions:
         samples: how many; None is one a frame.
         warm_up: inferences before the first that counts.
         threads: of onnxruntime; 0 takes all.
+        provider: what runs the graph.
         force: replace outputs that are not as we left them, too.
 
     Raises:
@@ -39,6 +41,7 @@ class ProfileOptions:
     samples: int | None = None
     warm_up: int = WARM_UP
     threads: int = 1
+    provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -128,6 +131,7 @@ def profile(
         GraphError: no such model, it cannot be run, or the output would harm an input.
         EvaluationError: there is nothing to measure.
         FramesError: a frame does not fit.
+        ProviderError: the provider is not there.
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
@@ -142,7 +146,14 @@ def _measured(
     source: Path, frames: Path, options: ProfileOptions, listener: Listener
 ) -> tuple[LatencyTrace, OthersLoad]:
     recording = CalibrationSet(frames)
-    try_first(graph.load(source), source.name, listener, file=source, frames=recording)
+    try_first(
+        graph.load(source),
+        source.name,
+        listener,
+        file=source,
+        frames=recording,
+        provider=options.provider,
+    )
     with OthersLoad() as load:
         trace = measure(
             source,
@@ -150,6 +161,7 @@ def _measured(
             samples=options.samples,
             warm_up=options.warm_up,
             threads=options.threads,
+            provider=options.provider,
             on_sample=lambda done, total: listener.on_progress(
                 "profile", done, total, "inferences"
             ),

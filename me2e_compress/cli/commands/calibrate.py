@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import calibrate as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -41,6 +42,8 @@ def calibrate(
     tensorrt_cache: Cache = None,
     onnxruntime_table: Table = None,
     threads: given.Threads = 0,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
@@ -55,7 +58,7 @@ def calibrate(
         shard=shard, merge=tuple(merge or ()), imported=imported, threads=threads,
         force=force,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
-        dims=sizes(set_dim or ()),
+        dims=sizes(set_dim or ()), provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.calibrate(model, frames, output, options, listener)

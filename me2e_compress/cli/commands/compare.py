@@ -6,6 +6,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compare as workflow
 
 
@@ -20,11 +21,18 @@ def compare(
             help="the first without onnxruntime's optimizations, the second with all",
         ),
     ] = False,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     as_json: given.Json = False,
 ) -> None:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres."""
     with listening() as listener:
         found = workflow.compare(
-            reference, candidate, frames, listener, as_it_stands=as_it_stands
+            reference,
+            candidate,
+            frames,
+            listener,
+            as_it_stands=as_it_stands,
+            provider=provider_named(provider, plugins or ()),
         )
     show(found, as_json)

@@ -8,6 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show, tell
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import evaluate as workflow
 
 Policy = Annotated[
@@ -43,6 +44,8 @@ def evaluate(
     engine: given.Engine = "local",
     address: given.Address = None,
     render: Render = None,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
@@ -51,7 +54,7 @@ def evaluate(
         routes=routes, latency=latency, latency_scale=latency_scale, in_order=in_order,
         seed=seed, workers=workers, dt_ms=dt_ms, adapter=adapter, weather=weather,
         frame_limit_s=frame_limit, engine=engine, address=address, render=render,
-        force=force,
+        provider=provider_named(provider, plugins or ()), force=force,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.evaluate(policy, output, options, listener)

@@ -8,6 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.profile import WARM_UP
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import profile as workflow
 
 
@@ -18,11 +19,14 @@ def profile(
     samples: Annotated[int | None, typer.Option(help="how many latencies")] = None,
     warm_up: Annotated[int, typer.Option(help="inferences before")] = WARM_UP,
     threads: given.Threads = 1,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace."""
-    options = workflow.ProfileOptions(samples, warm_up, threads, force)
+    device = provider_named(provider, plugins or ())
+    options = workflow.ProfileOptions(samples, warm_up, threads, device, force)
     with listening() as listener:
         found = workflow.profile(model, frames, output, options, listener)
     show(found, as_json)

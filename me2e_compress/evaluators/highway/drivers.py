@@ -62,20 +62,24 @@ class OnnxDriver(Driver):
         path: The file.
         adapter: TOML file that adapts the model to the contract; None where it keeps
             it as it is.
+        provider: What runs it, as a text: ``cpu``, ``tensorrt{cache=engines}``.
     """
 
     name: ClassVar[str] = "onnx"
     path: Path
     adapter: Path | None = None
+    provider: str = "cpu"
 
     def open(self) -> Policy:
         """Return the policy.
 
         Raises:
             EvaluationError: No such file, or a model that cannot drive.
+            ProviderError: The provider is not there.
         """
         from me2e_compress.evaluators.highway.adapter import Adapter
         from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+        from me2e_compress.runtime.providers import PROVIDERS
 
         if not self.path.is_file():
             raise EvaluationError(
@@ -83,7 +87,7 @@ class OnnxDriver(Driver):
                 f" are {', '.join(POLICIES.names())}"
             )
         adapter = None if self.adapter is None else Adapter.load(self.adapter)
-        return OnnxPolicy.open(self.path, adapter)
+        return OnnxPolicy.open(self.path, adapter, PROVIDERS.parse(self.provider))
 
     @property
     def label(self) -> str:
@@ -91,10 +95,12 @@ class OnnxDriver(Driver):
         return self.path.stem
 
     def fingerprint(self) -> str:
-        """Return digests of its files, wherever they lie."""
+        """Return digests of its files, wherever they lie, and another provider."""
         digests = [sha256_of(self.path)]
         if self.adapter is not None:
             digests.append(hashlib.sha256(self.adapter.read_bytes()).hexdigest())
+        if self.provider != "cpu":
+            digests.append(self.provider)
         return "+".join(digests)
 
 

@@ -27,6 +27,7 @@ from me2e_compress.evaluators.highway.ports import (
 )
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 
 MICROSECONDS = 1_000_000
@@ -35,7 +36,7 @@ MICROSECONDS = 1_000_000
 
 @dataclass
 class OnnxPolicy:
-    """Runs an ONNX graph on one onnxruntime thread that does not spin.
+    """Runs an ONNX graph in onnxruntime, on one thread that does not spin.
 
     Inputs ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus`` [18],
     ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route began, of
@@ -64,14 +65,24 @@ class OnnxPolicy:
     _state: dict[str, Array] = field(default_factory=dict, init=False)
 
     @classmethod
-    def open(cls, path: Path, adapter: Adapter | None = None) -> Self:
+    def open(
+        cls, path: Path, adapter: Adapter | None = None, provider: Provider = CPU
+    ) -> Self:
         """Load a model and run it once on zeros.
+
+        Args:
+            path: The file.
+            adapter: How its ports relate to the contract; None where they keep it.
+            provider: What runs it.
 
         Raises:
             EvaluationError: It cannot be run, or does not keep the contract.
+            ProviderError: The provider is not there.
         """
         try:
-            policy = cls._of(Session(path, threads=1), adapter or Adapter())
+            policy = cls._of(
+                Session(path, threads=1, provider=provider), adapter or Adapter()
+            )
             policy._dry_run()
         except (GraphError, FramesError, EvaluationError) as error:
             words = str(error).removeprefix(f"{path}: ")

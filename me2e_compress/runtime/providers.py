@@ -1,0 +1,291 @@
+"""Who runs the nodes of a session: onnxruntime's providers, and users' libraries."""
+
+import abc
+import dataclasses
+import importlib
+import importlib.util
+import mmap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Literal, TypeAlias
+
+import onnxruntime as ort
+from onnxruntime.capi import (
+    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
+)
+
+from me2e_compress.errors import ProviderError
+from me2e_compress.registry import Registry
+
+Chain: TypeAlias = list[str | tuple[str, dict[str, str]]]
+"""Providers in onnxruntime's words; what one cannot run the next one does."""
+
+WRONG_FUSIONS = ("Pad_Fusion",)
+"""Optimizations of onnxruntime (1.31) that give another answer: this one folds a Pad of
+zeros into the MaxPool behind it, whose own padding is minus infinity."""
+SLOW_FUSIONS = ("SkipLayerNormFusion",)
+"""Those that make the CPU slower: the fused kernel of Add and LayerNormalization takes
+4.0 to 6.9 times as long as the two (64 to 768 columns, 100 to 10,000 rows, one thread
+and two), 2.7 times on 20 rows, and as long on one (``benchmarks/bench_levers.py``)."""
+
+_CPU = "CPUExecutionProvider"
+_CUDA = "CUDAExecutionProvider"
+_GPU_PACKAGE = "pip uninstall onnxruntime; pip install onnxruntime-gpu"
+_NO_LIBRARY = (_native.Fail, _native.RuntimeException, RuntimeError)
+_ENTRY = b"RegisterCustomOps"
+"""The function that a library of onnxruntime operators must have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Provider(abc.ABC):
+    """What runs the nodes of a session; the fields are its options.
+
+    Class attributes:
+        name: what the command line calls it.
+        native: what onnxruntime calls it.
+        advice: what to do where it is not installed.
+        left_out: optimizations that onnxruntime is not to make for it.
+
+    Attributes:
+        plugins: libraries of onnxruntime operators that the graph needs.
+    """
+
+    name: ClassVar[str]
+    native: ClassVar[str]
+    advice: ClassVar[str]
+    left_out: ClassVar[tuple[str, ...]] = WRONG_FUSIONS
+    plugins: tuple[Path, ...] = dataclasses.field(default=(), kw_only=True)
+
+    def check(self) -> None:
+        """Check that the provider is installed, and the libraries are libraries.
+
+        Raises:
+            ProviderError: one is not; the message names it and what to install.
+        """
+        for library in self.plugins:
+            if not library.is_file():
+                raise ProviderError(f"plugins library {library}: no such file")
+        there = ort.get_available_providers()
+        if not self.is_installed():
+            raise ProviderError(
+                f"provider {self.name}: onnxruntime {ort.__version__} has only"
+                f" {', '.join(there)}; {self.advice}"
+            )
+
+    def is_installed(self) -> bool:
+        """Return whether this onnxruntime has it; its device may still be missing."""
+        return self.native in ort.get_available_providers()
+
+    def attach(self, options: ort.SessionOptions) -> None:
+        """Make the options of a session know the users' operators.
+
+        Raises:
+            ProviderError: not installed, or no library of operators.
+        """
+        self.check()
+        for library in self.plugins:
+            try:
+                options.register_custom_ops_library(str(library))
+            except _NO_LIBRARY as error:
+                line = " ".join(str(error).split())
+                raise ProviderError(f"plugins library {library}: {line}") from error
+
+    @abc.abstractmethod
+    def chain(self) -> Chain | None:
+        """Return the providers of a session; None where its options name them."""
+
+    def confirm(self, running: Sequence[str]) -> None:
+        """Check that a session runs on it: onnxruntime goes on without, on the CPU.
+
+        Args:
+            running: the session's providers.
+
+        Raises:
+            ProviderError: it does not.
+        """
+        if self.native not in running:
+            raise ProviderError(
+                f"provider {self.name} cannot start here: its driver or libraries are"
+                f" missing; onnxruntime would run on {', '.join(running)}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class CpuProvider(Provider):
+    """onnxruntime's own kernels on the CPU.
+
+    Attributes:
+        plugins: libraries of onnxruntime operators that the graph needs.
+    """
+
+    name: ClassVar[str] = "cpu"
+    native: ClassVar[str] = _CPU
+    advice: ClassVar[str] = "pip install onnxruntime"
+    left_out: ClassVar[tuple[str, ...]] = (*WRONG_FUSIONS, *SLOW_FUSIONS)
+
+    def chain(self) -> Chain:
+        """Return the CPU."""
+        return [_CPU]
+
+
+@dataclasses.dataclass(frozen=True)
+class CudaProvider(Provider):
+    """onnxruntime's CUDA kernels; int8 runs in float there.
+
+    Attributes:
+        device: index of the GPU.
+        tf32: round the operands of products to 10 bits of mantissa: faster.
+        plugins: libraries of onnxruntime operators that the graph needs.
+    """
+
+    name: ClassVar[str] = "cuda"
+    native: ClassVar[str] = _CUDA
+    advice: ClassVar[str] = _GPU_PACKAGE
+    device: int = 0
+    tf32: bool = False
+
+    def attach(self, options: ort.SessionOptions) -> None:
+        """Load CUDA and cuDNN of installed packages too.
+
+        Raises:
+            ProviderError: not installed, or no library of operators.
+        """
+        super().attach(options)
+        ort.preload_dlls()
+
+    def chain(self) -> Chain:
+        """Return CUDA, then the CPU."""
+        options = {"device_id": str(self.device), "use_tf32": str(int(self.tf32))}
+        return [(_CUDA, options), _CPU]
+
+
+@dataclasses.dataclass(frozen=True)
+class TensorRtProvider(Provider):
+    """TensorRT 10, through onnxruntime: an engine is built when a session opens.
+
+    Attributes:
+        device: index of the GPU.
+        precision: ``fp32``, ``fp16``, ``int8`` (of QDQ pairs), ``best``: both.
+        cache: folder of engines and timings, which are built anew without.
+        plugins: libraries that the graph needs: of onnxruntime operators, else of
+            TensorRT's plugins.
+    """
+
+    name: ClassVar[str] = "tensorrt"
+    native: ClassVar[str] = "TensorrtExecutionProvider"
+    advice: ClassVar[str] = f"{_GPU_PACKAGE}, and TensorRT 10"
+    device: int = 0
+    precision: Literal["fp32", "fp16", "int8", "best"] = "fp32"
+    cache: Path | None = None
+
+    def attach(self, options: ort.SessionOptions) -> None:
+        """Register the libraries of onnxruntime operators, and load CUDA.
+
+        Raises:
+            ProviderError: not installed.
+        """
+        ours = tuple(each for each in self.plugins if not self._is_tensorrts(each))
+        self.check()
+        CudaProvider(self.device, plugins=ours).attach(options)
+
+    def chain(self) -> Chain:
+        """Return TensorRT, then CUDA, then the CPU."""
+        options = {
+            "device_id": str(self.device),
+            "trt_fp16_enable": str(self.precision in ("fp16", "best")),
+            "trt_int8_enable": str(self.precision in ("int8", "best")),
+        }
+        if self.cache is not None:
+            for kind in ("engine", "timing"):
+                options[f"trt_{kind}_cache_enable"] = "True"
+                options[f"trt_{kind}_cache_path"] = str(self.cache)
+        theirs = [str(each) for each in self.plugins if self._is_tensorrts(each)]
+        if theirs:
+            options["trt_extra_plugin_lib_paths"] = ";".join(theirs)
+        return [(self.native, options), *CudaProvider(self.device).chain()]
+
+    @staticmethod
+    def _is_tensorrts(library: Path) -> bool:
+        """Return whether a library has no operators of onnxruntime; it is not run."""
+        if not library.is_file() or not library.stat().st_size:
+            return False
+        with (
+            library.open("rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+        ):
+            return content.find(_ENTRY) < 0
+
+
+@dataclasses.dataclass(frozen=True)
+class TensorRtRtxProvider(Provider):
+    """TensorRT for RTX GPUs, in the precision that the graph is written in.
+
+    Attributes:
+        cache: folder of compiled kernels, which are compiled anew without.
+        plugins: libraries of onnxruntime operators that the graph needs.
+    """
+
+    name: ClassVar[str] = "tensorrt-rtx"
+    native: ClassVar[str] = "NvTensorRTRTXExecutionProvider"
+    advice: ClassVar[str] = "pip install onnxruntime-ep-nv-tensorrt-rtx"
+    package: ClassVar[str] = "onnxruntime_ep_nv_tensorrt_rtx"
+    cache: Path | None = None
+
+    def is_installed(self) -> bool:
+        """Return whether the package that brings it is installed."""
+        return super().is_installed() or bool(importlib.util.find_spec(self.package))
+
+    def attach(self, options: ort.SessionOptions) -> None:
+        """Register the provider's own library, then those of operators.
+
+        Raises:
+            ProviderError: not installed, no RTX GPU, or no library of operators.
+        """
+        super().attach(options)
+        if not super().is_installed():
+            module = importlib.import_module(self.package)
+            ort.register_execution_provider_library(
+                self.native, module.get_library_path()
+            )
+        found = [each for each in ort.get_ep_devices() if each.ep_name == self.native]
+        if not found:
+            raise ProviderError(f"provider {self.name}: there is no RTX GPU here")
+        cache = {} if self.cache is None else {"nv_runtime_cache_path": str(self.cache)}
+        options.add_provider_for_devices(found[:1], cache)
+
+    def chain(self) -> None:
+        """Return none: the options of the session name its device."""
+        return
+
+
+CPU = CpuProvider()
+
+_HERE = "me2e_compress.runtime.providers"
+PROVIDERS: Registry[Provider] = Registry(
+    "provider",
+    "me2e_compress.providers",
+    ProviderError,
+    {
+        "cpu": f"{_HERE}:CpuProvider",
+        "cuda": f"{_HERE}:CudaProvider",
+        "tensorrt": f"{_HERE}:TensorRtProvider",
+        "tensorrt-rtx": f"{_HERE}:TensorRtRtxProvider",
+    },
+)
+
+
+def provider_named(text: str, plugins: Sequence[Path] = ()) -> Provider:
+    """Build the provider of a text, and check that it is installed.
+
+    Args:
+        text: ``cpu``, ``cuda``, ``tensorrt{precision=fp16, cache=engines}``, …
+        plugins: libraries of onnxruntime operators.
+
+    Raises:
+        ProviderError: no such provider or option, not installed, or no such library.
+    """
+    found = PROVIDERS.parse(text)
+    if plugins:
+        found = dataclasses.replace(found, plugins=(*found.plugins, *plugins))
+    found.check()
+    return found
