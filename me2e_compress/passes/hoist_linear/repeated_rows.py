@@ -121,9 +121,11 @@ def _inner_shape(
     small = static_shape(found.source)
     if small is None or node.op_type not in BINARY:
         return small
+    if len(node.inputs) != 2:
+        return None
     other = static_shape(node.inputs[1 - index])
     whole = static_shape(node.outputs[0]) or ()
-    if other is None or len(node.inputs) != 2:
+    if other is None:
         return None
     if math.prod(other[:-1]) == 1 and len(other) <= len(small):
         return small
