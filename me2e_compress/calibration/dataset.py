@@ -16,6 +16,7 @@ import onnx_ir as ir
 
 from me2e_compress import documents
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
+from me2e_compress.calibration.static_inputs import check_static, static_inputs
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
@@ -105,17 +106,23 @@ class CalibrationSet(Displayed):
     def check(self, model: ir.Model) -> None:
         """Read every frame once and check it against a model's inputs.
 
-        Recurrent inputs may be absent; names that the model lacks are an error.
+        Recurrent inputs may be absent; names that the model lacks are an error, but
+        for those that ``static-geometry`` made constants of it: they must be the same.
 
         Raises:
             FramesError: on the first array that is missing, unknown, of another
                 shape or dtype, or not finite: its file, its name, what was found and
                 what is expected.
         """
+        fixed = static_inputs(model)
         for path in self.files:
-            _check_frame(declared(path), model, str(path))
+            held = declared(path)
+            asked = {name: held[name] for name in held if name not in fixed}
+            _check_frame(asked, model, str(path))
             for name, array in load_arrays(path).items():
                 _check_finite(array, f"{path}: {name}")
+                if name in fixed:
+                    check_static(name, array, fixed[name], str(path))
 
 
 def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) -> None:

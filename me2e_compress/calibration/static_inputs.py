@@ -1,0 +1,54 @@
+"""Inputs that are constants of a graph, which frames may hold all the same.
+
+``static-geometry`` makes a graph of one vehicle's camera matrices. A recording of that
+vehicle still fits it; one of another vehicle does not, and nothing else would say so.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+
+import onnx_ir as ir
+
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.frames import Array
+
+STATIC_INPUTS = "me2e.static_inputs"
+"""Metadata of a graph: a digest of every input that became constant, as JSON."""
+
+
+def static_inputs(model: ir.Model) -> dict[str, str]:
+    """Read which inputs are constants, and the digests of what they hold."""
+    try:
+        found = json.loads(model.metadata_props.get(STATIC_INPUTS, "{}"))
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def enter_static(model: ir.Model, arrays: Mapping[str, Array]) -> None:
+    """Write that inputs are constants from now on."""
+    known = static_inputs(model)
+    known |= {name: digest_of(array) for name, array in arrays.items()}
+    model.metadata_props[STATIC_INPUTS] = json.dumps(known, sort_keys=True)
+
+
+def check_static(name: str, array: Array, digest: str, where: str) -> None:
+    """Check that a frame holds what the graph was made for.
+
+    Raises:
+        FramesError: it holds something else.
+    """
+    if digest_of(array) != digest:
+        raise FramesError(
+            f"{where}: {name} is not the one that the graph was made for"
+            " (static-geometry)"
+        )
+
+
+def digest_of(array: Array) -> str:
+    """Return a digest of an array's type, shape and content."""
+    seal = hashlib.blake2b(digest_size=16)
+    seal.update(repr((array.dtype.str, array.shape)).encode())
+    seal.update(array.tobytes())
+    return seal.hexdigest()
