@@ -93,7 +93,7 @@ class RawAttention(Dialect):
         scale = _columns_and_rows(call, shapes, locations)
         pixels = call.add("Mul", [locations, call.unsqueeze(scale, (1,))])
         offsets = call.reshape(pixels, (batch, queries, heads, -1))
-        reference = call.zeros((batch, queries, 1, 2), locations)
+        reference = call.full((batch, queries, 1, 2), 0.0, locations)
         raw = self._before_softmax(call, weights)
         raw = call.reshape(raw, (batch, queries, heads, -1))
         given = {

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
-from me2e_compress.operators.call import FusedCall, Size
+from me2e_compress.operators.call import FusedCall
 
 GRID_SAMPLE_OPSET = 16
 """The first opset of ONNX's GridSample."""
@@ -38,7 +38,8 @@ def sample_levels(
         value: [N, S, M, D], the maps one behind the other.
         sizes: [L, 2], height and width of each map.
         starts: [L], where each map begins among the S rows.
-        locations: [N, Q, M, L, P, 2], x and y in 0..1.
+        locations: [N, Q, M, L, P, 2], x and y in 0..1; [N, Q, 1, L, P, 2] where all
+            heads look at the same.
         weights: [N, Q, M, L, P].
 
     Returns:
@@ -71,6 +72,8 @@ def _by_grid_sample(
     batch, heads, width = (call.size(value, axis) for axis in (0, 2, 3))
     queries, points = call.size(locations, 1), call.size(locations, 4)
     both = call.product(batch, heads)
+    shared = call.size(locations, 2) == 1
+    images, channels = (batch, call.product(heads, width)) if shared else (both, width)
     scaled = call.add("Mul", [locations, call.numbers(2.0, locations)])
     grids = call.add("Sub", [scaled, call.numbers(1.0, locations)])
     grids = call.transpose(grids, (0, 2, 3, 1, 4, 5))  # [N, M, L, Q, P, 2]
@@ -80,14 +83,16 @@ def _by_grid_sample(
         if not height * columns:
             continue
         rows = call.slice(by_head, start, start + height * columns, 3)
-        image = call.reshape(rows, (both, width, height, columns))
+        image = call.reshape(rows, (images, channels, height, columns))
         grid = call.slice(grids, level, level + 1, 2)
-        grid = call.reshape(grid, (both, queries, points, 2))
+        grid = call.reshape(grid, (images, queries, points, 2))
         taken = call.add("GridSample", [image, grid], {"align_corners": 0})
+        if shared:
+            taken = call.reshape(taken, (both, width, queries, points))
         samples.append(taken)  # [N*M, D, Q, P]
         kept.append(level)
     if not samples:
-        return call.zeros((batch, queries, heads, width), value)
+        return call.full((batch, queries, heads, width), 0.0, value)
     weights = call.transpose(weights, (0, 2, 1, 3, 4))  # [N, M, Q, L, P]
     if len(kept) < len(maps):
         weights = call.add("Gather", [weights, call.integers(kept)], {"axis": 3})
@@ -177,21 +182,13 @@ def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value
     starts = call.cast(starts, ir.DataType.INT64)
     level = call.add("Mul", [call.add("Add", [starts, call.integers([1])]), many])
     level = call.unsqueeze(level, (1,))
-    head = call.unsqueeze(_counting(call, heads), (1, 2))
+    head = call.unsqueeze(call.counting(heads), (1, 2))
     first = call.add("Add", [head, level])  # [M, L, 1]
     if batch == 1:
         return first
     step = call.value_of(call.product(length, heads))
-    image = call.add("Mul", [_counting(call, batch), step])
+    image = call.add("Mul", [call.counting(batch), step])
     return call.add("Add", [call.unsqueeze(image, (1, 2, 3, 4)), first])
-
-
-def _counting(call: FusedCall, size: Size) -> ir.Value:
-    """Write 0, 1, ... below a size."""
-    if isinstance(size, int):
-        return call.integers(list(range(size)))
-    end = call.add("Squeeze", [size, call.integers([0])])
-    return call.add("Range", [call.integers(0), end, call.integers(1)])
 
 
 def sample_levels_array(

@@ -81,9 +81,29 @@ class FusedCall:
         kind = like.dtype or ir.DataType.FLOAT
         return self.constant(np.asarray(values, kind.numpy()))
 
+    def numbers_of(self, array: Array, like: ir.Value) -> ir.Value:
+        """Add an array in the element type of another value."""
+        kind = like.dtype or ir.DataType.FLOAT
+        return self.constant(array.astype(kind.numpy()))
+
     def integers(self, values: int | Sequence[int]) -> ir.Value:
         """Add an int64 constant."""
         return self.constant(np.asarray(values, np.int64), "sizes")
+
+    def sizes(self, values: Sequence[Size], shape: Sequence[int] = (-1,)) -> ir.Value:
+        """Return sizes as one int64 value: a constant where all are known."""
+        known = [size for size in values if isinstance(size, int)]
+        if len(known) == len(values):
+            return self.constant(np.asarray(known, np.int64).reshape(shape), "sizes")
+        joined = self.concat([self.value_of(size) for size in values], 0)
+        return self.reshape(joined, shape)
+
+    def reshape_table(self, value: ir.Value, shape: Sequence[int]) -> ir.Value:
+        """Reshape a small table; a constant stays one."""
+        known = array_of(value)
+        if known is None:
+            return self.reshape(value, shape)
+        return self.constant(known.reshape(shape), "table")
 
     def cast(self, value: ir.Value, kind: ir.DataType) -> ir.Value:
         """Return a value in another element type; itself where it has that."""
@@ -149,21 +169,24 @@ class FusedCall:
         edges = [self.integers([number]) for number in (start, end, axis)]
         return self.add("Slice", [value, *edges])
 
+    def counting(self, size: Size) -> ir.Value:
+        """Write 0, 1, ... below a size, int64."""
+        if isinstance(size, int):
+            return self.integers(list(range(size)))
+        end = self.add("Squeeze", [size, self.integers([0])])
+        return self.add("Range", [self.integers(0), end, self.integers(1)])
+
     def concat(self, values: Sequence[ir.Value], axis: int) -> ir.Value:
         """Join values along an axis; one alone stays as it is."""
         if len(values) == 1:
             return values[0]
         return self.add("Concat", values, {"axis": axis})
 
-    def zeros(self, sizes: Sequence[Size], like: ir.Value) -> ir.Value:
-        """Write zeros of the element type of another value."""
+    def full(self, sizes: Sequence[Size], number: float, like: ir.Value) -> ir.Value:
+        """Write one number everywhere, of the element type of another value."""
         kind = like.dtype or ir.DataType.FLOAT
-        known = [size for size in sizes if isinstance(size, int)]
-        if len(known) == len(sizes):
-            return self.constant(np.zeros(known, kind.numpy()), "zeros")
-        shape = self.concat([self.value_of(size) for size in sizes], 0)
-        zero = {"value": ir.tensor(np.zeros(1, kind.numpy()))}
-        result = self.add("ConstantOfShape", [shape], zero)
+        filling = {"value": ir.tensor(np.full(1, number, kind.numpy()))}
+        result = self.add("ConstantOfShape", [self.sizes(sizes)], filling)
         result.shape = _shape(sizes)
         return result
 

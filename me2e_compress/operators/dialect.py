@@ -260,6 +260,25 @@ class Dialect:
             )
 
 
+def present(inputs: Values) -> tuple[ir.Value, ...]:
+    """Return the inputs of a call that are not left out."""
+    return tuple(value for value in inputs if value is not None)
+
+
+def number(attributes: Attributes, name: str) -> int:
+    """Return an attribute that is one integer."""
+    value = attributes[name]
+    assert isinstance(value, int)
+    return value
+
+
+def numbers(attributes: Attributes, name: str) -> tuple[int, ...]:
+    """Return an attribute that is a list of integers."""
+    value = attributes[name]
+    assert not isinstance(value, int | float | str)
+    return tuple(value)
+
+
 def _value_of(attribute: ir.Attr) -> AttributeValue:
     value = attribute.value
     if isinstance(value, list | tuple):

@@ -17,7 +17,22 @@ OPERATORS: Registry[Operator] = Registry(
     "operator",
     _HERE,
     RecipeError,
-    {"deformable-attention": f"{_HERE}.deformable_attention:DeformableAttention"},
+    {
+        "deformable-attention": f"{_HERE}.deformable_attention:DeformableAttention",
+        "deformable-aggregation": (
+            f"{_HERE}.deformable_aggregation:DeformableAggregation"
+        ),
+        "rotate": f"{_HERE}.rotate:Rotate",
+        "inverse": f"{_HERE}.inverse:Inverse",
+        "grid-sampler-2d": f"{_HERE}.grid_sampler:GridSampler2D",
+        "grid-sampler-3d": f"{_HERE}.grid_sampler:GridSampler3D",
+        "select-and-pad": f"{_HERE}.select_and_pad:SelectAndPad",
+        "bev-pool": f"{_HERE}.bev_pool:BEVPool",
+        "multi-head-attention": f"{_HERE}.multi_head_attention:MultiHeadAttention",
+        "deformable-convolution": (
+            f"{_HERE}.deformable_convolution:DeformableConvolution"
+        ),
+    },
 )
 
 _RESERVED = (OWN_DOMAIN, "com.microsoft")

@@ -62,7 +62,11 @@ def read_graph(path: Path, listener: Listener) -> ir.Model:
 
 def lacking_shapes(model: ir.Model) -> str:
     """Say which plugins give what nobody knows the shape of; empty if none does."""
-    plugins = unshaped_plugins(model)
+    if not unshaped_plugins(model):
+        return ""
+    copy = model.clone()
+    graph.infer_shapes(copy)  # plugins of known dialects tell it themselves
+    plugins = unshaped_plugins(copy)
     if not plugins:
         return ""
     names = ", ".join(dict.fromkeys(node.op_type for node in plugins))

@@ -99,6 +99,19 @@ def test_a_name_of_no_dialect_is_an_error() -> None:
         TranslatePlugins("trt")
 
 
+def test_an_operator_that_the_library_lacks_is_named() -> None:
+    text = (
+        OPSET
+        + """
+    net (float[1,6,4,4] x) => (float[1,6,4,4] y) { ["turn"] y = InverseTRT(x) }"""
+    )
+    with pytest.raises(
+        PreconditionError,
+        match=r"node turn: the dialect tensorrt has no inverse \(InverseTRT\)",
+    ):
+        TranslatePlugins("tensorrt").run(read(text), NO_MODULES)
+
+
 def test_an_opset_that_is_too_old_is_an_error() -> None:
     model = read(RAW.replace('"" : 17', '"" : 12'))
     with pytest.raises(PreconditionError, match="needs opset 13"):

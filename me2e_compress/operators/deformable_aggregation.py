@@ -1,0 +1,183 @@
+"""Deformable feature aggregation (Sparse4D, arXiv 2211.10581; SparseDrive)."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    FLOAT32,
+    INT8_TOO,
+    INT32,
+    INTEGERS,
+    OWN_DOMAIN,
+    Arrays,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+    present,
+)
+
+
+def _operands(
+    integers: tuple[ir.DataType, ...], feature: tuple[ir.DataType, ...]
+) -> tuple[Operand, ...]:
+    return (
+        Operand("mc_ms_feat", "N S C", feature),
+        Operand("spatial_shape", "V L 2", integers),
+        Operand("scale_start_index", "V L", integers),
+        Operand("sampling_location", "N A P V 2", positions=True),
+        Operand("weights", "N A P V L G"),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ScaledFeature(Dialect):
+    """SparseDriveV2, whose int8 features come with a scale per channel, a sixth input.
+
+    From the own form it goes with float features, which have no scale.
+    """
+
+    def inputs_to_own(
+        self, call: FusedCall, inputs: Values, attributes: Attributes
+    ) -> Values:
+        """Multiply the features by their scales."""
+        if len(inputs) < 6 or inputs[5] is None:
+            return inputs[:5]
+        feature, *others, scale = present(inputs)
+        wide = call.cast(feature, scale.dtype or ir.DataType.FLOAT)
+        return (call.add("Mul", [wide, scale]), *others)
+
+    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
+        """Multiply the features by their scales."""
+        if len(arrays) < 6 or arrays[5] is None:
+            return arrays[:5]
+        return (np.asarray(arrays[0]) * arrays[5].astype(np.float64), *arrays[1:5])
+
+    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+        """Drop that of the scales."""
+        return shapes[:5]
+
+
+_SPARSE_DRIVE, _OP = "SparseDrive", "DeformableAggregation"
+
+
+@dataclasses.dataclass(frozen=True)
+class DeformableAggregation(Operator):
+    """A weighted sum of samples of all cameras and levels, for each anchor.
+
+    Own form ``me2e::DeformableAggregation``: mc_ms_feat [N, S, C], the maps of all
+    cameras one behind the other; spatial_shape [V, L, 2] (H, W) of V cameras;
+    scale_start_index [V, L]; sampling_location [N, A, P, V, 2] (x, y), of which only
+    those strictly between 0 and 1 count; weights [N, A, P, V, L, G]. Channel c reads
+    group c // (C / G). Output [N, A, C], the sum over points, cameras and levels.
+    """
+
+    name: ClassVar[str] = "deformable-aggregation"
+    own: ClassVar[Dialect] = Dialect(
+        "me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, (*FLOAT32, ir.DataType.FLOAT16)),
+        "me2e",
+    )  # fmt: skip
+    dialects: ClassVar[tuple[Dialect, ...]] = (
+        Dialect(
+            "sparsedrive", _OP, "SparseDrive",
+            _operands(INT32, (*FLOAT32, ir.DataType.FLOAT16)), _SPARSE_DRIVE,
+        ),
+        ScaledFeature(
+            "sparsedrive-v2", _OP, "sparsedrivev2",
+            (
+                *_operands(INT32, INT8_TOO),
+                Operand("feat_scale", "C", FLOAT32, optional=True),
+            ),
+            "SparseDriveV2",
+        ),
+        Dialect(
+            "sparseend2end", "DeformableAttentionAggrPlugin", "custom",
+            _operands(INT32, (*FLOAT32, ir.DataType.FLOAT16)), "SparseEnd2End",
+        ),
+    )  # fmt: skip
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Write it as deformable attention whose heads are the channel groups."""
+        feature, sizes, starts, at, weights = present(inputs)
+        batch, anchors, points, cameras, levels, groups = (
+            call.size(weights, axis) for axis in range(6)
+        )
+        width = call.size(feature, 2)
+        parts = -1
+        if isinstance(width, int) and isinstance(groups, int):
+            parts = width // groups
+        value = call.reshape(feature, (batch, call.size(feature, 1), groups, parts))
+        maps = call.product(cameras, levels)
+        places = call.transpose(at, (0, 1, 3, 2, 4))  # [N, A, V, P, 2]
+        places = call.unsqueeze(places, (2, 4))  # [N, A, 1, V, 1, P, 2]
+        shape = (batch, anchors, 1, cameras, levels, points, 2)
+        shown = call.sizes(shape)
+        places = call.add("Expand", [places, shown])
+        places = call.reshape(places, (batch, anchors, 1, maps, points, 2))
+        weights = self._inside(call, at, weights)
+        weights = call.transpose(weights, (0, 1, 5, 3, 4, 2))  # [N, A, G, V, L, P]
+        weights = call.reshape(weights, (batch, anchors, groups, maps, points))
+        result = sample_levels(
+            call,
+            value,
+            call.reshape_table(sizes, (-1, 2)),
+            call.reshape_table(starts, (-1,)),
+            places,
+            weights,
+        )
+        return call.reshape(result, (batch, anchors, width))
+
+    def _inside(self, call: FusedCall, at: ir.Value, weights: ir.Value) -> ir.Value:
+        """Take the weights of positions away that are not within their image."""
+        sides = []
+        for axis in call.split_last(at, 2):
+            above = call.add("Greater", [axis, call.numbers(0.0, axis)])
+            sides += [above, call.add("Less", [axis, call.numbers(1.0, axis)])]
+        first, *others = sides
+        for side in others:
+            first = call.add("And", [first, side])
+        inside = call.unsqueeze(first, (4, 5))
+        return call.add("Where", [inside, weights, call.numbers(0.0, weights)])
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, [N, A, C] float64."""
+        feature, sizes, starts, at, weights = (np.asarray(each) for each in inputs)
+        batch, anchors, points, cameras, levels, groups = weights.shape
+        value = feature.astype(np.float64).reshape(batch, feature.shape[1], groups, -1)
+        inside = np.expand_dims(((at > 0) & (at < 1)).all(axis=-1), (-2, -1))
+        shares = np.where(inside, weights, 0).astype(np.float64)
+        places = at.astype(np.float64).transpose(0, 1, 3, 2, 4)[:, :, None, :, None]
+        shape = (batch, anchors, groups, cameras, levels, points, 2)
+        result = sample_levels_array(
+            value,
+            sizes.reshape(-1, 2).astype(np.int64),
+            starts.reshape(-1).astype(np.int64),
+            np.broadcast_to(places, shape).reshape(*shape[:3], -1, points, 2),
+            shares.transpose(0, 1, 5, 3, 4, 2).reshape(*shape[:3], -1, points),
+        )
+        return result.reshape(batch, anchors, -1)
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return [N, A, C]."""
+        feature, weights = shapes[0] or (None,) * 3, shapes[4] or (None,) * 6
+        batch = feature[0] if feature[0] is not None else weights[0]
+        return (batch, weights[1], feature[2])
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count four neighbours and a weight for each sample of C numbers."""
+        feature, weights = shapes[0], shapes[4]
+        if feature is None or weights is None or feature[2] is None:
+            return None
+        known = [dim for dim in weights[:5] if dim is not None]
+        return 4 * math.prod(known) * feature[2] if len(known) == 5 else None

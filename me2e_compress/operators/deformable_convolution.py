@@ -1,0 +1,254 @@
+"""Modulated deformable convolution (Deformable ConvNets v2, arXiv 1811.11168)."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    FLOAT32,
+    FLOATS,
+    INT8_TOO,
+    OWN_DOMAIN,
+    Arrays,
+    Attribute,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+    number,
+    numbers,
+    present,
+)
+
+DEFORM_CONV_OPSET = 19
+"""The first opset of ONNX's DeformConv."""
+
+_NAMES = ("stride", "padding", "dilation")
+
+
+def _options(groups: str, offset_groups: str) -> tuple[Attribute, ...]:
+    return (
+        Attribute("stride", (1, 1)),
+        Attribute("padding", (0, 0)),
+        Attribute("dilation", (1, 1)),
+        Attribute(groups, 1),
+        Attribute(offset_groups, 1),
+    )
+
+
+def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
+    return (
+        Operand("input", "N C H W", types),
+        Operand("offset", "N * F G", types, positions=True),
+        Operand("mask", "N * F G", types),
+        Operand("weight", "O * * *", types),
+        Operand("bias", "O", types, optional=True),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedGroups(Dialect):
+    """A library that names the two counts of groups as it likes, in one order."""
+
+    def options_to_own(self, attributes: Attributes) -> Attributes:
+        """Rename the counts of groups."""
+        values = [attributes[each.name] for each in self.attributes]
+        return dict(zip((each.name for each in _OWN), values, strict=True))
+
+    def options_from_own(self, attributes: Attributes) -> Attributes:
+        """Rename the counts of groups."""
+        values = [attributes[each.name] for each in _OWN]
+        return dict(zip((each.name for each in self.attributes), values, strict=True))
+
+
+_OWN = _options("groups", "deform_groups")
+_OSS = _options("group", "deformable_group")
+_CONV, _MMCV = "ModulatedDeformConv2d", "MMCVModulatedDeformConv2d"
+_LIBRARY = ("trt.plugins", _operands(FLOATS), "TensorRT OSS")
+_MMDEPLOY = (_operands(FLOAT32), "mmcv")
+_DERRYHUB = ("", _operands(INT8_TOO), "BEVFormer_tensorrt")
+_TRT = "ModulatedDeformableConv2dTRT"
+
+
+@dataclasses.dataclass(frozen=True)
+class DeformableConvolution(Operator):
+    """A convolution whose kernel's elements are moved by offsets, weighted by a mask.
+
+    Own form ``me2e::ModulatedDeformConv2d``: input [N, C, H, W]; offset
+    [N, deform_groups * K * 2, F, G] (y, x), for K elements of the kernel; mask
+    [N, deform_groups * K, F, G]; weight [O, C / groups, kernel height, width]; bias [O]
+    or none; ``stride``, ``padding``, ``dilation`` (two each), ``groups``,
+    ``deform_groups``. Output [N, O, F, G].
+    """
+
+    name: ClassVar[str] = "deformable-convolution"
+    own: ClassVar[Dialect] = NamedGroups(
+        "me2e", _CONV, OWN_DOMAIN, _operands(FLOATS), "me2e", _OWN
+    )
+    dialects: ClassVar[tuple[Dialect, ...]] = (
+        NamedGroups("tensorrt", _CONV, *_LIBRARY, _OSS),
+        NamedGroups("tensorrt-v2", _CONV, *_LIBRARY, _OSS, "2"),
+        NamedGroups("mmdeploy", _MMCV, "mmdeploy", *_MMDEPLOY, _OWN),
+        NamedGroups("mmcv", _MMCV, "mmcv", *_MMDEPLOY, _OWN),
+        NamedGroups("derryhub", _TRT, *_DERRYHUB, _OWN),
+        NamedGroups("derryhub-trt2", f"{_TRT}2", *_DERRYHUB, _OWN),
+    )
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Write ONNX's DeformConv, or below its opset samples and a product.
+
+        Raises:
+            PreconditionError: below opset 19 a shape is not known.
+        """
+        image, offset, mask, weight = present(inputs[:4])
+        bias = inputs[4] if len(inputs) > 4 else None
+        if call.opset >= DEFORM_CONV_OPSET:
+            down, across = numbers(attributes, "padding")
+            options: dict[str, int | tuple[int, ...]] = {
+                "strides": numbers(attributes, "stride"),
+                "dilations": numbers(attributes, "dilation"),
+                "pads": (down, across, down, across),
+                "group": number(attributes, "groups"),
+                "offset_group": number(attributes, "deform_groups"),
+            }
+            return call.add("DeformConv", [image, weight, offset, bias, mask], options)
+        result = self._by_samples(call, image, offset, mask, weight, attributes)
+        if bias is None:
+            return result
+        return call.add("Add", [result, call.unsqueeze(bias, (0, 2, 3))])
+
+    def _by_samples(
+        self,
+        call: FusedCall,
+        image: ir.Value,
+        offset: ir.Value,
+        mask: ir.Value,
+        weight: ir.Value,
+        attributes: Attributes,
+    ) -> ir.Value:
+        """Sample for each element of the kernel; multiply by the weight."""
+        batch, channels, height, width = (call.size(image, axis) for axis in range(4))
+        rows, columns = call.size(offset, 2), call.size(offset, 3)
+        outs, per_group, *kernel = (call.size(weight, axis) for axis in range(4))
+        sizes = [channels, height, width, rows, columns, outs, per_group, *kernel]
+        known = [size for size in sizes if isinstance(size, int)]
+        if len(known) < len(sizes):
+            raise PreconditionError(
+                f"node {call.node.name}: below opset {DEFORM_CONV_OPSET} the shapes of"
+                f" {image.name}, {offset.name} and {weight.name} must be known"
+            )
+        deep, high, wide, down, across, out, part, *elements = known
+        count, places = elements[0] * elements[1], down * across
+        parts, groups = number(attributes, "deform_groups"), deep // part
+        value = call.reshape(image, (batch, parts, deep // parts, high * wide))
+        value = call.transpose(value, (0, 3, 1, 2))  # [N, H*W, parts, C / parts]
+        moved = call.reshape(offset, (batch, parts, count, 2, places))
+        moved = call.transpose(moved, (0, 4, 2, 1, 3))  # [N, F*G, elements, parts, 2]
+        grid = kernel_positions((down, across), (elements[0], elements[1]), attributes)
+        at = call.add(
+            "Add",
+            [
+                moved,
+                call.numbers_of(grid, moved),
+            ],
+        )
+        y, x = call.split_last(at, 2)
+        half = call.numbers(0.5, at)
+        edges = [
+            call.unsqueeze(
+                call.add(
+                    "Div",
+                    [call.add("Add", [axis, half]), call.numbers(float(size), axis)],
+                ),
+                (-1,),
+            )
+            for axis, size in ((x, wide), (y, high))
+        ]
+        shape = (batch, places * count, parts, 1, 1)
+        shares = call.reshape(mask, (batch, parts, count, places))
+        shares = call.reshape(call.transpose(shares, (0, 3, 2, 1)), shape)
+        taken = sample_levels(
+            call,
+            value,
+            call.sizes((high, wide), (1, 2)),
+            call.integers([0]),
+            call.reshape(call.concat(edges, -1), (*shape, 2)),
+            shares,
+        )
+        taken = call.reshape(taken, (batch, places, count, groups, part))
+        taken = call.transpose(taken, (0, 3, 4, 2, 1))
+        taken = call.reshape(taken, (batch, groups, part * count, places))
+        matrix = call.reshape(weight, (groups, out // groups, part * count))
+        result = call.add("MatMul", [matrix, taken])
+        return call.reshape(result, (batch, out, down, across))
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, [N, O, F, G] float64."""
+        image, offset, mask, weight, *bias = (
+            np.asarray(each, np.float64) for each in inputs if each is not None
+        )
+        batch, deep, high, wide = image.shape
+        down, across = offset.shape[2:]
+        out, part, *elements = weight.shape
+        count, places = math.prod(elements), down * across
+        parts, groups = number(attributes, "deform_groups"), deep // part
+        grid = kernel_positions((down, across), (elements[0], elements[1]), attributes)
+        moved = offset.reshape(batch, parts, count, 2, places).transpose(0, 4, 2, 1, 3)
+        at = (moved + grid)[..., ::-1] + 0.5
+        shape = (batch, places * count, parts, 1, 1)
+        shares = mask.reshape(batch, parts, count, places).transpose(0, 3, 2, 1)
+        taken = sample_levels_array(
+            image.reshape(batch, parts, -1, high * wide).transpose(0, 3, 1, 2),
+            np.array([[high, wide]]),
+            np.array([0]),
+            (at / np.array([wide, high])).reshape(*shape, 2),
+            shares.reshape(shape),
+        )
+        taken = taken.reshape(batch, places, count, groups, part)
+        matrix = weight.reshape(groups, out // groups, part, count)
+        result: NdArray = np.einsum("gock,npkgc->ngop", matrix, taken)
+        result = result.reshape(batch, out, down, across)
+        return np.add(result, bias[0].reshape(-1, 1, 1)) if bias else result
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return [N, O, F, G]."""
+        offset, weight = shapes[1] or (None,) * 4, shapes[3] or (None,)
+        return (offset[0], weight[0], offset[2], offset[3])
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count the convolution: output elements times a kernel's numbers."""
+        shape, weight = self.output_shape(shapes, attributes), shapes[3]
+        dims = [*(shape or (None,)), *(weight or (None,))[1:]]
+        known = [dim for dim in dims if dim is not None]
+        return math.prod(known) if len(known) == 7 else None
+
+
+def kernel_positions(
+    out: tuple[int, int], kernel: tuple[int, int], attributes: Attributes
+) -> NdArray:
+    """Compute where each element of a kernel lies without an offset.
+
+    Returns:
+        [rows * columns, elements, 1, 2] float64, y and x in pixels.
+    """
+    options = [numbers(attributes, name) for name in _NAMES]
+    axes = [
+        np.arange(out[axis])[:, None] * stride - padding
+        + np.arange(kernel[axis])[None] * dilation
+        for axis, (stride, padding, dilation) in enumerate(zip(*options, strict=True))
+    ]  # fmt: skip
+    grid = np.zeros((out[0], out[1], kernel[0], kernel[1], 2))
+    grid[..., 0] = axes[0][:, None, :, None]
+    grid[..., 1] = axes[1][None, :, None, :]
+    return grid.reshape(out[0] * out[1], kernel[0] * kernel[1], 1, 2)

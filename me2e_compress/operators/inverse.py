@@ -1,0 +1,116 @@
+"""Inverse of small matrices, of cameras for one."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    FLOAT32,
+    FLOATS,
+    OWN_DOMAIN,
+    Arrays,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+    present,
+)
+
+_LARGEST = 16
+"""Of n * n minors of (n - 1) x (n - 1) numbers, the work is n to the fifth."""
+
+_DERRYHUB = "BEVFormer_tensorrt"
+_ANY, _BATCHES = Operand("matrix", None, FLOAT32, positions=True), "B C n n"
+
+
+def _plugin(name: str, op_type: str, domain: str, source: str) -> Dialect:
+    return Dialect(name, op_type, domain, (_ANY,), source)
+
+
+@dataclasses.dataclass(frozen=True)
+class Inverse(Operator):
+    """The inverse of square matrices.
+
+    Own form ``me2e::Inverse``: matrix [..., n, n], n known and at most 16, to the same.
+    The body divides the cofactors, each a determinant (ONNX's Det), by the determinant.
+    """
+
+    name: ClassVar[str] = "inverse"
+    own: ClassVar[Dialect] = _plugin("me2e", "Inverse", OWN_DOMAIN, "me2e")
+    dialects: ClassVar[tuple[Dialect, ...]] = (
+        *(
+            Dialect(
+                name, "InverseTRT", "",
+                (Operand("matrix", _BATCHES, FLOAT32, positions=True),), _DERRYHUB,
+            )
+            for name in ("derryhub", "derryhub-trt2", "dl4agx-uniad")
+        ),
+        _plugin("dl4agx", "InversePlugin", "custom_op", "DL4AGX"),
+        Dialect(
+            "onnxruntime", "Inverse", "com.microsoft",
+            (Operand("matrix", None, FLOATS, positions=True),), "onnxruntime",
+        ),
+    )  # fmt: skip
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Write the adjugate over the determinant.
+
+        Raises:
+            PreconditionError: the size of the matrices is not known, or too large.
+        """
+        (matrix,) = present(inputs)
+        kind = matrix.dtype or ir.DataType.FLOAT
+        if kind == ir.DataType.FLOAT16:  # onnxruntime has no kernel for it
+            matrix = call.cast(matrix, ir.DataType.FLOAT)
+        size = call.size(matrix, -1)
+        if not isinstance(size, int) or not 0 < size <= _LARGEST:
+            raise PreconditionError(
+                f"node {call.node.name}: matrices of {matrix.name} must be of a known"
+                f" size up to {_LARGEST}"
+            )
+        if size == 1:
+            return call.cast(call.add("Reciprocal", [matrix]), kind)
+        rank = len(matrix.shape) if matrix.shape is not None else 2
+        outer = tuple(call.size(matrix, axis) for axis in range(rank - 2))
+        flat = call.reshape(matrix, (*outer, size * size))
+        minors = call.add("Gather", [flat, call.constant(_minors(size))], {"axis": -1})
+        parity = np.indices((size, size)).sum(axis=0) % 2
+        signs = call.numbers_of(1 - 2 * parity, matrix)
+        adjugate = call.add("Mul", [call.add("Det", [minors]), signs])
+        whole = call.unsqueeze(call.add("Det", [matrix]), (rank - 2, rank - 1))
+        return call.cast(call.add("Div", [adjugate, whole]), kind)
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, float64."""
+        return np.linalg.inv(np.asarray(inputs[0], np.float64))
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return the shape of the matrices."""
+        return shapes[0]
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count n cubed for each matrix, what elimination takes."""
+        shape = shapes[0]
+        known = [dim for dim in shape or () if dim is not None]
+        if shape is None or len(known) < len(shape):
+            return None
+        return math.prod(known) * known[-1]
+
+
+def _minors(size: int) -> NdArray:
+    """Index the minor of each element of the adjugate, [n, n, n - 1, n - 1]."""
+    kept = np.array([[j for j in range(size) if j != i] for i in range(size)])
+    # element (i, j) of the adjugate is the minor without row j and column i
+    rows, columns = kept[None, :, :, None], kept[:, None, None, :]
+    index: NdArray = rows * size + columns
+    return index

@@ -1,0 +1,82 @@
+"""Attention whose heads lie in the batch (Attention is all you need, equation 1)."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    FLOATS,
+    INT8_TOO,
+    OWN_DOMAIN,
+    Arrays,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+    present,
+)
+
+
+def _dialect(name: str, op_type: str, domain: str, source: str) -> Dialect:
+    types = FLOATS if domain == OWN_DOMAIN else INT8_TOO
+    operands = (
+        Operand("query", "B Q C", types),
+        Operand("key", "B K C", types),
+        Operand("value", "B K C", types),
+    )
+    return Dialect(name, op_type, domain, operands, source)
+
+
+@dataclasses.dataclass(frozen=True)
+class MultiHeadAttention(Operator):
+    """Softmax(query key^T / sqrt(C)) value, for each head.
+
+    Own form ``me2e::MultiHeadAttention``: query [B, Q, C]; key and value [B, K, C]; the
+    heads lie in B. Output [B, Q, C].
+    """
+
+    name: ClassVar[str] = "multi-head-attention"
+    own: ClassVar[Dialect] = _dialect("me2e", "MultiHeadAttention", OWN_DOMAIN, "me2e")
+    dialects: ClassVar[tuple[Dialect, ...]] = (
+        _dialect("derryhub", "QKVTRT", "", "BEVFormer_tensorrt"),
+        _dialect("derryhub-trt2", "QKVTRT2", "", "BEVFormer_tensorrt"),
+    )
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Write both products and the softmax."""
+        query, key, value = present(inputs)
+        width = call.size(query, -1)
+        count = call.cast(call.value_of(width), query.dtype or ir.DataType.FLOAT)
+        query = call.add("Div", [query, call.add("Sqrt", [count])])
+        scores = call.add("MatMul", [query, call.transpose(key, (0, 2, 1))])
+        weights = call.add("Softmax", [scores], {"axis": -1})
+        return call.add("MatMul", [weights, value])
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, [B, Q, C] float64."""
+        query, key, value = (np.asarray(each, np.float64) for each in inputs)
+        scores = query @ key.transpose(0, 2, 1) / math.sqrt(query.shape[-1])
+        weights = np.exp(scores - scores.max(axis=-1, keepdims=True))
+        result: NdArray = (weights / weights.sum(axis=-1, keepdims=True)) @ value
+        return result
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return [B, Q, C]."""
+        return shapes[0]
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count both products."""
+        query, key = shapes[0], shapes[1]
+        known = [dim for dim in query or () if dim is not None]
+        if len(known) < 3 or key is None or key[1] is None:
+            return None
+        return 2 * math.prod(known) * key[1]

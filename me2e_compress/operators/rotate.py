@@ -1,0 +1,160 @@
+"""Rotation of a feature map about a point, as BEVFormer turns its last BEV."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    FLOATS,
+    INT8_TOO,
+    OWN_DOMAIN,
+    Arrays,
+    Attribute,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+    present,
+)
+
+_INTERPOLATION = (Attribute("interpolation", 0, choices=(0, 1)),)
+
+
+def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
+    return (
+        Operand("img", "C H W", types),
+        Operand("angle", "1", types, positions=True),
+        Operand("center", "2", types, positions=True),
+    )
+
+
+def _dialect(name: str, op_type: str, domain: str, source: str) -> Dialect:
+    types = INT8_TOO if source == _DERRYHUB else FLOATS
+    return Dialect(name, op_type, domain, _operands(types), source, _INTERPOLATION)
+
+
+_DERRYHUB = "BEVFormer_tensorrt"
+
+
+@dataclasses.dataclass(frozen=True)
+class Rotate(Operator):
+    """Rotate a feature map by an angle about a point; zeros come in from outside.
+
+    Own form ``me2e::Rotate``: img [C, H, W]; angle [1] in degrees; center [2] (x, y) in
+    pixels; ``interpolation`` 0 bilinear, 1 nearest (halves to the even pixel). Output
+    [C, H, W], as torchvision's ``rotate`` (BEVFormer_tensorrt, rotateKernel.cu).
+    """
+
+    name: ClassVar[str] = "rotate"
+    own: ClassVar[Dialect] = _dialect("me2e", "Rotate", OWN_DOMAIN, "me2e")
+    dialects: ClassVar[tuple[Dialect, ...]] = (
+        _dialect("derryhub", "RotateTRT", "", _DERRYHUB),
+        _dialect("derryhub-trt2", "RotateTRT2", "", _DERRYHUB),
+        _dialect("dl4agx-uniad", "RotateTRT", "", _DERRYHUB),
+        _dialect("dl4agx", "RotatePlugin", "custom_op", "DL4AGX"),
+        _dialect("autoware", "RotatePlugin", "", "Autoware"),
+    )
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Sample the map at the turned positions of its pixels."""
+        image, angle, center = present(inputs)
+        channels, height, width = (call.size(image, axis) for axis in range(3))
+        rows = call.transpose(call.reshape(image, (channels, -1)), (1, 0))
+        value = call.unsqueeze(rows, (0, 2))  # [1, H*W, 1, C]
+        x, y = self._positions(call, image, angle, center)
+        places = []
+        for at, size in ((x, width), (y, height)):
+            if attributes["interpolation"] == 1:
+                at = call.add("Round", [at])
+            middle = call.add("Add", [at, call.numbers(0.5, at)])
+            count = call.cast(call.value_of(size), at.dtype or ir.DataType.FLOAT)
+            scaled = call.add("Div", [middle, count])
+            places.append(call.reshape(scaled, (1, -1, 1, 1, 1, 1)))
+        at = call.concat(places, 5)
+        pixels = call.product(height, width)
+        weights = call.full((1, pixels, 1, 1, 1), 1.0, at)
+        sizes = call.sizes((height, width), (1, 2))
+        result = sample_levels(call, value, sizes, call.integers([0]), at, weights)
+        result = call.transpose(call.reshape(result, (pixels, channels)), (1, 0))
+        return call.reshape(result, (channels, height, width))
+
+    def _positions(
+        self, call: FusedCall, image: ir.Value, angle: ir.Value, center: ir.Value
+    ) -> tuple[ir.Value, ir.Value]:
+        """Write where each pixel comes from, x and y [H, W] in pixels."""
+        turn = call.add("Mul", [angle, call.numbers(math.pi / 180, angle)])
+        cosine, sine = call.add("Cos", [turn]), call.add("Sin", [turn])
+        kind = angle.dtype or ir.DataType.FLOAT
+        middles = []  # of a pixel, from the center of rotation
+        for axis, at in zip((2, 1), call.split_last(center, 2), strict=True):
+            counted = call.cast(call.counting(call.size(image, axis)), kind)
+            half = call.add("Add", [counted, call.numbers(0.5, counted)])
+            middles.append((call.add("Sub", [half, at]), at))
+        (across, x), (down, y) = middles
+        down = call.unsqueeze(down, (1,))
+        turned = (
+            call.add("Sub", self._products(call, (cosine, across), (sine, down))),
+            call.add("Add", self._products(call, (sine, across), (cosine, down))),
+        )
+        half = call.numbers(0.5, angle)
+        moved = (call.add("Sub", [at, half]) for at in (x, y))
+        one, two = (
+            call.add("Add", [at, start])
+            for at, start in zip(turned, moved, strict=True)
+        )
+        return one, two
+
+    def _products(
+        self,
+        call: FusedCall,
+        one: tuple[ir.Value, ir.Value],
+        two: tuple[ir.Value, ir.Value],
+    ) -> list[ir.Value]:
+        return [call.add("Mul", list(pair)) for pair in (one, two)]
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, [C, H, W] float64."""
+        image, angle, center = (np.asarray(each, np.float64) for each in inputs)
+        channels, height, width = image.shape
+        turn = -np.deg2rad(angle.item())
+        y, x = np.mgrid[:height, :width] + 0.5
+        x, y = x - center[0], y - center[1]
+        at = np.stack(
+            [
+                np.cos(turn) * x + np.sin(turn) * y + center[0],
+                -np.sin(turn) * x + np.cos(turn) * y + center[1],
+            ],
+            axis=-1,
+        )
+        if attributes["interpolation"] == 1:
+            at = np.round(at - 0.5) + 0.5
+        size = np.array([width, height], np.float64)
+        result = sample_levels_array(
+            image.reshape(channels, -1).T[None, :, None],
+            np.array([[height, width]]),
+            np.array([0]),
+            (at / size).reshape(1, -1, 1, 1, 1, 2),
+            np.ones((1, height * width, 1, 1, 1)),
+        )
+        return result.reshape(height, width, channels).transpose(2, 0, 1)
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return [C, H, W]."""
+        return shapes[0]
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count four neighbours for each element; none for the nearest."""
+        if attributes["interpolation"] == 1:
+            return 0
+        known = [dim for dim in shapes[0] or () if dim is not None]
+        return 4 * math.prod(known) if len(known) == 3 else None

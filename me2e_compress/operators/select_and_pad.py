@@ -1,0 +1,106 @@
+"""The flagged rows of a table, padded to a fixed number."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.base import Operator
+from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.dialect import (
+    FLOAT32,
+    FLOATS,
+    INT32,
+    INTEGERS,
+    OWN_DOMAIN,
+    Arrays,
+    Attribute,
+    Dialect,
+    NdArray,
+    Operand,
+    Values,
+    number,
+    present,
+)
+
+
+def _dialect(
+    name: str,
+    op_type: str,
+    domain: str,
+    source: str,
+    types: tuple[ir.DataType, ...] = FLOATS,
+    flags: tuple[ir.DataType, ...] = INT32,
+) -> Dialect:
+    operands = (
+        Operand("feat", "B Q C", types),
+        Operand("flag", "B Q", flags),
+        Operand("invalid", "C", types),
+    )
+    return Dialect(name, op_type, domain, operands, source, (Attribute("P", 16),))
+
+
+@dataclasses.dataclass(frozen=True)
+class SelectAndPad(Operator):
+    """The first rows that are flagged, in order; a row of its own where they run out.
+
+    Own form ``me2e::SelectAndPad``: feat [B, Q, C]; flag int32 or int64 [B, Q], above 0
+    where a row is taken; invalid [C]; ``P`` rows. Output [B, P, C].
+    """
+
+    name: ClassVar[str] = "select-and-pad"
+    own: ClassVar[Dialect] = _dialect(
+        "me2e", "SelectAndPad", OWN_DOMAIN, "me2e", FLOATS, INTEGERS
+    )
+    dialects: ClassVar[tuple[Dialect, ...]] = (
+        _dialect("dl4agx", "SelectAndPadPlugin", "custom_op", "DL4AGX", FLOAT32),
+        _dialect("autoware", "SelectAndPadPlugin", "", "Autoware"),
+    )
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        """Take the P flagged rows of the lowest number (TopK), then choose."""
+        feature, flag, invalid = present(inputs)
+        count, rows = number(attributes, "P"), call.size(feature, 1)
+        if not isinstance(rows, int) or rows < count:  # there must be P rows to take
+            more = call.integers([0, 0, 0, 0, count, 0])
+            feature = call.add("Pad", [feature, more])
+            flag = call.cast(flag, ir.DataType.INT32)
+            flag = call.add("Pad", [flag, call.integers([0, 0, 0, count])])
+            rows = call.size(feature, 1)
+        numbers = call.cast(call.counting(rows), ir.DataType.FLOAT)
+        first = call.add("Sub", [call.numbers(0.0, numbers), numbers])
+        last = call.numbers(float("-inf"), numbers)
+        wide = call.cast(flag, ir.DataType.INT64)
+        taken = call.add("Greater", [wide, call.integers(0)])
+        order = call.add("Where", [taken, first, last])
+        best = call.add("TopK", [order, call.integers([count])], outputs=2)
+        index = best.producer().outputs[1]  # type: ignore[union-attr]
+        index = call.unsqueeze(index, (2,))
+        found = call.add("GatherND", [feature, index], {"batch_dims": 1})
+        none = call.add("Equal", [best, last])
+        return call.add("Where", [call.unsqueeze(none, (2,)), invalid, found])
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        """Compute it in numpy, [B, P, C] float64."""
+        feature, flag, invalid = (np.asarray(each) for each in inputs)
+        count = number(attributes, "P")
+        result = np.empty((len(feature), count, feature.shape[2]))
+        result[:] = invalid
+        for index, rows in enumerate(feature):
+            chosen = rows[flag[index] > 0][:count]
+            result[index, : len(chosen)] = chosen
+        return result
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        """Return [B, P, C]."""
+        feature = shapes[0] or (None,) * 3
+        return (feature[0], number(attributes, "P"), feature[2])
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        """Count none: rows are moved."""
+        return 0
