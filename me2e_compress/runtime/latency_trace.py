@@ -1,8 +1,9 @@
 """Latencies of a model as they were measured on one machine."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -14,6 +15,68 @@ from me2e_compress.runtime.atomic import write_json
 
 PERCENTILES = (50, 90, 99)
 
+Microseconds: TypeAlias = Mapping[str, tuple[int, ...]]
+"""By name, one number an inference."""
+
+
+@dataclass(frozen=True)
+class TimeShare:
+    """What one part of a model takes of its time.
+
+    Attributes:
+        name: of a module or an operator.
+        share: of the whole, 0 to 1.
+        p50_us: microseconds; so with the others.
+        p90_us: see there.
+        p99_us: see there.
+        max_us: of the slowest inference.
+    """
+
+    name: str
+    share: float
+    p50_us: int
+    p90_us: int
+    p99_us: int
+    max_us: int
+
+
+def shares(parts: Microseconds) -> tuple[TimeShare, ...]:
+    """Return what each part takes, over all inferences."""
+    whole = max(1, sum(map(sum, parts.values())))
+    return tuple(
+        TimeShare(
+            name,
+            sum(samples) / whole,
+            percentile(samples, 50),
+            percentile(samples, 90),
+            percentile(samples, 99),
+            max(samples),
+        )
+        for name, samples in parts.items()
+    )
+
+
+def shares_table(title: str, what: str, parts: Microseconds) -> Table:
+    """Show what each part takes: share, then milliseconds."""
+    rows = [
+        (
+            each.name,
+            f"{each.share:.1%}",
+            *(
+                f"{taken_us / 1e3:.2f}"
+                for taken_us in (each.p50_us, each.p90_us, each.p99_us, each.max_us)
+            ),
+        )
+        for each in shares(parts)
+    ]
+    columns = (what, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
+    return table(title, columns, rows)
+
+
+def percentile(samples: Sequence[int], percent: float) -> int:
+    """Return the smallest sample that so many percent do not exceed."""
+    return int(np.percentile(samples, percent, method="inverted_cdf"))
+
 
 @dataclass(frozen=True, repr=False)
 class LatencyTrace(Displayed):
@@ -24,12 +87,15 @@ class LatencyTrace(Displayed):
         machine: Processor and number of threads, in words.
         samples_us: Microseconds, one an inference, without the warm-up.
         frames: Fingerprint of the recording that the model saw; None: not known.
+        modules_us: What each module took in as many inferences of their own, under a
+            profiler; empty: not measured.
     """
 
     model_sha256: str
     machine: str
     samples_us: tuple[int, ...]
     frames: str | None = None
+    modules_us: Microseconds = field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -37,17 +103,22 @@ class LatencyTrace(Displayed):
         return f"{len(self.samples_us)} inferences on {self.machine}"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the percentiles in milliseconds."""
+        """Return the percentiles in milliseconds, and what modules took."""
         rows = [
             *((f"p{p}", self.percentile_us(p)) for p in PERCENTILES),
             ("max", self.max_us),
         ]
         shown = [(name, f"{taken_us / 1e3:.2f}") for name, taken_us in rows]
-        return (table(self.headline, ("latency", "ms"), shown),)
+        whole = table(self.headline, ("latency", "ms"), shown)
+        if not self.modules_us:
+            return (whole,)
+        count = len(next(iter(self.modules_us.values())))
+        title = f"By module, {count} inferences under a profiler"
+        return whole, shares_table(title, "module", self.modules_us)
 
     def percentile_us(self, percent: float) -> int:
         """Return the smallest sample that so many percent do not exceed."""
-        return int(np.percentile(self.samples_us, percent, method="inverted_cdf"))
+        return percentile(self.samples_us, percent)
 
     @property
     def max_us(self) -> int:
@@ -57,6 +128,8 @@ class LatencyTrace(Displayed):
     def to_json(self) -> dict[str, Any]:
         """Return p50, p90, p99 and max beside the samples."""
         frames = {} if self.frames is None else {"frames": self.frames}
+        taken = {name: list(each) for name, each in self.modules_us.items()}
+        modules = {"modules_us": taken} if taken else {}
         return {
             "model_sha256": self.model_sha256,
             "machine": self.machine,
@@ -64,6 +137,7 @@ class LatencyTrace(Displayed):
             **{f"p{p}_us": self.percentile_us(p) for p in PERCENTILES},
             "max_us": self.max_us,
             "samples_us": list(self.samples_us),
+            **modules,
         }
 
     def save(self, path: Path) -> None:
@@ -98,8 +172,16 @@ class LatencyTrace(Displayed):
             raise EvaluationError(
                 f"{path}: not a latency trace: {where}: {first['msg']}"
             ) from error
-        samples_us = tuple(record.samples_us)
-        return cls(record.model_sha256, record.machine, samples_us, record.frames)
+        return cls(
+            record.model_sha256,
+            record.machine,
+            tuple(record.samples_us),
+            record.frames,
+            {name: tuple(taken) for name, taken in record.modules_us.items()},
+        )
+
+
+_Samples: TypeAlias = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 
 
 class _Record(BaseModel):
@@ -108,4 +190,5 @@ class _Record(BaseModel):
     model_sha256: str
     machine: str
     frames: str | None = None
-    samples_us: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    samples_us: _Samples
+    modules_us: dict[str, _Samples] = Field(default_factory=dict)

@@ -8,6 +8,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.graph import producer_of
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 
 _JOINTS = "/_"
@@ -15,20 +16,21 @@ _JOINTS = "/_"
 ``/MatMulAddFusion``, ``_nchwc``, ``_token_1``."""
 
 
-def optimized(model: ir.Model) -> ir.Model:
+def optimized(model: ir.Model, provider: Provider = CPU) -> ir.Model:
     """Return a graph as onnxruntime's optimizations leave it, on this machine.
 
     Its operators are those that run: ``QLinearConv``, ``FusedConv``, ``ReorderInput``.
 
     Args:
         model: the graph; it stays as it is.
+        provider: what runs it.
 
     Raises:
         GraphError: onnxruntime cannot run this graph.
     """
     with tempfile.TemporaryDirectory(prefix="me2e-optimized-") as folder:
         path = Path(folder) / "model.onnx"
-        Session(model, threads=1, rewritten=path)
+        Session(model, threads=1, rewritten=path, provider=provider)
         found = ir.load(path)
         ir.external_data.load_to_model(found)
     return found

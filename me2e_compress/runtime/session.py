@@ -67,6 +67,8 @@ class Session:
         rewritten: a file to write the graph to as onnxruntime's optimizations leave
             it, its weights in a file beside it; it fits this machine's kernels only.
         provider: what runs the nodes, and the libraries of operators it knows.
+        profiled: a folder for what onnxruntime's profiler writes, all in all, when
+            :meth:`end_profile` is called.
 
     Attributes:
         inputs: by name, what must be fed, in order.
@@ -90,6 +92,7 @@ class Session:
         release: bool = False,
         rewritten: Path | None = None,
         provider: Provider = CPU,
+        profiled: Path | None = None,
     ) -> None:
         options = ort.SessionOptions()
         provider.attach(options)
@@ -110,6 +113,9 @@ class Session:
             options.add_session_config_entry(_WEIGHTS_FILE, f"{rewritten.name}.data")
             # Weights packed for the kernels are not what is written.
             options.add_session_config_entry("session.disable_prepacking", "1")
+        if profiled is not None:
+            options.enable_profiling = True
+            options.profile_file_prefix = str(profiled / "nodes")
         self._each_run = ort.RunOptions()
         if release:
             self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
@@ -156,6 +162,10 @@ class Session:
         except REFUSALS as error:
             raise GraphError(f"onnxruntime failed: {_line(error)}") from error
         return dict(zip(names, values, strict=True))
+
+    def end_profile(self) -> Path:
+        """Write what the profiler recorded; return the file, an event a line."""
+        return Path(self._ort.end_profiling())
 
 
 def replay(

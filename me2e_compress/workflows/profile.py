@@ -1,16 +1,32 @@
 """Latency of a model alone and warm, as a trace."""
 
 import dataclasses
+from importlib import util
 from pathlib import Path
+
+import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.errors import EvaluationError, MissingExtraError
+from me2e_compress.modules import assign
+from me2e_compress.runtime.breakdown import Breakdown, break_down
+from me2e_compress.runtime.latency_trace import (
+    LatencyTrace,
+    Microseconds,
+    shares,
+    shares_table,
+)
 from me2e_compress.runtime.others_load import BUSY, OthersLoad, is_busy
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.workflows.checks import MOST_THREADS, check_count, model_path
+from me2e_compress.workflows.checks import (
+    MOST_THREADS,
+    check_count,
+    load_map,
+    model_path,
+)
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -18,6 +34,10 @@ from me2e_compress.workflows.result import Result, Table
 
 MOST_SAMPLES = 10**9
 """Inferences that can be asked for: at a millisecond each, a fortnight."""
+KINDS = (".png", ".svg", ".pdf")
+"""Endings of a figure."""
+_SHOWN = 12
+"""Operators in a table."""
 BEYOND_P99 = 5
 """Samples that must lie beyond the 99th percentile: with fewer, one disturbance more or
 less moves it."""
@@ -32,6 +52,9 @@ class ProfileOptions:
         warm_up: inferences before the first that counts.
         threads: of onnxruntime; 0 takes all.
         provider: what runs the graph.
+        by_module: then measure modules and operators, in inferences of their own.
+        module_map: preset or TOML file; None finds the preset.
+        figure: draw modules over inferences as PNG, SVG or PDF; measures them.
         force: replace outputs that are not as we left them, too.
 
     Raises:
@@ -42,6 +65,9 @@ class ProfileOptions:
     warm_up: int = WARM_UP
     threads: int = 1
     provider: Provider = CPU
+    by_module: bool = False
+    module_map: str | Path | None = None
+    figure: str | Path | None = None
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -59,6 +85,8 @@ class ProfileResult(Result):
         model: the file.
         trace: the samples.
         output: the trace that was written; None if none was.
+        operators_us: what each operator took, in inferences under a profiler.
+        figure: the picture that was drawn; None if none was.
         others_cores: how many cores other processes kept busy; None: not measured.
         cores: of the machine.
     """
@@ -68,6 +96,8 @@ class ProfileResult(Result):
     output: Path | None
     others_cores: float | None = None
     cores: int = 1
+    operators_us: Microseconds = dataclasses.field(default_factory=dict)
+    figure: Path | None = None
 
     @property
     def headline(self) -> str:
@@ -95,20 +125,29 @@ class ProfileResult(Result):
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the percentiles in milliseconds."""
-        return tuple(
-            dataclasses.replace(each, title=self.headline)
-            for each in self.trace.tables()
-        )
+        """Return the percentiles in milliseconds, by module and operator too."""
+        whole, *modules = self.trace.tables()
+        found = (dataclasses.replace(whole, title=self.headline), *modules)
+        if not self.operators_us:
+            return found
+        rest = len(self.operators_us) - _SHOWN
+        shown = shares_table("By operator, as it runs", "operator", self.operators_us)
+        note = f"{rest} more operators: --json" if rest > 0 else ""
+        return *found, dataclasses.replace(shown, rows=shown.rows[:_SHOWN], note=note)
 
     def records(self) -> list[dict[str, object]]:
         """Return a row an inference, in their order."""
         return [{"latency_us": sample} for sample in self.trace.samples_us]
 
     def to_json(self) -> object:
-        """Return what the trace file holds, and how busy the machine was."""
-        others = {"others_cores": self.others_cores, "cores": self.cores}
-        return {**self.trace.to_json(), **others}
+        """Return what the trace file holds, shares, and how busy the machine was."""
+        return {
+            **self.trace.to_json(),
+            "modules": shares(self.trace.modules_us),
+            "operators": shares(self.operators_us),
+            "others_cores": self.others_cores,
+            "cores": self.cores,
+        }
 
 
 def profile(
@@ -118,7 +157,7 @@ def profile(
     options: ProfileOptions | None = None,
     listener: Listener = SILENT,
 ) -> ProfileResult:
-    """Measure a model alone and warm.
+    """Measure a model alone and warm; by module and operator too, if asked.
 
     Args:
         model: the graph, or the name of one that ships.
@@ -129,25 +168,83 @@ def profile(
 
     Raises:
         GraphError: no such model, it cannot be run, or the output would harm an input.
-        EvaluationError: there is nothing to measure.
+        EvaluationError: there is nothing to measure, or no such kind of picture.
         FramesError: a frame does not fit.
+        ModuleMapError: no such map.
         ProviderError: the provider is not there.
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
-    with writing([written], (source, frames), force=options.force):
-        trace, load = _measured(source, Path(frames), options, listener)
+    figure = None if options.figure is None else figure_path(options.figure)
+    inputs = (source, frames, options.module_map)
+    with writing([written, figure], inputs, force=options.force):
+        loaded, recording = graph.load(source), CalibrationSet(Path(frames))
+        trace, load = _measured(source, loaded, recording, options, listener)
+        operators: Microseconds = {}
+        if options.by_module or figure is not None:
+            found = _broken_down(loaded, recording, options, listener)
+            trace = dataclasses.replace(trace, modules_us=found.modules_us)
+            operators = found.operators_us
+        if figure is not None:
+            draw(trace, source.stem, figure)
         if written is not None:
             trace.save(written)
-    return ProfileResult(source, trace, written, load.cores, load.of)
+    return ProfileResult(source, trace, written, load.cores, load.of, operators, figure)
+
+
+def figure_path(named: str | Path) -> Path:
+    """Return the file of a figure, if it can be drawn.
+
+    Raises:
+        EvaluationError: its name does not end as one of :data:`KINDS` of pictures.
+        MissingExtraError: matplotlib is not installed.
+    """
+    path = Path(named)
+    if path.suffix not in KINDS:
+        raise EvaluationError(f"{path}: a figure ends in {', '.join(KINDS)}")
+    if util.find_spec("matplotlib") is None:
+        raise MissingExtraError("matplotlib", "highway")
+    return path
+
+
+def draw(trace: LatencyTrace, name: str, path: Path) -> None:
+    """Draw what modules took, inference by inference; see :mod:`latency_figure`."""
+    from me2e_compress.workflows.latency_figure import draw_modules  # matplotlib
+
+    draw_modules(trace.modules_us, name, trace.machine, path)
+
+
+def _broken_down(
+    loaded: ir.Model,
+    recording: CalibrationSet,
+    options: ProfileOptions,
+    listener: Listener,
+) -> Breakdown:
+    """Measure modules and operators in as many inferences, under the profiler."""
+    placed = assign(loaded, load_map(options.module_map, loaded))
+    return break_down(
+        loaded,
+        placed.module_of,
+        recording,
+        runs=len(recording) if options.samples is None else options.samples,
+        warm_up=options.warm_up,
+        threads=options.threads,
+        provider=options.provider,
+        on_run=lambda done, total: listener.on_progress(
+            "by module", done, total, "inferences"
+        ),
+    )
 
 
 def _measured(
-    source: Path, frames: Path, options: ProfileOptions, listener: Listener
+    source: Path,
+    loaded: ir.Model,
+    recording: CalibrationSet,
+    options: ProfileOptions,
+    listener: Listener,
 ) -> tuple[LatencyTrace, OthersLoad]:
-    recording = CalibrationSet(frames)
     try_first(
-        graph.load(source),
+        loaded,
         source.name,
         listener,
         file=source,

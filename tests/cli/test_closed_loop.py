@@ -132,6 +132,12 @@ def test_score_of_another_folder(run: Run, tmp_path: Path) -> None:
         run("score", tmp_path)
 
 
+def test_a_figure_of_no_known_kind(run: Run, tmp_path: Path) -> None:
+    words = ("-o", tmp_path / "t.json", "--figure", tmp_path / "tail.gif")
+    with pytest.raises(EvaluationError, match=r"tail\.gif: a figure ends in \.png"):
+        run("profile", "highway", tmp_path, *words)
+
+
 def test_a_profile_is_a_latency_trace(run: Run, manifest: Path, tmp_path: Path) -> None:
     model = tmp_path / "m.onnx"
     text = """<ir_version: 8, opset_import: ["" : 17]>
@@ -143,8 +149,13 @@ def test_a_profile_is_a_latency_trace(run: Run, manifest: Path, tmp_path: Path) 
         np.savez(frames / f"{index}.npz", x=np.zeros(3, np.float32))
     (frames / "scenes.json").write_text('{"scenes": [0]}')
 
-    shown = json.loads(run("profile", model, frames, "-o", trace, "--json"))
+    picture = tmp_path / "tail.png"
 
+    words = ("profile", model, frames, "-o", trace, "--figure", picture, "--json")
+    shown = json.loads(run(*words))
+
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert [each["name"] for each in shown["modules"]] == ["model", "(between nodes)"]
     saved = json.loads(trace.read_text())
     assert {key: shown[key] for key in saved} == saved
     assert faults("profile", shown) == []

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from me2e_compress.cli import arguments as given
-from me2e_compress.cli.console import listening, show
+from me2e_compress.cli.console import listening, show, tell
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import profile as workflow
@@ -19,6 +19,13 @@ def profile(
     samples: Annotated[int | None, typer.Option(help="how many latencies")] = None,
     warm_up: Annotated[int, typer.Option(help="inferences before")] = WARM_UP,
     threads: given.Threads = 1,
+    by_module: Annotated[
+        bool, typer.Option("--by-module", help="then modules and operators too")
+    ] = False,
+    figure: Annotated[
+        Path | None, typer.Option(help="draw modules over inferences: PNG, SVG, PDF")
+    ] = None,
+    module_map: given.ModuleMap = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
@@ -26,7 +33,11 @@ def profile(
 ) -> None:
     """Measure a model alone and warm, and write its latencies as a trace."""
     device = provider_named(provider, plugins or ())
-    options = workflow.ProfileOptions(samples, warm_up, threads, device, force)
+    options = workflow.ProfileOptions(
+        samples, warm_up, threads, device, by_module, module_map, figure, force
+    )
     with listening() as listener:
         found = workflow.profile(model, frames, output, options, listener)
     show(found, as_json)
+    if found.figure is not None:
+        tell(f"wrote {found.figure}")

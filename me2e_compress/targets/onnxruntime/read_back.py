@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import onnx_ir as ir
 
+from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
@@ -38,9 +39,17 @@ def read_back(model: ir.Model) -> Iterator[LintFinding]:
     meant = set() if plan is None else {each.output for each in plan.weight_only}
     known = origins(source, found)
     for node in int8_layers(found, _FLOAT_KERNELS):
-        layer = known.get(str(node.name), node)
+        layer = _layer_of(known.get(str(node.name), node))
         if layer.outputs[0].name not in meant:
             yield warning("float-kernel", layer, _what(layer, node.op_type))
+
+
+def _layer_of(node: ir.Node) -> ir.Node:
+    """Return the layer that a node ends: itself, or what its ReLU or bias reads."""
+    maker = graph.producer_of(node.inputs[0])
+    if node.op_type in _FLOAT_KERNELS or maker is None:
+        return node
+    return maker if maker.op_type in _FLOAT_KERNELS else node
 
 
 def _what(layer: ir.Node, kernel: str) -> str:

@@ -1,0 +1,114 @@
+"""Draw where the time goes: modules stacked over inferences, and the long tail."""
+
+import io
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.style import context
+from matplotlib.ticker import PercentFormatter
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.runtime.latency_trace import Microseconds, percentile
+
+Totals: TypeAlias = npt.NDArray[np.int64]
+"""Microseconds of whole inferences."""
+
+_MARKED = (50, 99)
+_STYLE = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#d9dde3",
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9.5,
+    "svg.hashsalt": "me2e-compress",
+}
+_INK, _MUTED = "#1d2127", "#6b7480"
+_MOST_COLOURS = 10
+"""Of the map ``tab10``: modules beyond these are drawn as one."""
+
+
+def draw_modules(parts: Microseconds, name: str, machine: str, path: Path) -> None:
+    """Draw what modules took: stacked inference by inference, and how they spread.
+
+    Left, a bar an inference, a colour a module, the largest at the bottom. Right, which
+    share of the inferences takes longer than so many milliseconds, on a logarithmic
+    axis: a long tail reaches far to the right.
+
+    Args:
+        parts: microseconds by module, one number an inference.
+        name: of the model.
+        machine: that ran it, in words.
+        path: PNG, SVG or PDF.
+
+    Raises:
+        EvaluationError: the file cannot be written.
+    """
+    with context(_STYLE, after_reset=True):
+        figure = Figure(figsize=(9.6, 3.6), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(2.3, 1))
+        figure.suptitle(f"{name}: {machine}", x=0.01, ha="left", fontsize=10)
+        shown = _gathered(parts)
+        total = np.sum([np.array(each) for each in shown.values()], axis=0)
+        _stack(left, shown, total)
+        _tail(right, total)
+        drawn = io.BytesIO()
+        kind = path.suffix.removeprefix(".")
+        undated = {"Date": None} if kind == "svg" else None
+        figure.savefig(drawn, format=kind, dpi=160, metadata=undated)
+    try:
+        write_bytes(path, drawn.getvalue())
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _gathered(parts: Microseconds) -> Microseconds:
+    """Return the largest parts, in their order, the others as one."""
+    if len(parts) <= _MOST_COLOURS:
+        return parts
+    names = list(parts)
+    small = names[_MOST_COLOURS - 1 :]
+    others = tuple(map(sum, zip(*(parts[name] for name in small), strict=True)))
+    kept = {name: parts[name] for name in names[: _MOST_COLOURS - 1]}
+    return {**kept, f"{len(small)} others": others}
+
+
+def _stack(axes: Axes, parts: Microseconds, total: Totals) -> None:
+    """Draw a bar an inference."""
+    colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
+    at = np.arange(1, len(total) + 1)
+    floor = np.zeros(len(total))
+    for (name, samples), colour in zip(parts.items(), colours, strict=False):
+        height = np.array(samples) / 1e3
+        share = sum(samples) / max(1, int(total.sum()))
+        label = f"{name}  {share:.0%}"
+        axes.bar(at, height, 1.0, floor, color=colour, label=label, linewidth=0)
+        floor += height
+    axes.set_xlim(0.5, len(total) + 0.5)
+    axes.set_xlabel("inference", color=_MUTED)
+    axes.set_title("milliseconds by module", color=_MUTED)
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, reverse=True
+    )
+
+
+def _tail(axes: Axes, total: Totals) -> None:
+    """Draw which share of the inferences takes longer."""
+    slower = 1 - np.arange(len(total)) / len(total)
+    axes.step(np.sort(total) / 1e3, slower, where="pre", color=_INK, linewidth=1.4)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    for percent in _MARKED:
+        place = percentile(total.tolist(), percent) / 1e3
+        axes.axvline(place, color=_MUTED, linewidth=0.8, linestyle=":")
+        above = axes.get_xaxis_transform()
+        words = f"p{percent} {place:.0f}"
+        axes.text(place, 1.01, words, transform=above, color=_MUTED, ha="center")
+    axes.set_xlabel("milliseconds", color=_MUTED)
+    axes.set_title("how many take longer", color=_MUTED, pad=16)
