@@ -152,7 +152,9 @@ class DeformableAggregation(Operator):
         """Compute it in numpy, [N, A, C] float64."""
         feature, sizes, starts, at, weights = (np.asarray(each) for each in inputs)
         batch, anchors, points, cameras, levels, groups = weights.shape
-        value = feature.astype(np.float64).reshape(batch, feature.shape[1], groups, -1)
+        rows, width = feature.shape[1:]
+        value = feature.astype(np.float64)
+        value = value.reshape(batch, rows, groups, width // groups)
         inside = np.expand_dims(((at > 0) & (at < 1)).all(axis=-1), (-2, -1))
         shares = np.where(inside, weights, 0).astype(np.float64)
         places = at.astype(np.float64).transpose(0, 1, 3, 2, 4)[:, :, None, :, None]

@@ -180,6 +180,11 @@ rows = st.sampled_from(ROWS)
 seeds = st.integers(0, 10_000)
 
 
+def test_maps_that_are_all_empty() -> None:
+    operator = next(each for each in operators() if each.name in DRAWS)
+    hold(operator, operator.own, seed=1301, opset=13, known=False)
+
+
 @settings(max_examples=40, deadline=None)
 @given(row=rows, seed=seeds, opset=st.sampled_from([13, 17, 20]), known=st.booleans())
 def test_the_body_is_the_reference(
