@@ -12,7 +12,10 @@ from me2e_compress.operators.lookup import (
     dialect_names,
     dialect_of,
     find,
+    op_types,
     operators,
+    position_inputs,
+    score_inputs,
 )
 from me2e_compress.operators.replace import (
     FusedNode,
@@ -39,7 +42,10 @@ __all__ = [
     "find",
     "fused_nodes",
     "import_domains",
+    "op_types",
     "operators",
+    "position_inputs",
+    "score_inputs",
     "set_output",
     "translate",
 ]

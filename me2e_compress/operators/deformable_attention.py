@@ -42,7 +42,7 @@ _RAW = (
     Operand("spatial_shapes", "L 2", INT32),
     Operand("reference_points", "N Q 1 *", INT8_TOO, positions=True),
     Operand("sampling_offsets", "N Q M *", INT8_TOO, positions=True),
-    Operand("attention_weights", "N Q M *", INT8_TOO),
+    Operand("attention_weights", "N Q M *", INT8_TOO, scores=True),
 )
 
 

@@ -41,6 +41,7 @@ class Operand:
         optional: whether it may be left out, it and all behind it.
         positions: whether it says where to look, or which matrix to invert: such
             numbers stay in float.
+        scores: whether it holds weights before their softmax.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Operand:
     types: tuple[ir.DataType, ...] = FLOATS
     optional: bool = False
     positions: bool = False
+    scores: bool = False
 
     @property
     def rank(self) -> int | None:

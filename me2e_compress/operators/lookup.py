@@ -1,6 +1,7 @@
 """Which fused operator a node is, and in whose spelling."""
 
 import functools
+from collections.abc import Mapping
 
 import onnx_ir as ir
 
@@ -86,6 +87,41 @@ def dialect_names() -> tuple[str, ...]:
 def operators() -> tuple[Operator, ...]:
     """Build every operator that can be imported, ours first."""
     return tuple(OPERATORS.build(name, {}) for name in OPERATORS.usable())
+
+
+@functools.cache
+def op_types(name: str) -> frozenset[str]:
+    """Return what the nodes of an operator are called, in every dialect."""
+    return frozenset(
+        dialect.op_type
+        for operator in operators()
+        for dialect in operator.all_dialects()
+        if operator.name == name
+    )
+
+
+@functools.cache
+def position_inputs() -> Mapping[str, tuple[int, ...]]:
+    """Return which inputs say where to look or which matrix to invert, by op_type."""
+    return {
+        op_type: tuple(
+            index
+            for index, operand in enumerate(rows[0][1].operands)
+            if operand.positions
+        )
+        for op_type, rows in _rows().items()
+    }
+
+
+@functools.cache
+def score_inputs() -> Mapping[str, int]:
+    """Return which input holds weights before their softmax, by op_type."""
+    return {
+        op_type: index
+        for op_type, rows in _rows().items()
+        for index, operand in enumerate(rows[0][1].operands)
+        if operand.scores
+    }
 
 
 @functools.cache

@@ -7,6 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import input_at
 from me2e_compress.graph.shapes import is_one_matrix
+from me2e_compress.operators import position_inputs, score_inputs
 from me2e_compress.quantization.find_attention import behind
 from me2e_compress.quantization.geometry import depth, is_few
 
@@ -16,40 +17,10 @@ _POSITIONS: dict[str, tuple[int, ...]] = {
     "GatherElements": (1,),
     "GatherND": (1,),
     "GridSample": (1,),
-    "GridSamplePlugin": (1,),
-    "GridSampler2DTRT": (1,),
-    "GridSampler2DTRT2": (1,),
-    "GridSampler3DTRT": (1,),
-    "GridSampler3DTRT2": (1,),
-    "Inverse": (0,),
-    "InversePlugin": (0,),
-    "InverseTRT": (0,),
-    "MMCVModulatedDeformConv2d": (1,),
-    "MMCVMultiScaleDeformableAttention": (3,),
-    "MSDAPlugin": (3,),
-    "ModulatedDeformConv2d": (1,),
-    "ModulatedDeformableConv2dTRT": (1,),
-    "ModulatedDeformableConv2dTRT2": (1,),
-    "MultiScaleDeformableAttention": (3,),
-    "MultiScaleDeformableAttentionPlugin": (3,),
-    "MultiScaleDeformableAttnTRT": (2, 3),
-    "MultiScaleDeformableAttnTRT2": (2, 3),
-    "MultiscaleDeformableAttnPlugin_TRT": (3,),
-    "RotatePlugin": (1, 2),
-    "RotateTRT": (1, 2),
-    "RotateTRT2": (1, 2),
     "ScatterElements": (1,),
     "ScatterND": (1,),
-    "grid_sampler": (1,),
 }
-"""Which inputs say where to look or which matrix to invert: standard operators, and the
-plugins of TensorRT OSS, DerryHub's BEVFormer_tensorrt, DL4AGX and mmdeploy."""
-
-_SAMPLING_WEIGHTS = {
-    "MultiScaleDeformableAttnTRT": 4,
-    "MultiScaleDeformableAttnTRT2": 4,
-}
-"""Plugins that take sampling weights before their softmax, and at which input."""
+"""Which inputs of standard operators say where to look."""
 
 _ARITHMETIC = frozenset(
     {
@@ -141,8 +112,9 @@ def _has_weight(layer: ir.Node, constants: Collection[ir.Value]) -> bool:
 
 
 def _positions(graph: ir.Graph) -> Iterator[tuple[ir.Value, str]]:
+    known = {**position_inputs(), **_POSITIONS}
     for node in graph:
-        for index in _POSITIONS.get(node.op_type, ()):
+        for index in known.get(node.op_type, ()):
             value = input_at(node, index)
             if value is not None:
                 yield value, node.op_type
@@ -172,8 +144,9 @@ def _companions(
 
 
 def _weights(graph: ir.Graph) -> Iterator[ir.Value]:
+    scores = {**score_inputs(), "Softmax": 0}
     for node in graph:
-        index = 0 if node.op_type == "Softmax" else _SAMPLING_WEIGHTS.get(node.op_type)
+        index = scores.get(node.op_type)
         value = None if index is None else node.inputs[index]
         if value is not None:
             yield value

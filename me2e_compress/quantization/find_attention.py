@@ -15,6 +15,7 @@ from me2e_compress.graph import (
     producer_of,
     static_shape,
 )
+from me2e_compress.operators import op_types
 
 KEEP = 16
 """How many products are remembered a value: more than the heads of an attention that
@@ -73,14 +74,13 @@ def _merged(sources: Iterable[Hits]) -> Hits:
     return tuple((step, node) for node, step in nearest[:KEEP])
 
 
-FUSED = frozenset(
+_FUSED = frozenset(
     {
         "Attention", "GroupQueryAttention", "MultiHeadAttention", "PackedAttention",
-        "PackedMultiHeadAttention", "QAttention", "QKVTRT", "QKVTRT2",
+        "PackedMultiHeadAttention", "QAttention",
     }
 )  # fmt: skip
-"""Operators that are attention as a whole (ONNX 23, com.microsoft, DerryHub's
-BEVFormer_tensorrt)."""
+"""Operators of ONNX and com.microsoft that are attention as a whole."""
 
 _PRODUCTS = ("Einsum", "Gemm", "MatMul")
 
@@ -132,7 +132,7 @@ def find_attention(
     the softmax may be decomposed into ``Div(Exp(x), ReduceSum(Exp(x)))``. What a mask
     is made of is told from the scores by its size. The search is linear in the graph.
 
-    Operators that are attention as a whole (:data:`FUSED`) are mapped too.
+    Operators that are attention as a whole (:func:`is_fused`) are mapped too.
 
     Sampling weights of deformable attention come from a linear layer, not from such a
     product, and are not attention here.
@@ -207,10 +207,15 @@ def _fits(product: ir.Value, scores: ir.Value) -> bool:
     return have == want or (left[-1] == right[-1] and have > 0 and want % have == 0)
 
 
+def is_fused(node: ir.Node) -> bool:
+    """Return whether a node is attention as a whole, a plugin of a library or not."""
+    return node.op_type in _FUSED or node.op_type in op_types("multi-head-attention")
+
+
 def _fused(nodes: Iterable[ir.Node]) -> dict[ir.Node, Attention]:
     found: dict[ir.Node, Attention] = {}
     for node in nodes:
-        if node.op_type in FUSED:
+        if is_fused(node):
             tokens = [_tokens(value) for value in node.inputs[:2]]
             found[node] = Attention(tokens[0], tokens[-1])
     return found

@@ -9,6 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import input_at, is_standard, open_shape
 from me2e_compress.graph.shapes import extent
+from me2e_compress.operators import op_types
 
 MATRICES = frozenset({(3, 3), (3, 4), (4, 4)})
 """Sizes of rotations, camera intrinsics, projections and rigid transforms."""
@@ -32,16 +33,17 @@ _ARITHMETIC = frozenset(
     {
         "Abs", "Add", "BatchNormalization", "Cast", "Ceil", "Clip", "Concat", "Div",
         "Dropout", "Exp", "Expand", "Flatten", "Floor", "Gather", "GatherElements",
-        "GatherND", "Identity", "InstanceNormalization", "Inverse", "InversePlugin",
-        "InverseTRT", "LayerNormalization", "Log", "Max", "Min", "Mod", "Mul", "Neg",
+        "GatherND", "Identity", "InstanceNormalization", "LayerNormalization", "Log",
+        "Max", "Min", "Mod", "Mul", "Neg",
         "Pad", "Pow", "Reciprocal", "ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin",
         "ReduceSum", "Relu", "Reshape", "Round", "ScatterElements", "ScatterND",
         "Sigmoid", "Slice", "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Tile",
         "Transpose", "Unsqueeze", "Where",
     }
 )  # fmt: skip
-"""What points stay points through: no product, no comparison, no sine or cosine (an
-embedding, as fine as its 8 bits), no softmax, no sampler."""
+"""What points stay points through, besides the inverse of a matrix: no product, no
+comparison, no sine or cosine (an embedding, as fine as its 8 bits), no softmax, no
+sampler."""
 
 _DATA: Mapping[str, tuple[int, ...]] = {
     "BatchNormalization": (0,), "Clip": (0,), "Expand": (0,), "Gather": (0,),
@@ -108,6 +110,7 @@ class _Flow:
         self.found: dict[ir.Node, str] = {}
         self._constants = constants
         self._learned: set[ir.Value] = set()
+        self._inverses = op_types("inverse")
 
     def enter(self, node: ir.Node) -> None:
         """Follow geometry, and what is learned, through one node."""
@@ -118,7 +121,7 @@ class _Flow:
         if met and product:
             self.found[node] = f"multiplies what comes from the input {met[0].name}"
             goes_on = self._passes(node)
-        elif met and node.op_type in _ARITHMETIC:
+        elif met and (node.op_type in _ARITHMETIC or node.op_type in self._inverses):
             goes_on = self._remains(node, reads)
         if goes_on:
             matrix = all(each.is_matrix for each in met) and self._alone(reads)

@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.operators import Dialect, dialect_of, expand, find, translate
+from me2e_compress.operators import (
+    Dialect,
+    dialect_of,
+    expand,
+    find,
+    position_inputs,
+    score_inputs,
+    translate,
+)
 from me2e_compress.operators.attention_layouts import RawAttention
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from tests.operators.running import body_and_reference, graph_of, run
@@ -224,3 +232,9 @@ def test_a_node_says_what_it_gives() -> None:
     assert OPERATOR.output_shape(shapes, {}) == (1, 100, 8, 32)
     assert OPERATOR.macs(shapes, {}) == 4 * 100 * 8 * 4 * 32
     assert own.domain == "me2e"
+
+
+def test_it_says_which_inputs_are_positions_and_which_scores() -> None:
+    raw, own = "MultiScaleDeformableAttnTRT", OPERATOR.own.op_type
+    assert (position_inputs()[raw], score_inputs()[raw]) == ((2, 3), 4)
+    assert (position_inputs()[own], score_inputs().get(own)) == ((3,), None)

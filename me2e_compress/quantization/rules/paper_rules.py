@@ -7,7 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, provenance
 from me2e_compress.graph.shapes import extent
-from me2e_compress.quantization.find_attention import FUSED
+from me2e_compress.quantization.find_attention import is_fused
 from me2e_compress.quantization.rules.base import Rule, RuleFacts, RuleSet
 
 
@@ -24,7 +24,7 @@ class WeightedOperator(Rule):
             return None
         if node not in facts.attention:
             return f"{node.op_type} is no weighted layer"
-        if node.op_type not in FUSED:
+        if not is_fused(node):
             return f"{node.op_type} in an attention has no int8 kernel"
         size = facts.attention[node]
         return (

@@ -12,10 +12,10 @@ from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.quantized import PAIR
 from me2e_compress.targets.tensorrt.lint.support_matrix import (
     LATER,
-    PLUGINS,
     SUPPORTED,
     UNSUPPORTED,
     Plugin,
+    known_plugins,
 )
 
 OPSETS = (9, 20, 24)
@@ -95,10 +95,11 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
 
     TensorRT looks at the name alone; exporters leave the domain out.
     """
+    known = known_plugins()
     for node in nodes_of(model):
         if not is_plugin(node):
             continue
-        plugin = PLUGINS.get(node.op_type)
+        plugin = known.get(node.op_type)
         if plugin is not None:
             yield from _call(node, plugin)
         elif node.op_identifier() not in model.functions:
@@ -112,8 +113,9 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
 
 def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
     """Find known plugins whose outputs have no shape: nor has what is behind them."""
+    known = known_plugins()
     for node in unshaped_plugins(model):
-        if node.op_type not in PLUGINS:
+        if node.op_type not in known:
             continue
         yield warning(
             "plugin-shape",

@@ -4,15 +4,19 @@ Operators are those of the support matrix of onnx-tensorrt, ``docs/operators.md`
 TensorRT 10.15; what it takes that 10.1 (opset 20) did not is listed apart. An operator
 that stands in neither list is unknown, and reported.
 
-Plugins have names, inputs and attributes as in the source of TensorRT OSS 10.7,
-DerryHub's BEVFormer_tensorrt, DL4AGX (``custom_op`` and exporter ops) and mmdeploy.
+Plugins have names, inputs and attributes as the dialects of the fused operators say.
 TensorRT finds a plugin by the node's operator name, ``plugin_version`` and
 ``plugin_namespace``.
 """
 
 import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
 
 import onnx_ir as ir
+
+from me2e_compress.operators import OWN_DOMAIN, Dialect, operators
+from me2e_compress.operators.dialect import INT32
 
 _FLOAT = frozenset({ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.BFLOAT16})
 _HALF = _FLOAT - {ir.DataType.BFLOAT16}
@@ -80,10 +84,6 @@ UNSUPPORTED = frozenset(
 )  # fmt: skip
 """Operators that the matrix lists as not supported."""
 
-_PLUGIN_FLOAT = frozenset({ir.DataType.FLOAT})
-_PLUGIN_HALF = _PLUGIN_FLOAT | {ir.DataType.FLOAT16}
-_PLUGIN_INT8 = _PLUGIN_HALF | {ir.DataType.INT8}
-
 
 @dataclasses.dataclass(frozen=True)
 class Plugin:
@@ -100,58 +100,44 @@ class Plugin:
 
     source: str
     inputs: tuple[int, int]
-    attributes: tuple[str, ...] = ()
-    types: frozenset[ir.DataType] = _PLUGIN_HALF
-    rank: int | None = None
-    integers: tuple[int, ...] = ()
+    attributes: tuple[str, ...]
+    types: frozenset[ir.DataType]
+    rank: int | None
+    integers: tuple[int, ...]
 
 
-_DERRYHUB, _OSS, _DL4AGX, _MMDEPLOY = (
-    "BEVFormer_tensorrt", "TensorRT OSS", "DL4AGX", "mmdeploy",
-)  # fmt: skip
-_SAMPLER = ("interpolation_mode", "padding_mode", "align_corners")
-_CONV = ("stride", "padding", "dilation")
-_DEFORM = (*_CONV, "groups", "deform_groups")
+_OTHER_DOMAINS = (OWN_DOMAIN, "com.microsoft")
+"""Domains whose operators are no plugins of TensorRT."""
 
-_msda = Plugin(_DERRYHUB, (5, 5), types=_PLUGIN_INT8, rank=4)
-_rotate = Plugin(_DERRYHUB, (3, 3), ("interpolation",), _PLUGIN_INT8, 3)
-_sampler_2d = Plugin(_DERRYHUB, (2, 2), _SAMPLER, _PLUGIN_INT8, 4)
-_sampler_3d = Plugin(_DERRYHUB, (2, 2), _SAMPLER, _PLUGIN_HALF, 5)
-_deform = Plugin(_DERRYHUB, (4, 5), _DEFORM, _PLUGIN_INT8, 4)
-_attention = Plugin(_DERRYHUB, (3, 3), types=_PLUGIN_INT8, rank=3)
-_pool = Plugin(_DERRYHUB, (7, 7), ("out_height", "out_width"), _PLUGIN_INT8)
 
-PLUGINS: dict[str, Plugin] = {
-    "BEVPoolV2TRT": _pool,
-    "BEVPoolV2TRT2": _pool,
-    "GridSampler2DTRT": _sampler_2d,
-    "GridSampler2DTRT2": _sampler_2d,
-    "GridSampler3DTRT": _sampler_3d,
-    "GridSampler3DTRT2": _sampler_3d,
-    "InverseTRT": Plugin(_DERRYHUB, (1, 1), types=_PLUGIN_FLOAT, rank=4),
-    "ModulatedDeformableConv2dTRT": _deform,
-    "ModulatedDeformableConv2dTRT2": _deform,
-    "MultiScaleDeformableAttnTRT": _msda,
-    "MultiScaleDeformableAttnTRT2": _msda,
-    "QKVTRT": _attention,
-    "QKVTRT2": _attention,
-    "RotateTRT": _rotate,
-    "RotateTRT2": _rotate,
-    "MultiscaleDeformableAttnPlugin_TRT": Plugin(_OSS, (5, 5), rank=4, integers=(1, 2)),
-    "ModulatedDeformConv2d": Plugin(
-        _OSS, (4, 5), (*_CONV, "group", "deformable_group"), rank=4
-    ),
-    "MultiScaleDeformableAttentionPlugin": Plugin(
-        _DL4AGX, (5, 5), rank=4, integers=(1, 2)
-    ),
-    "MSDAPlugin": Plugin(_DL4AGX, (5, 5), rank=4, integers=(1, 2)),
-    "GridSamplePlugin": Plugin(_DL4AGX, (2, 2)),
-    "InversePlugin": Plugin(_DL4AGX, (1, 1), types=_PLUGIN_FLOAT),
-    "SelectAndPadPlugin": Plugin(_DL4AGX, (3, 3), ("P",), integers=(1,)),
-    "RotatePlugin": Plugin(_DL4AGX, (3, 3), ("interpolation",), rank=3),
-    "MMCVMultiScaleDeformableAttention": Plugin(
-        _MMDEPLOY, (5, 5), rank=4, integers=(1, 2)
-    ),
-    "MMCVModulatedDeformConv2d": Plugin(_MMDEPLOY, (4, 5), _DEFORM, _PLUGIN_FLOAT, 4),
-    "grid_sampler": Plugin(_MMDEPLOY, (2, 2), _SAMPLER, _PLUGIN_FLOAT, 4),
-}
+@functools.cache
+def known_plugins() -> Mapping[str, Plugin]:
+    """Return the plugins of every dialect that is known, by the operator's name.
+
+    Where libraries share a name, what one of them takes is let pass.
+    """
+    rows: dict[str, list[Dialect]] = {}
+    for operator in operators():
+        for dialect in operator.dialects:
+            if dialect.domain not in _OTHER_DOMAINS:
+                rows.setdefault(dialect.op_type, []).append(dialect)
+    return {op_type: _plugin(dialects) for op_type, dialects in rows.items()}
+
+
+def _plugin(dialects: Sequence[Dialect]) -> Plugin:
+    first = dialects[0]
+    least = min(sum(not each.optional for each in row.operands) for row in dialects)
+    ranks = {row.operands[0].rank for row in dialects}
+    return Plugin(
+        first.source,
+        (least, max(len(row.operands) for row in dialects)),
+        tuple(each.name for each in first.attributes if each.required),
+        frozenset(kind for row in dialects for kind in row.operands[0].types),
+        ranks.pop() if len(ranks) == 1 else None,
+        tuple(
+            index
+            for index, operand in enumerate(first.operands)
+            if all(row.operands[index].types == INT32 for row in dialects)
+            and not operand.optional
+        ),
+    )

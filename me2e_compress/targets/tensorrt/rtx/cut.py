@@ -4,7 +4,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import is_standard
+from me2e_compress.graph.nodes import is_plugin
 
 LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
 """Operators that TensorRT takes, by its own plugins, and TensorRT-RTX does not."""
@@ -35,9 +35,9 @@ def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
 
 
 def _is_missing(node: ir.Node, model: ir.Model) -> bool:
-    if is_standard(node):
-        return node.op_type in LACKING
-    return node.op_identifier() not in model.functions
+    if is_plugin(node):
+        return node.op_identifier() not in model.functions
+    return node.op_type in LACKING
 
 
 def _detach(where: ir.Graph, node: ir.Node) -> None:

@@ -79,3 +79,8 @@ def test_a_local_function_is_no_plugin() -> None:
 def test_a_plugin_of_unknown_result_cannot_be_cut_at() -> None:
     with pytest.raises(PreconditionError, match="output r is not known"):
         cut(ir.from_onnx_text(ROTATED))
+
+
+def test_a_plugin_without_a_domain_is_cut_out_too() -> None:
+    _, gone = cut(typed(ROTATED.replace("trt.Rotate", "Rotate")))
+    assert gone == ("/Rotate",)
