@@ -1,66 +1,20 @@
 """Products in front of what repeats their rows; the algebra says how many are left."""
 
-import math
-from typing import Any
-
-import hypothesis
 import numpy as np
-import onnx_ir as ir
 import pytest
-from hypothesis import strategies as st
 
-from me2e_compress.graph import infer_shapes, macs, provenance, static_shape
+from me2e_compress.graph import provenance
 from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.hoist_linear import HoistLinear, least_work
-from tests.passes.small import NO_MODULES, apply, compute, ops, read
-
-RANDOM = np.random.default_rng(3)
-
-
-def normal(*shape: int) -> Any:
-    return RANDOM.normal(size=shape).astype(np.float32)
-
-
-def integers(*values: int) -> Any:
-    return np.array(values, np.int64)
-
-
-def graph_of(signature: str, body: str, version: int = 17) -> str:
-    return (
-        f'<ir_version: 8, opset_import: ["" : {version}]>\ng {signature} {{ {body} }}'
-    )
-
-
-def products(model: ir.Model) -> int:
-    return sum(macs(node) or 0 for node in model.graph)
-
-
-def difference(model: ir.Model, text: str, weights: dict[str, Any]) -> float:
-    """Return the largest gap to the text in float64, relative to the largest value."""
-    double = {
-        name: array.astype(np.float64) if array.dtype == np.float32 else array
-        for name, array in weights.items()
-    }
-    feeds = {
-        port.name or "": normal(*(static_shape(port) or ()))
-        for port in model.graph.inputs
-    }
-    wide = {name: array.astype(np.float64) for name, array in feeds.items()}
-    wanted = compute(read(text.replace("float[", "double["), **double), wide)
-    worst = 0.0
-    for want, got in zip(wanted, compute(model, feeds), strict=True):
-        assert want.shape == got.shape
-        worst = max(worst, float(np.abs(want - got).max() / np.abs(want).max()))
-    return worst
-
-
-def hoist(text: str, **weights: Any) -> ir.Model:
-    """Apply the pass under its contract; outputs are those of float64 within 1e-5."""
-    model = read(text, **weights)
-    apply(HoistLinear(), model)
-    assert difference(model, text, weights) < 1e-5
-    return model
-
+from me2e_compress.passes.hoist_linear import HoistLinear
+from tests.passes.hoisted import (
+    difference,
+    graph_of,
+    hoist,
+    integers,
+    normal,
+    products,
+)
+from tests.passes.small import apply, ops, read
 
 ROWS, TIMES, WIDE = 101, 60, 32
 
@@ -269,81 +223,3 @@ def test_new_nodes_know_their_module_and_every_origin() -> None:
         assert past.passes == ("hoist-linear",)
         assert {"product", "bias"} <= set(past.origins)
         assert (node.op_type == "Tile") == ("many" in past.origins)
-
-
-MOVES = (
-    "expand",
-    "tile",
-    "gather",
-    "reshape",
-    "transpose",
-    "unsqueeze",
-    "slice",
-    "add",
-)
-
-
-@st.composite
-def chains(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
-    """A value that is rearranged, repeated and added to, and then multiplied."""
-    width = draw(st.integers(1, 6))
-    shape = [draw(st.integers(1, 3)), draw(st.integers(1, 4)), width]
-    start = list(shape)
-    weights: dict[str, Any] = {"w": normal(width, draw(st.integers(1, 5)))}
-    steps: list[str] = []
-    for index, move in enumerate(draw(st.lists(st.sampled_from(MOVES), max_size=6))):
-        name = f"c{index}"
-        repeats = draw(st.integers(1, 9))
-        if move == "expand":
-            shape = [repeats, *shape]
-            weights[name] = integers(*shape)
-            call = f"Expand(v{index}, {name})"
-        elif move == "tile":
-            weights[name] = integers(repeats, *[1] * (len(shape) - 1))
-            shape = [shape[0] * repeats, *shape[1:]]
-            call = f"Tile(v{index}, {name})"
-        elif move == "gather":
-            weights[name] = RANDOM.integers(0, shape[0], repeats)
-            shape = [repeats, *shape[1:]]
-            call = f"Gather(v{index}, {name})"
-        elif move == "reshape":
-            shape = [math.prod(shape[:-1]), width]
-            weights[name] = integers(*shape)
-            call = f"Reshape(v{index}, {name})"
-        elif move == "transpose":
-            order = [*range(len(shape) - 2, -1, -1), len(shape) - 1]
-            shape = [shape[axis] for axis in order]
-            call = f"Transpose<perm = {order}>(v{index})"
-        elif move == "unsqueeze":
-            shape = [1, *shape]
-            weights[name] = integers(0)
-            call = f"Unsqueeze(v{index}, {name})"
-        elif move == "slice":
-            shape = [max(1, shape[0] - 1), *shape[1:]]
-            weights |= {name: integers(shape[0]), "zero": integers(0)}
-            call = f"Slice(v{index}, zero, {name}, zero)"
-        else:
-            weights[name] = normal(*draw(st.sampled_from([[width], [1, width], shape])))
-            call = f"{draw(st.sampled_from(['Add', 'Sub']))}(v{index}, {name})"
-        steps.append(f"v{index + 1} = {call}")
-    body = f"v0 = Neg(x) {' '.join(steps)} y = MatMul(v{len(steps)}, w)"
-    result = ",".join("ABCDEFGHIJK"[: len(shape)])
-    text = graph_of(f"(float{start} x) => (float[{result}] y)", body)
-    return text.replace("float[1 ", "float[1"), weights
-
-
-@hypothesis.given(chains())
-@hypothesis.settings(max_examples=60, deadline=None)
-def test_any_chain_in_front_of_a_product(drawn: tuple[str, dict[str, Any]]) -> None:
-    """Products this small never pay: here one costs what starting a node does."""
-    text, weights = drawn
-    model = read(text, **weights)
-    infer_shapes(model)
-    before = products(model)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(least_work, "MACS_PER_NODE", 1)
-        changes = HoistLinear(bytes_per_node=10**9).run(model, NO_MODULES).changes
-    hypothesis.event(f"changes: {min(changes, 1)}")
-    infer_shapes(model, strict=True)
-    assert products(model) < before if changes else products(model) == before
-    assert difference(model, text, weights) < 1e-5

@@ -7,6 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import opset_of
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.hoist_linear.batch_operands import split_operand
 from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
@@ -27,17 +28,18 @@ ROUNDS = 8
 class _Tally:
     products: int = 0
     others: int = 0
+    operands: int = 0
     macs: int = 0
 
     @property
     def changes(self) -> int:
-        return self.products + self.others
+        return self.products + self.others + self.operands
 
     def notes(self) -> tuple[str, ...]:
         found = []
-        if self.products:
+        if products := self.products + self.operands:
             less = f"{self.macs / 1e6:,.1f} MMACs fewer"
-            found.append(f"moved {self.products} products: {less}")
+            found.append(f"moved {products} products: {less}")
         if self.others:
             found.append(f"moved {self.others} other nodes in front of repeated rows")
         return tuple(found)
@@ -102,5 +104,8 @@ class HoistLinear(Pass):
                     tally.macs += found.macs
             elif do_before_repeats(node, rewriter, opset):
                 tally.others += 1
+            elif (fewer := split_operand(node, rewriter)) is not None:
+                tally.operands += 1
+                tally.macs += fewer
             if tally.changes > before:
                 prices.forget()

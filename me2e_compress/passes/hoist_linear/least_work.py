@@ -184,7 +184,7 @@ class Prices:
         return Price(Composed(layer, inner.way), inner.work, inner.macs)
 
     def _distributed(self, asked: Question, node: ir.Node) -> Price | None:
-        found = list(_terms(node, asked.shape))
+        found = list(terms_of(node, asked.shape))
         if not found:
             return None
         terms, cost, macs = [], 0.0, 0
@@ -249,7 +249,7 @@ class Prices:
         return _size(static_shape(weight) or ()) * _item(weight) / self.rate
 
 
-def _terms(
+def terms_of(
     node: ir.Node, shape: tuple[int, ...]
 ) -> Iterator[tuple[ir.Value, bool, tuple[int, int] | None]]:
     """Take a sum apart: its values, whether only it reads them, their matrix rows.

@@ -19,6 +19,7 @@ from me2e_compress.passes.hoist_linear.ways import (
     Way,
 )
 from me2e_compress.rewrite import (
+    Array,
     Numbers,
     add_constant,
     fresh_name,
@@ -41,6 +42,7 @@ class Rewriter:
     def __init__(self, graph: ir.Graph, names: set[str], by: str) -> None:
         self.graph, self.names, self.by = graph, names, by
         self.shapes: dict[tuple[int, ...], ir.Value] = {}
+        self.stored: list[ir.Value] = []
 
     def replace(self, layer: LinearLayer, way: Way) -> bool:
         """Compute a layer another way; False if a weight would overflow."""
@@ -50,7 +52,7 @@ class Rewriter:
         try:
             new = writer.build(way, Matrix(layer.matrix(), stored, name), layer.bias())
         except OverflowError:
-            writer.undo()
+            self.undo(writer.made)
             return False
         self.swap(layer.result, new)
         return True
@@ -78,9 +80,22 @@ class Rewriter:
         known = self.shapes.get(shape)
         if known is None or not known.is_initializer():
             array = np.array(shape, np.int64)
-            known = add_constant(self.graph, array, name, self.names)
-            self.shapes[shape] = known
+            known = self.shapes[shape] = self.store(array, name)
         return known
+
+    def store(self, array: Array, name: str) -> ir.Value:
+        """Register an initializer."""
+        value = add_constant(self.graph, array, name, self.names)
+        self.stored.append(value)
+        return value
+
+    def undo(self, values: Sequence[ir.Value]) -> None:
+        """Take back what was written last, in order, and what is stored for it."""
+        for value in reversed(values):
+            self.drop(value)
+        for value in self.stored:
+            if not is_read(value) and value.is_initializer():
+                del self.graph.initializers[value.name or ""]
 
     def move(
         self, node: ir.Node, inputs: list[ir.Value]
@@ -135,16 +150,7 @@ class _Writer:
 
     def __init__(self, rewriter: Rewriter, layer: LinearLayer) -> None:
         self.rewriter, self.layer = rewriter, layer
-        self.graph, self.names = rewriter.graph, rewriter.names
         self.made: list[ir.Value] = []
-        self.stored: list[ir.Value] = []
-
-    def undo(self) -> None:
-        """Take back what was written."""
-        for made in reversed(self.made):
-            self.rewriter.drop(made)
-        for value in self.stored:
-            del self.graph.initializers[value.name or ""]
 
     def build(self, way: Way, matrix: Matrix, bias: Numbers | None) -> ir.Value:
         """Write the nodes that multiply by a matrix and add a vector."""
@@ -206,9 +212,7 @@ class _Writer:
             array = numbers.astype(dtype.numpy())
         if overflow(numbers, array):
             raise OverflowError(name)
-        value = add_constant(self.graph, array, name, self.names)
-        self.stored.append(value)
-        return value
+        return self.rewriter.store(array, name)
 
     def _write(
         self,

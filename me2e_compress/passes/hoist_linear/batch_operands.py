@@ -1,0 +1,222 @@
+"""Attention over keys, or values, that are partly the same for every batch.
+
+Given:   keys = A + p P, A the same for every batch;  MatMul(q, heads of keys)
+Result:  MatMul(q, heads of A) + MatMul(MatMul(q, heads of P), p)
+
+What is repeated for the batch need not be written out then, and what has few columns
+(positions: two) is multiplied by the queries before it is made wide.
+"""
+
+import dataclasses
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import macs, static_shape
+from me2e_compress.passes.hoist_linear.head_layout import HeadLayout, layout_of
+from me2e_compress.passes.hoist_linear.least_work import terms_of
+from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
+from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
+from me2e_compress.passes.hoist_linear.row_moves import broadcasts
+from me2e_compress.passes.work import work
+from me2e_compress.rewrite import Array, maker, sole_reader
+
+
+@dataclasses.dataclass(frozen=True)
+class Operand:
+    """The right operand of a batched product, taken apart.
+
+    Attributes:
+        layout: which of its axes are batch, heads, tokens and channels.
+        shared: the terms that are the same for every batch.
+        narrow: the terms that are linear layers of few columns.
+        nodes: what made it, and nothing else reads.
+    """
+
+    layout: HeadLayout
+    shared: tuple[ir.Value, ...]
+    narrow: tuple[LinearLayer, ...]
+    nodes: tuple[ir.Node, ...]
+
+
+def split_operand(product: ir.Node, rewriter: Rewriter) -> int | None:
+    """Multiply by the terms of a batched product's operand apart.
+
+    Returns:
+        How many MACs that saves; None if it does not pay, or is no such product.
+    """
+    found = _operand(product)
+    if found is None or product.inputs[0] is None:
+        return None
+    writer = _Writer(product, found, rewriter)
+    new = writer.result()
+    before = sum(map(work, (product, *found.nodes)))
+    saved = sum(macs(node) or 0 for node in (product, *found.nodes))
+    made = [node for value in writer.values if (node := value.producer()) is not None]
+    saved -= sum(macs(node) or 0 for node in made)
+    if saved < 0 or before - sum(map(work, made)) < 1.0:
+        rewriter.undo(writer.values)
+        return None
+    rewriter.swap(product.outputs[0], new)
+    return saved
+
+
+def _operand(product: ir.Node) -> Operand | None:
+    if product.op_type != "MatMul" or product.domain not in ("", "ai.onnx"):
+        return None
+    right = product.inputs[1]
+    layout = None if right is None else layout_of(right)
+    left = static_shape(product.inputs[0])
+    if right is None or layout is None or left is None:
+        return None
+    if left[:-2] != (static_shape(right) or ())[:-2]:
+        return None
+    terms = _terms(layout.value)
+    if terms is None:
+        return None
+    shared, narrow = [], []
+    nodes = [*layout.nodes, *terms[1]]
+    for value in terms[0]:
+        layer = layer_behind(value)
+        if layout.is_shared(static_shape(value)):
+            shared.append(value)
+        elif layer is not None and layout.is_whole(static_shape(layer.source)):
+            if any(sole_reader(node.outputs[0]) is None for node in layer.nodes):
+                return None
+            narrow.append(layer)
+            nodes.extend(layer.nodes)
+        else:
+            return None
+    if not shared and any(layer.bias() is not None for layer in narrow):
+        return None
+    return Operand(layout, tuple(shared), tuple(narrow), tuple(nodes))
+
+
+def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
+    """List the terms of a sum, or what is repeated, and the nodes in between."""
+    if sole_reader(value) is None:
+        return None
+    repeated = maker(value, "Expand", "Tile")
+    if repeated is not None and repeated.inputs[0] is not None:
+        return ([repeated.inputs[0]], [repeated]) if broadcasts(repeated) else None
+    total = maker(value, "Add")
+    if total is None:
+        return None
+    found = [term for term, _, _ in terms_of(total, static_shape(value) or ())]
+    between = [
+        node
+        for operand in total.inputs
+        if operand not in found
+        and (node := maker(operand, "Expand", "Tile")) is not None
+        and sole_reader(node.outputs[0]) is not None
+    ]
+    return (found, [total, *between]) if found else None
+
+
+class _Writer:
+    """Writes the products of the terms before the product of their sum."""
+
+    def __init__(self, product: ir.Node, found: Operand, rewriter: Rewriter) -> None:
+        self.product, self.found, self.rewriter = product, found, rewriter
+        self.values: list[ir.Value] = []
+
+    def result(self) -> ir.Value:
+        """Write the sum of the products; return what takes the product's place."""
+        layout, out = self.found.layout, self.product.outputs[0]
+        left = self.product.inputs[0]
+        assert left is not None
+        matrix = (static_shape(left) or ())[-2:]
+        left = self._shape(left, (layout.batch, layout.heads, *matrix))
+        if layout.scale != 1.0:
+            factor = self._constant(np.array(layout.scale), "scale")
+            left = self._write("Mul", [left, factor], static_shape(left) or ())
+        total: ir.Value | None = None
+        biases = [layer.bias() for layer in self.found.narrow]
+        for value in self.found.shared:
+            for bias in biases:
+                if bias is not None:
+                    added = self._constant(bias, "bias")
+                    shape = static_shape(value) or ()
+                    value = self._write("Add", [value, added], shape)
+            biases = []
+            total = self._plus(total, self._multiply(left, self._heads(value)))
+        for layer in self.found.narrow:
+            total = self._plus(total, self._narrow(left, layer))
+        assert total is not None
+        return self._shape(total, static_shape(out) or ())
+
+    def _narrow(self, left: ir.Value, layer: LinearLayer) -> ir.Value:
+        """Multiply by a layer: by its matrix and its source, the smaller first."""
+        layout = self.found.layout
+        matrix = layer.matrix().reshape(-1, layout.heads, layout.channels)
+        source = self._tokens(layer.source)
+        if layout.turned:
+            turned = self._constant(matrix.transpose(1, 2, 0)[None], "heads")
+            return self._multiply(self._multiply(left, turned), source)
+        heads = self._constant(matrix.transpose(1, 0, 2)[None], "heads")
+        return self._multiply(self._multiply(left, source), heads)
+
+    def _heads(self, value: ir.Value) -> ir.Value:
+        """Take a value apart into heads: [1, H, J, D], or [1, H, D, J] if turned."""
+        layout = self.found.layout
+        ends = (layout.heads, layout.channels)
+        tokens = (layout.tokens, 1) if layout.batch_axis else (1, layout.tokens)
+        split = self._shape(value, (*tokens, *ends))
+        first, second = (1, 0) if layout.batch_axis else (0, 1)
+        order = [first, 2, 3, second] if layout.turned else [first, 2, second, 3]
+        return self._transpose(split, order)
+
+    def _tokens(self, value: ir.Value) -> ir.Value:
+        """Give rows an axis of heads: [B, 1, J, C], or [B, 1, C, J] if turned."""
+        layout = self.found.layout
+        first, second = (1, 0) if layout.batch_axis else (0, 1)
+        order = [first, 2, second] if layout.turned else [first, second, 2]
+        moved = self._transpose(value, order) if order != [0, 1, 2] else value
+        return self._shape(moved, (layout.batch, 1, *(static_shape(moved) or ())[1:]))
+
+    def _transpose(self, value: ir.Value, order: list[int]) -> ir.Value:
+        old = static_shape(value) or ()
+        shape = tuple(old[axis] for axis in order)
+        return self._write("Transpose", [value], shape, [ir.AttrInt64s("perm", order)])
+
+    def _shape(self, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
+        if static_shape(value) == shape:
+            return value
+        target = self.rewriter.target(shape, f"{self.product.name}_shape")
+        return self._write("Reshape", [value, target], shape)
+
+    def _multiply(self, left: ir.Value, right: ir.Value) -> ir.Value:
+        rows, columns = (
+            (static_shape(left) or ())[:-1],
+            (static_shape(right) or ())[-1:],
+        )
+        return self._write("MatMul", [left, right], (*rows, *columns))
+
+    def _plus(self, one: ir.Value | None, two: ir.Value) -> ir.Value:
+        if one is None:
+            return two
+        return self._write("Add", [one, two], static_shape(one) or ())
+
+    def _constant(self, numbers: Array, name: str) -> ir.Value:
+        dtype = self.product.outputs[0].dtype
+        assert dtype is not None
+        array = numbers.astype(dtype.numpy())
+        return self.rewriter.store(array, f"{self.product.name}_{name}")
+
+    def _write(
+        self,
+        op_type: str,
+        inputs: list[ir.Value],
+        shape: tuple[int, ...],
+        attributes: list[ir.Attr] | None = None,
+    ) -> ir.Value:
+        value = self.rewriter.write(
+            op_type,
+            inputs,
+            attributes or [],
+            shape,
+            sources=(self.product, *self.found.nodes),
+            like=self.product.outputs[0],
+        )
+        self.values.append(value)
+        return value

@@ -1,0 +1,97 @@
+"""Any chain of moves and sums in front of a product: fewer MACs, the same numbers."""
+
+import math
+from typing import Any
+
+import hypothesis
+import pytest
+from hypothesis import strategies as st
+
+from me2e_compress.graph import infer_shapes
+from me2e_compress.passes.hoist_linear import HoistLinear, least_work
+from tests.passes.hoisted import (
+    RANDOM,
+    difference,
+    graph_of,
+    integers,
+    normal,
+    products,
+)
+from tests.passes.small import NO_MODULES, read
+
+MOVES = (
+    "expand",
+    "tile",
+    "gather",
+    "reshape",
+    "transpose",
+    "unsqueeze",
+    "slice",
+    "add",
+)
+
+
+@st.composite
+def chains(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
+    """A value that is rearranged, repeated and added to, and then multiplied."""
+    width = draw(st.integers(1, 6))
+    shape = [draw(st.integers(1, 3)), draw(st.integers(1, 4)), width]
+    start = list(shape)
+    weights: dict[str, Any] = {"w": normal(width, draw(st.integers(1, 5)))}
+    steps: list[str] = []
+    for index, move in enumerate(draw(st.lists(st.sampled_from(MOVES), max_size=6))):
+        name = f"c{index}"
+        repeats = draw(st.integers(1, 9))
+        if move == "expand":
+            shape = [repeats, *shape]
+            weights[name] = integers(*shape)
+            call = f"Expand(v{index}, {name})"
+        elif move == "tile":
+            weights[name] = integers(repeats, *[1] * (len(shape) - 1))
+            shape = [shape[0] * repeats, *shape[1:]]
+            call = f"Tile(v{index}, {name})"
+        elif move == "gather":
+            weights[name] = RANDOM.integers(0, shape[0], repeats)
+            shape = [repeats, *shape[1:]]
+            call = f"Gather(v{index}, {name})"
+        elif move == "reshape":
+            shape = [math.prod(shape[:-1]), width]
+            weights[name] = integers(*shape)
+            call = f"Reshape(v{index}, {name})"
+        elif move == "transpose":
+            order = [*range(len(shape) - 2, -1, -1), len(shape) - 1]
+            shape = [shape[axis] for axis in order]
+            call = f"Transpose<perm = {order}>(v{index})"
+        elif move == "unsqueeze":
+            shape = [1, *shape]
+            weights[name] = integers(0)
+            call = f"Unsqueeze(v{index}, {name})"
+        elif move == "slice":
+            shape = [max(1, shape[0] - 1), *shape[1:]]
+            weights |= {name: integers(shape[0]), "zero": integers(0)}
+            call = f"Slice(v{index}, zero, {name}, zero)"
+        else:
+            weights[name] = normal(*draw(st.sampled_from([[width], [1, width], shape])))
+            call = f"{draw(st.sampled_from(['Add', 'Sub']))}(v{index}, {name})"
+        steps.append(f"v{index + 1} = {call}")
+    body = f"v0 = Neg(x) {' '.join(steps)} y = MatMul(v{len(steps)}, w)"
+    result = ",".join("ABCDEFGHIJK"[: len(shape)])
+    text = graph_of(f"(float{start} x) => (float[{result}] y)", body)
+    return text.replace("float[1 ", "float[1"), weights
+
+
+@hypothesis.given(chains())
+@hypothesis.settings(max_examples=60, deadline=None)
+def test_any_chain_in_front_of_a_product(drawn: tuple[str, dict[str, Any]]) -> None:
+    """Products this small never pay: here one costs what starting a node does."""
+    text, weights = drawn
+    model = read(text, **weights)
+    infer_shapes(model)
+    before = products(model)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(least_work, "MACS_PER_NODE", 1)
+        changes = HoistLinear(bytes_per_node=10**9).run(model, NO_MODULES).changes
+    hypothesis.event(f"changes: {min(changes, 1)}")
+    infer_shapes(model, strict=True)
+    assert products(model) < before if changes else products(model) == before
+    assert difference(model, text, weights) < 1e-5
