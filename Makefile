@@ -33,15 +33,15 @@ fix: $(VENV)/.test
 	$(BIN)/ruff format .
 
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[highway]'
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[highway,fast]'
 	touch $@
 
 $(VENV)/.test: pyproject.toml constraints.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,bench,ray,trt-check,test]'
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,fast,bench,ray,trt-check,test]'
 	touch $@ $(VENV)/.demo
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,ray,docs]'
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[zoo,highway,fast,ray,docs]'
 	touch $@
 
 $(VENV):

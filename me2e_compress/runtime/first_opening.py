@@ -10,7 +10,7 @@ import hashlib
 import json
 import signal
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter
 
@@ -21,9 +21,11 @@ import platformdirs
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
+from me2e_compress.operators.kernels import why_not
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.fused_nodes import compiled_or_expanded
 from me2e_compress.runtime.opening import unsupported
 from me2e_compress.runtime.providers import CPU
 
@@ -63,20 +65,27 @@ def try_apart(
             signal.
     """
     begun = perf_counter()
+    if unsupported(model):
+        return 0.0
+    try:
+        ready, needed = compiled_or_expanded(model, compiled=why_not() is None)
+    except GraphError:
+        return 0.0
+    kernels = [each.op_type for each in needed]
     folder = memory or platformdirs.user_cache_path("me2e-compress") / "opened"
-    opened, ran = (folder / f"{each}.json" for each in _fingerprints(model))
+    opened, ran = (folder / f"{each}.json" for each in _fingerprints(model, kernels))
     verdict = opened if feeds is None else ran
-    if unsupported(model) or _is_known(verdict) or _is_known(ran):
+    if _is_known(verdict) or _is_known(ran):
         return 0.0
     on_begin()
     with tempfile.TemporaryDirectory(prefix="me2e-opening-") as scratch:
         inputs = Path(scratch) / "inputs.npz"
         _save(feeds or {}, inputs)
-        if file is None:
+        if file is None or ready is not model:
             file = Path(scratch) / "model.onnx"
-            graph.save(model, file)
+            graph.save(ready, file)
         steps = "open" if feeds is None else "run"
-        words = [str(file), str(inputs), steps, *CPU.left_out]
+        words = [str(file), str(inputs), steps, ",".join(kernels), *CPU.left_out]
         done = run_script(_SCRIPT, words)
     if done.returncode not in _REFUSED:
         step = (done.stdout.split() or ["start"])[-1]
@@ -88,9 +97,10 @@ def try_apart(
     return perf_counter() - begun
 
 
-def _fingerprints(model: ir.Model) -> Iterator[str]:
+def _fingerprints(model: ir.Model, kernels: Sequence[str]) -> Iterator[str]:
     """Name a graph that was opened, and one that was run, by this onnxruntime."""
-    known = (graph.digest(model), ort.__version__, CPU.native, *CPU.left_out)
+    how = (CPU.native, *CPU.left_out, *kernels)
+    known = (graph.digest(model), ort.__version__, *how)
     for step in ("opened", "ran"):
         yield hashlib.sha256("\n".join((*known, step)).encode()).hexdigest()
 

@@ -5,7 +5,7 @@ file, and the arrays themselves in the place of that file. So no weight is seria
 however large they are together (a protobuf message ends at 2 GiB).
 """
 
-import functools
+import mmap
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,9 +21,9 @@ from onnxruntime.capi import (
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph import is_standard
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import is_read
+from me2e_compress.runtime.fused_nodes import is_fused, runnable, unknown_nodes
 from me2e_compress.runtime.providers import CPU, Provider
 
 # The compiled module has no stubs.
@@ -47,29 +47,18 @@ REFUSALS: tuple[type[Exception], ...] = (
 """Everything raised where a graph cannot be read, built or run."""
 
 
-@functools.cache
-def operators() -> frozenset[tuple[str, str]]:
-    """List the (domain, operator) pairs that are known; ai.onnx is written ``""``."""
-    return frozenset(
-        ("" if schema.domain == "ai.onnx" else schema.domain, schema.name)
-        for schema in _native.get_all_operator_schema()
-    )
-
-
 def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
     """Return why a graph cannot be run; None if every operator is known.
 
-    What the libraries of a provider bring is not known before a session is built. A
-    known operator may still lack a kernel for its element type; only building a
+    Fused operators are: a kernel or a body runs them. What the libraries of a provider
+    bring is not known before a session is built. A known operator may still lack a
+    kernel for its element type; only building a
     :class:`~me2e_compress.runtime.session.Session` finds that.
     """
-    known = operators()
     unknown = {
         f"{node.domain or 'ai.onnx'}::{node.op_type}": node
-        for graph in (*model.graphs(), *model.functions.values())
-        for node in graph
-        if node.op_identifier() not in model.functions
-        and ("" if is_standard(node) else node.domain, node.op_type) not in known
+        for node in unknown_nodes(model)
+        if not is_fused(node)
     }
     if not unknown or provider.plugins:
         return None
@@ -100,8 +89,9 @@ def open_file(
 ) -> tuple[ort.InferenceSession, Weights]:
     """Open an ONNX file: as it stands or, where onnxruntime refuses that, as read here.
 
-    So a graph opens that is newer than onnxruntime, or whose shapes lie in a file of
-    weights. The arguments are those of :func:`open_graph`.
+    So a graph opens that is newer than onnxruntime, whose shapes lie in a file of
+    weights, or that holds fused operators. The arguments are those of
+    :func:`open_graph`.
 
     Returns:
         The session, and what must live as long.
@@ -111,11 +101,28 @@ def open_file(
     """
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
-    try:
-        return _build(str(path), options, provider, without), {}
-    except GraphError:
-        model = graph.load(path)
-    return open_graph(model, options, provider, without)
+    if not _has_own_nodes(path):
+        try:
+            return _build(str(path), options, provider, without), {}
+        except GraphError:
+            pass
+    return open_graph(graph.load(path), options, provider, without)
+
+
+_OWN_NODE = b":\x04me2e"
+"""A node in the toolkit's own domain, as it stands in a file."""
+
+
+def _has_own_nodes(path: Path) -> bool:
+    """Return whether a file may hold nodes that onnxruntime would run as their bodies.
+
+    Reading the graph takes ten times as long as looking through the bytes.
+    """
+    with path.open("rb") as file:
+        if not path.stat().st_size:
+            return False
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            return content.find(_OWN_NODE) >= 0
 
 
 def open_graph(
@@ -142,6 +149,7 @@ def open_graph(
     """
     if reason := unsupported(model, provider):
         raise GraphError(reason)
+    model = runnable(model, options, provider)
     lent = {
         name: tensor
         for name, value in model.graph.initializers.items()

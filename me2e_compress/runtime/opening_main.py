@@ -1,6 +1,7 @@
-"""Opens and runs a graph: ``python opening_main.py MODEL INPUTS.npz STEPS FUSION...``.
+"""Opens and runs a graph: ``opening_main.py MODEL INPUTS.npz STEPS KERNELS FUSION...``.
 
-It says each step before it takes it, so that the last one is known if it dies.
+KERNELS are parted by commas; only for them does it import something of this package. It
+says each step before it takes it, so that the last one is known if it dies.
 """
 
 import sys
@@ -11,12 +12,16 @@ import onnxruntime as ort
 _NUMPY = {"float": "float32", "double": "float64"}
 
 
-def main(model: str, inputs: str, steps: str, *disabled: str) -> None:
+def main(model: str, inputs: str, steps: str, kernels: str, *disabled: str) -> None:
     """Open a file as a session does; run it once where the steps say so."""
     options = ort.SessionOptions()
     options.log_severity_level = 4
     options.enable_mem_pattern = False
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    if kernels:
+        from me2e_compress.operators.kernels import custom_ops
+
+        custom_ops.register_named(options, kernels.split(","))
     sys.stdout.write("open\n")
     sys.stdout.flush()
     session = ort.InferenceSession(

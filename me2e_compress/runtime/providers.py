@@ -72,6 +72,10 @@ class Provider(abc.ABC):
                 f" {', '.join(there)}; {self.advice}"
             )
 
+    def claims(self, op_type: str) -> bool:
+        """Return whether a user's library names an operator: then it runs it."""
+        return any(_holds(each, op_type.encode()) for each in self.plugins)
+
     def is_installed(self) -> bool:
         """Return whether this onnxruntime has it; its device may still be missing."""
         return self.native in ort.get_available_providers()
@@ -207,13 +211,7 @@ class TensorRtProvider(Provider):
     @staticmethod
     def _is_tensorrts(library: Path) -> bool:
         """Return whether a library has no operators of onnxruntime; it is not run."""
-        if not library.is_file() or not library.stat().st_size:
-            return False
-        with (
-            library.open("rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-        ):
-            return content.find(_ENTRY) < 0
+        return library.is_file() and not _holds(library, _ENTRY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -256,6 +254,17 @@ class TensorRtRtxProvider(Provider):
     def chain(self) -> None:
         """Return none: the options of the session name its device."""
         return
+
+
+def _holds(library: Path, word: bytes) -> bool:
+    """Return whether a file holds these bytes; it is looked at, not run."""
+    if not library.is_file() or not library.stat().st_size:
+        return False
+    with (
+        library.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+    ):
+        return content.find(word) >= 0
 
 
 CPU = CpuProvider()

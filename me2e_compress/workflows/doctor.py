@@ -11,6 +11,7 @@ import psutil
 import pynvml
 
 from me2e_compress.manager.report import versions
+from me2e_compress.operators.kernels import KERNELS, why_not
 from me2e_compress.workflows.result import Result, Table, table
 
 _EXTRAS = (
@@ -72,7 +73,7 @@ class DoctorResult(Result):
 
 def doctor() -> DoctorResult:
     """Look for everything that the toolkit can make use of."""
-    return DoctorResult((*_machine(), *_packages(), _gpu()))
+    return DoctorResult((*_machine(), *_packages(), _kernels(), _gpu()))
 
 
 def _machine() -> list[Checkup]:
@@ -96,6 +97,14 @@ def _packages() -> list[Checkup]:
             name = module.replace("_", "-")
             found.append(Checkup(module, importlib.metadata.version(name)))
     return found
+
+
+def _kernels() -> Checkup:
+    """Say which compiled kernels sessions run in the place of fused operators."""
+    what = "compiled kernels"
+    if reason := why_not():
+        return Checkup(what, None, f"fused operators run as their bodies: {reason}")
+    return Checkup(what, ", ".join(each.op_type for each in KERNELS))
 
 
 def _gpu() -> Checkup:

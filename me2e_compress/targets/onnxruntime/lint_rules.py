@@ -14,7 +14,7 @@ from me2e_compress.graph import (
     opset_of,
     producer_of,
 )
-from me2e_compress.runtime.opening import operators as native_operators
+from me2e_compress.runtime.fused_nodes import known_operators
 from me2e_compress.targets.base import (
     LintFinding,
     LintRule,
@@ -39,7 +39,7 @@ def opset(model: ir.Model) -> Iterator[LintFinding]:
 
 def operators(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators that have neither a kernel nor a function in the file."""
-    known = native_operators()
+    known = known_operators()
     for node in nodes_of(model):
         domain = "" if is_standard(node) else node.domain
         name = f"{node.domain or 'ai.onnx'}::{node.op_type}"

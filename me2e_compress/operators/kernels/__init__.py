@@ -1,0 +1,10 @@
+"""Compiled kernels of fused operators, run by ordinary onnxruntime sessions.
+
+A session calls them on its own threads, in the place of the nodes that
+:data:`~me2e_compress.operators.kernels.kernel.DOMAIN` holds.
+"""
+
+from me2e_compress.operators.kernels.availability import why_not
+from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, Kernel
+
+__all__ = ["DOMAIN", "KERNELS", "Kernel", "why_not"]

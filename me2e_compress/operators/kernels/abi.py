@@ -1,0 +1,76 @@
+"""Numbers that Python, compiled kernels and onnxruntime's C interface agree on.
+
+Places in ``OrtApi`` and ``OrtCustomOp`` are those of ``onnxruntime_c_api.h``, where
+entries are only ever added at the end.
+"""
+
+API_VERSION = 17
+"""The first with ``KernelContext_ParallelFor``: onnxruntime 1.17."""
+
+OP_VERSION = 16
+"""The first with ``KernelComputeV2``, which answers with a status."""
+
+CREATE_DOMAIN, ADD_OP, ADD_DOMAIN = 26, 27, 28
+
+CALLED_BY_KERNELS = (
+    0,  # CreateStatus
+    90,  # KernelContext_GetInput
+    91,  # KernelContext_GetOutput
+    51,  # GetTensorMutableData
+    65,  # GetTensorTypeAndShape
+    60,  # GetTensorElementType
+    61,  # GetDimensionsCount
+    62,  # GetDimensions
+    99,  # ReleaseTensorTypeAndShapeInfo
+    274,  # KernelContext_ParallelFor
+)
+(
+    CREATE_STATUS,
+    GET_INPUT,
+    GET_OUTPUT,
+    GET_DATA,
+    GET_INFO,
+    GET_TYPE,
+    GET_RANK,
+    GET_DIMS,
+    RELEASE_INFO,
+    PARALLEL_FOR,
+) = range(len(CALLED_BY_KERNELS))
+"""Words of a kernel's state: addresses of those functions, then"""
+BLOCK = len(CALLED_BY_KERNELS)
+"""that of the kernel's own ``block``, which ``ParallelFor`` calls, then"""
+MESSAGES = BLOCK + 1
+"""those of what it may answer where its inputs do not fit."""
+STATE_WORDS = MESSAGES + 16
+
+INVALID_ARGUMENT = 2
+"""``ORT_INVALID_ARGUMENT``."""
+
+FLOAT, UINT8, INT8, INT32, INT64, ANY = 1, 2, 3, 6, 7, 0
+"""``ONNXTensorElementDataType``; ``ANY`` leaves it to the kernel to look."""
+
+VARIADIC = (
+    "GetVariadicInputMinArity",
+    "GetVariadicInputHomogeneity",
+    "GetVariadicOutputMinArity",
+    "GetVariadicOutputHomogeneity",
+)
+FIELDS = (
+    "version",
+    "CreateKernel",
+    "GetName",
+    "GetExecutionProviderType",
+    "GetInputType",
+    "GetInputTypeCount",
+    "GetOutputType",
+    "GetOutputTypeCount",
+    "KernelCompute",
+    "KernelDestroy",
+    "GetInputCharacteristic",
+    "GetOutputCharacteristic",
+    "GetInputMemoryType",
+    *VARIADIC,
+    "CreateKernelV2",
+    "KernelComputeV2",
+)
+"""Of ``OrtCustomOp``, a word each; those behind them are for later versions."""

@@ -1,0 +1,145 @@
+"""Compiled kernels as custom operators of an ordinary onnxruntime session.
+
+Everything that onnxruntime is given here stays for as long as the process lives: a
+session calls its operators until it is gone, and Python cannot tell when that is.
+Python is called only while a session is being opened, never by one that runs or ends.
+"""
+
+import ctypes
+import functools
+import threading
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import onnxruntime as ort
+
+from me2e_compress.operators.kernels import abi
+from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, Kernel
+from me2e_compress.operators.kernels.machine_code import load_or_compile
+from me2e_compress.operators.kernels.store import default_folder
+from me2e_compress.operators.kernels.trampoline import STATE_OFFSET, trampoline
+
+_POINTER = ctypes.c_void_p
+_INT, _SIZE = ctypes.c_int, ctypes.c_size_t
+
+_asked = threading.local()
+"""What this thread is registering: onnxruntime calls back within that very call."""
+
+
+def register(
+    options: ort.SessionOptions,
+    kernels: Iterable[Kernel],
+    begins: Callable[[], None] = lambda: None,
+) -> None:
+    """Let sessions of these options run kernels; to be called once for them.
+
+    Args:
+        options: of the sessions.
+        kernels: which; compiled here where this machine has not seen them.
+        begins: called before each that is compiled.
+
+    Raises:
+        OSError: no shared object can be opened; see :mod:`trampoline`.
+        ImportError: Numba is not installed, or does not work here.
+    """
+    door = trampoline()
+    _asked.code = {
+        each: load_or_compile(each.op_type, each.module, default_folder(), begins)
+        for each in kernels
+    }
+    door.fill(_address(_register))
+    options.register_custom_ops_library(door.path)
+
+
+def register_named(options: ort.SessionOptions, names: Iterable[str]) -> None:
+    """Do what :func:`register` does for kernels by their names."""
+    known = {each.op_type: each for each in KERNELS}
+    register(options, [known[name] for name in names])
+
+
+def _add(options: int, base: int) -> None:
+    """Add what was asked for; onnxruntime calls it through the trampoline."""
+    api = _api(base)
+    domain = _POINTER()
+    name = ctypes.create_string_buffer(DOMAIN.encode())
+    create = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)(api[abi.CREATE_DOMAIN])
+    add = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)
+    create(ctypes.addressof(name), ctypes.addressof(domain))
+    for kernel, code in _asked.code.items():
+        operator = _operator(kernel, code["compute"], code["block"], base)
+        add(api[abi.ADD_OP])(domain, ctypes.addressof(operator))
+    add(api[abi.ADD_DOMAIN])(options, domain)
+
+
+_register = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)(_add)
+
+
+def _api(base: int) -> Any:
+    """Return the functions of onnxruntime's C interface, by their places."""
+    get = ctypes.cast(base, ctypes.POINTER(_POINTER))[0]
+    found = ctypes.CFUNCTYPE(_POINTER, ctypes.c_uint32)(get)(abi.API_VERSION)
+    return ctypes.cast(found, ctypes.POINTER(_POINTER))
+
+
+_KEPT: list[object] = []
+
+
+@functools.cache
+def _operator(kernel: Kernel, compute: int, block: int, base: int) -> Any:
+    """Write an ``OrtCustomOp``, and behind it the state of its kernels."""
+    name = ctypes.create_string_buffer(kernel.op_type.encode())
+    said = [
+        ctypes.create_string_buffer(f"{kernel.op_type}: {each}".encode())
+        for each in kernel.messages
+    ]
+    door = trampoline()
+    callbacks: dict[str, Any] = {
+        "GetName": ctypes.CFUNCTYPE(_POINTER, _POINTER)(
+            lambda _: ctypes.addressof(name)
+        ),
+        "GetExecutionProviderType": ctypes.CFUNCTYPE(_POINTER, _POINTER)(
+            lambda _: None
+        ),
+        "GetInputType": ctypes.CFUNCTYPE(_INT, _POINTER, _SIZE)(
+            lambda _, index: kernel.inputs[index]
+        ),
+        "GetInputTypeCount": ctypes.CFUNCTYPE(_SIZE, _POINTER)(
+            lambda _: len(kernel.inputs)
+        ),
+        "GetOutputType": ctypes.CFUNCTYPE(_INT, _POINTER, _SIZE)(
+            lambda _, index: kernel.output
+        ),
+        "GetOutputTypeCount": ctypes.CFUNCTYPE(_SIZE, _POINTER)(lambda _: 1),
+        "GetInputCharacteristic": _zero(),  # an input that is required
+        "GetOutputCharacteristic": _zero(),
+        "GetInputMemoryType": _zero(),
+        **{name: _one() for name in abi.VARIADIC},
+    }
+    written = (_POINTER * (STATE_OFFSET // 8 + abi.STATE_WORDS))()
+    written[0] = abi.OP_VERSION
+    for field, callback in callbacks.items():
+        written[abi.FIELDS.index(field)] = _address(callback)
+    for field in ("CreateKernel", "KernelDestroy"):
+        written[abi.FIELDS.index(field)] = door.address(field)
+    written[abi.FIELDS.index("KernelComputeV2")] = compute
+    api = _api(base)
+    state = [api[place] for place in abi.CALLED_BY_KERNELS]
+    state += [block, *map(ctypes.addressof, said)]
+    for index, word in enumerate(state):
+        written[STATE_OFFSET // 8 + index] = word
+    _KEPT.extend((name, said, callbacks, written))
+    return written
+
+
+def _zero() -> Any:
+    return ctypes.CFUNCTYPE(_INT, _POINTER, _SIZE)(lambda _, index: 0)
+
+
+def _one() -> Any:
+    return ctypes.CFUNCTYPE(_INT, _POINTER)(lambda _: 1)
+
+
+def _address(callback: Any) -> int:
+    found = ctypes.cast(callback, _POINTER).value
+    assert found is not None
+    return found

@@ -1,0 +1,57 @@
+"""Which compiled kernels there are."""
+
+import dataclasses
+
+from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, UINT8
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """A compiled operator.
+
+    Attributes:
+        op_type: its name; the domain is :data:`DOMAIN`.
+        module: of this package, that has its code.
+        inputs: their element types.
+        messages: what it may answer where its inputs do not fit.
+        output: its element type.
+    """
+
+    op_type: str
+    module: str
+    inputs: tuple[int, ...]
+    messages: tuple[str, ...]
+    output: int = FLOAT
+
+
+DOMAIN = "me2e.kernels"
+"""Nodes are moved here when a graph is opened. A domain of their own: no file has
+nodes in it, so no function body and no other library can claim them."""
+
+_DEFORMABLE = (
+    "the inputs have not the ranks that they must: value 4, spatial_shapes 2,"
+    " level_start_index 1, sampling_locations 6, attention_weights 5",
+    "the inputs do not fit each other: they must be value [N,S,M,D], spatial_shapes"
+    " [L,2], level_start_index [L], sampling_locations [N,Q,M,L,P,2] and"
+    " attention_weights [N,Q,M,L,P]",
+    "spatial_shapes and level_start_index must be int32 or int64",
+    "a level lies outside of value: level_start_index + height x width is more than"
+    " value has rows, or a number is negative",
+    "value has 2^31 or more numbers for one of the batch",
+    "a head has more than 1024 points",
+    "the scale of value must be one number, or one for every channel, its zero point"
+    " one number",
+)
+_INPUTS = (FLOAT, ANY, ANY, FLOAT, FLOAT)
+
+KERNELS = tuple(
+    Kernel(
+        f"MultiScaleDeformableAttention{word}", "deformable_kernel", inputs, _DEFORMABLE
+    )
+    for word, inputs in (
+        ("", _INPUTS),
+        ("Int8", (INT8, *_INPUTS[1:], FLOAT, INT8)),
+        ("Uint8", (UINT8, *_INPUTS[1:], FLOAT, UINT8)),
+    )
+)
+"""All of them."""

@@ -1,0 +1,145 @@
+"""Kernels as machine code that is kept in a file and needs no Numba to load.
+
+Numba compiles once a machine, 1 to 2 s a kernel; afterwards LLVM alone loads the code,
+in a third of the time that importing Numba takes. A file is named by all that it was
+made of: this package's kernels, the compilers, and the processor.
+"""
+
+import functools
+import hashlib
+import importlib
+import platform
+import threading
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from llvmlite import binding as llvm
+
+from me2e_compress.errors import GraphError
+from me2e_compress.operators.kernels.store import keep, private
+
+_FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf"})
+"""What kernels may call, of the C library. Code that calls into Python or into Numba
+would end a process into which Numba is not loaded."""
+
+_WRAPPER = """
+declare i32 @"{inner}"(ptr, ptr, i64, i64)
+define i64 @{name}(i64 %first, i64 %second) {{
+    %result = alloca i64
+    %raised = alloca ptr
+    store i64 0, ptr %result
+    call i32 @"{inner}"(ptr %result, ptr %raised, i64 %first, i64 %second)
+    %value = load i64, ptr %result
+    ret i64 %value
+}}
+"""
+"""A C function around a Numba function, whose first two arguments are pointers to the
+result and to what it raised; ``cfunc``'s own wrapper raises in Python."""
+
+_DIGEST = hashlib.sha256().digest_size
+_LOCK = threading.Lock()
+_ENGINES: list[Any] = []
+"""They own the code, which may be run for as long as the process lives."""
+
+
+def load_or_compile(
+    op_type: str, module: str, folder: Path, begins: Callable[[], None]
+) -> Mapping[str, int]:
+    """Return the addresses of a kernel's functions, by name.
+
+    Args:
+        op_type: the kernel's operator.
+        module: of this package; its ``functions(op_type)`` are Python functions of
+            two words that return a word.
+        folder: where machine code is kept.
+        begins: called before a kernel is compiled, not where its code was found.
+
+    Raises:
+        GraphError: the functions call something that only Python or Numba has.
+    """
+    with _LOCK:
+        place = private(folder)
+        path = None if place is None else place / f"{op_type}-{_fingerprint()}.o"
+        code = _read(path)
+        if code is None:
+            begins()
+            found = importlib.import_module(f"{__package__}.{module}")
+            code = _compiled(found.functions(op_type))
+            if path is not None:
+                keep(path, hashlib.sha256(code).digest() + code)
+        return _addresses(code)
+
+
+@functools.cache
+def _fingerprint() -> str:
+    """Name everything that machine code depends on."""
+    known = hashlib.sha256()
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        known.update(file.read_bytes())
+    versions = (metadata.version(each) for each in ("numba", "llvmlite"))
+    cpu = (llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
+    known.update("\n".join((*versions, *cpu, platform.machine())).encode())
+    return known.hexdigest()[:32]
+
+
+def _read(path: Path | None) -> bytes | None:
+    """Return code that was kept; None if there is none, or a file of something else."""
+    try:
+        content = b"" if path is None else path.read_bytes()
+    except OSError:
+        return None
+    digest, code = content[:_DIGEST], content[_DIGEST:]
+    return code if code and hashlib.sha256(code).digest() == digest else None
+
+
+def _machine() -> Any:
+    """Return LLVM's compiler for this very processor."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target = llvm.Target.from_default_triple()
+    features = llvm.get_host_cpu_features().flatten()
+    return target.create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=features, opt=3, jit=True
+    )
+
+
+def _compiled(functions: Mapping[str, Callable[[int, int], int]]) -> bytes:
+    """Compile Python functions to an object file of C functions of the same names."""
+    import numba  # takes 0.25 s, and only here
+
+    from me2e_compress.operators.kernels import intrinsics
+
+    word = numba.types.intp
+    machine = _machine()
+    whole = llvm.parse_assembly("")
+    for name, function in functions.items():
+        made = numba.cfunc(word(word, word), **intrinsics.OPTIONS)(function)
+        inner = made.native_name.removeprefix("cfunc.")
+        whole.link_in(llvm.parse_assembly(made.inspect_llvm()))
+        whole.link_in(llvm.parse_assembly(_WRAPPER.format(inner=inner, name=name)))
+    for each in (*whole.functions, *whole.global_variables):
+        if not each.is_declaration and each.name not in functions:
+            each.linkage = "internal"
+    passes = llvm.create_new_module_pass_manager()
+    passes.add_global_dead_code_eliminate_pass()
+    options = llvm.create_pipeline_tuning_options()
+    passes.run(whole, llvm.create_pass_builder(machine, options))
+    foreign = [
+        each.name
+        for each in whole.functions
+        if each.is_declaration and not each.name.startswith("llvm.")
+    ]
+    if unknown := sorted(set(foreign) - _FOREIGN):
+        raise GraphError(f"a kernel calls {unknown[0]}, which only Numba has")
+    return bytes(machine.emit_object(whole))
+
+
+def _addresses(code: bytes) -> Mapping[str, int]:
+    """Load an object file; return where its C functions stand."""
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    _ENGINES.append(engine)
+    return {name: engine.get_function_address(name) for name in ("compute", "block")}

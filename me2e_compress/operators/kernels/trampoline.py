@@ -1,0 +1,188 @@
+"""The shared object by which onnxruntime finds our operators, written at first use.
+
+``SessionOptions.register_custom_ops_library`` opens a shared object and calls its
+function ``RegisterCustomOps``; that is the only door that onnxruntime's Python package
+has. So a shared object of three functions of one or two instructions is written as
+bytes: no compiler is needed on the user's machine, no binary of a platform need be
+shipped or trusted, and it is 4 kB (64 kB where memory comes in larger pages). Each
+process puts the address of its own callback into the object's ``slot``.
+"""
+
+import ctypes
+import dataclasses
+import functools
+import os
+import platform
+import struct
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from me2e_compress.operators.kernels.store import default_folder, keep, private
+
+STATE_OFFSET = 0x180
+"""Bytes from an operator's description to the state of its kernels, which stands right
+behind it: ``CreateKernel`` is one addition then, and needs no Python."""
+
+_CODE, _SYMBOLS, _HASH, _NAMES = 0x200, 0x280, 0x380, 0x3C0
+_FUNCTIONS = ("RegisterCustomOps", "CreateKernel", "KernelDestroy")
+_STEP = 16  # bytes a function takes
+
+
+@dataclasses.dataclass(frozen=True)
+class _Machine:
+    """What differs between processors.
+
+    Attributes:
+        number: ``e_machine`` of an ELF header.
+        page: the largest page that memory may come in.
+        jump: code that jumps to the address in the slot, so far away.
+        add: code that returns its first argument plus :data:`STATE_OFFSET`.
+        nothing: code that returns.
+    """
+
+    number: int
+    page: int
+    add: bytes
+    nothing: bytes
+
+    def jump(self, distance: int) -> bytes:
+        """Return code that jumps to the address in the slot, so far behind it."""
+        if self.number == 62:  # jmp *slot(%rip)
+            return b"\xff\x25" + struct.pack("<i", distance - 6)
+        # ldr x16, slot; br x16
+        return struct.pack("<II", 0x58000010 | (distance // 4) << 5, 0xD61F0200)
+
+
+_MACHINES: Mapping[str, _Machine] = {
+    "x86_64": _Machine(
+        62,
+        0x1000,
+        b"\x48\x8d\x87" + struct.pack("<i", STATE_OFFSET) + b"\xc3",  # lea, ret
+        b"\xc3",
+    ),
+    "aarch64": _Machine(
+        183,
+        0x10000,
+        struct.pack("<II", 0x91000000 | STATE_OFFSET << 10, 0xD65F03C0),  # add, ret
+        struct.pack("<I", 0xD65F03C0),
+    ),
+}
+
+
+def why_not() -> str | None:
+    """Return why this platform has no trampoline; None if it has one."""
+    if sys.platform != "linux":
+        return f"there are kernels on Linux only, not on {sys.platform}"
+    if platform.machine() not in _MACHINES:
+        known = " and ".join(_MACHINES)
+        return f"there are kernels for {known} only, not for {platform.machine()}"
+    return None
+
+
+def shared_object(machine: str) -> bytes:
+    """Write the shared object: an ELF file of code, a slot and their names.
+
+    Args:
+        machine: ``x86_64`` or ``aarch64``.
+    """
+    kind = _MACHINES[machine]
+    dynamic, slot = kind.page, kind.page + 0x100
+    code = [kind.jump(slot - _CODE), kind.add, kind.nothing]
+    names = b"\0" + b"".join(f"{name}\0".encode() for name in (*_FUNCTIONS, "slot"))
+    places = [names.index(f"{name}\0".encode()) for name in (*_FUNCTIONS, "slot")]
+    symbols = bytes(24)
+    for index, (place, body) in enumerate(zip(places, code, strict=False)):
+        at = _CODE + _STEP * index
+        symbols += struct.pack("<IBBHQQ", place, 0x12, 0, 1, at, len(body))
+    symbols += struct.pack("<IBBHQQ", places[3], 0x11, 0, 1, slot, 8)
+    # one bucket, five symbols, each the next one's predecessor
+    table = struct.pack("<8I", 1, 5, 1, 0, 2, 3, 4, 0)
+    entries = ((4, _HASH), (5, _NAMES), (6, _SYMBOLS), (10, len(names)), (11, 24))
+    tags = b"".join(struct.pack("<qQ", *entry) for entry in (*entries, (0, 0)))
+    file = bytearray(slot + 8)
+    pieces = {
+        0: _header(kind, dynamic, len(tags)),
+        _SYMBOLS: symbols,
+        _HASH: table,
+        _NAMES: names,
+        dynamic: tags,
+        **{_CODE + _STEP * index: body for index, body in enumerate(code)},
+    }
+    for at, piece in pieces.items():
+        file[at : at + len(piece)] = piece
+    return bytes(file)
+
+
+def _header(kind: _Machine, dynamic: int, tags: int) -> bytes:
+    """Write the ELF header, and what is loaded where."""
+    ident = b"\x7fELF\2\1\1".ljust(16, b"\0")
+    sizes = (64, 56, 4, 0, 0, 0)
+    head = struct.pack(
+        "<16sHHIQQQIHHHHHH", ident, 3, kind.number, 1, 0, 64, 0, 0, *sizes
+    )
+    segments = (
+        (1, 5, 0, 0x400, kind.page),  # code, read and run
+        (1, 6, dynamic, 0x108, kind.page),  # the slot, read and written
+        (2, 6, dynamic, tags, 8),
+        (0x6474E551, 6, 0, 0, 16),  # the stack holds no code
+    )
+    for sort, flags, at, size, align in segments:
+        head += struct.pack("<IIQQQQQQ", sort, flags, at, at, at, size, size, align)
+    return head
+
+
+@dataclasses.dataclass(frozen=True)
+class Trampoline:
+    """The shared object, open in this process.
+
+    Attributes:
+        path: what onnxruntime is told to open.
+        library: the same, open.
+    """
+
+    path: str
+    library: ctypes.CDLL
+
+    def address(self, name: str) -> int:
+        """Return where a function stands."""
+        found = ctypes.cast(getattr(self.library, name), ctypes.c_void_p).value
+        assert found is not None
+        return found
+
+    def fill(self, callback: int) -> None:
+        """Put an address into the slot that ``RegisterCustomOps`` jumps to."""
+        ctypes.c_void_p.in_dll(self.library, "slot").value = callback
+
+
+def load(folder: Path) -> Trampoline:
+    """Open the shared object from a private folder or, where that fails, from memory.
+
+    A folder that cannot be written to, or from which nothing may run (``noexec``),
+    is passed over.
+
+    Raises:
+        OSError: not even memory can be run.
+    """
+    content = shared_object(platform.machine())
+    if place := private(folder):
+        path = place / f"trampoline-{platform.machine()}.so"
+        if keep(path, content):
+            try:
+                return Trampoline(str(path), ctypes.CDLL(str(path)))
+            except OSError:
+                pass  # noexec
+    handle = os.memfd_create("me2e-trampoline")  # open for as long as the process lives
+    os.write(handle, content)
+    path_in_memory = f"/proc/self/fd/{handle}"
+    return Trampoline(path_in_memory, ctypes.CDLL(path_in_memory))
+
+
+@functools.cache
+def trampoline() -> Trampoline:
+    """Open the shared object once a process.
+
+    Raises:
+        OSError: it can be opened neither from the cache folder nor from memory.
+    """
+    return load(default_folder())

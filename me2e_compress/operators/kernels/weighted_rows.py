@@ -1,0 +1,165 @@
+"""The inner loop of every deformable operator, in vectors: a weighted sum of rows.
+
+Written as LLVM instructions: so the sums stay in registers for every head size, which
+Numba's loops over arrays leave to chance.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from me2e_compress.operators.kernels.intrinsics import ELEMENTS, FLOAT, INT, WORD
+
+CAPACITY = 1024
+"""Points at a time; the four arrays of offsets, and of weights, stand so far apart."""
+
+CORNERS = 4
+WIDTHS = (32, 16, 8, 4, 1)
+"""Channels at a time: the widest that fits first."""
+
+
+def weighted_rows(kind: Any) -> Any:
+    """Return the intrinsic ``(rows, offsets, weights, first, last, out, size)``.
+
+    It writes ``size`` float32 numbers to the address ``out``: the sum over the points
+    ``first`` to ``last`` of four rows each, times their weights. A point whose first
+    offset is negative is left out.
+
+    Args:
+        kind: of the rows: float32, int8 or uint8.
+    """
+
+    def typed(
+        context: Any,
+        rows: Any,
+        offsets: Any,
+        weights: Any,
+        first: Any,
+        last: Any,
+        out: Any,
+        size: Any,
+    ) -> tuple[Any, Callable[..., Any]]:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            _Loops(builder, kind, *arguments).write()
+            return context.get_dummy_value()
+
+        word = types.intp
+        return types.void(word, offsets, weights, word, word, word, word), generate
+
+    return intrinsic(typed)
+
+
+class _Loops:
+    """The instructions: for each width a loop over channels, in it one over points."""
+
+    def __init__(
+        self,
+        builder: Any,
+        kind: Any,
+        rows: Any,
+        offsets: Any,
+        weights: Any,
+        first: Any,
+        last: Any,
+        out: Any,
+        size: Any,
+    ) -> None:
+        self.builder, self.kind = builder, kind
+        self.rows = builder.inttoptr(rows, ELEMENTS[kind].as_pointer())
+        self.out = builder.inttoptr(out, FLOAT.as_pointer())
+        self.offsets, self.weights = offsets, weights
+        self.first, self.last, self.size = first, last, size
+
+    def write(self) -> None:
+        builder = self.builder
+        done = cgutils.alloca_once(builder, WORD)
+        builder.store(WORD(0), done)
+        for width in WIDTHS:
+            head, body, after = (
+                builder.append_basic_block(f"{part}{width}")
+                for part in ("head", "body", "after")
+            )
+            builder.branch(head)
+            builder.position_at_end(head)
+            at = builder.load(done)
+            end = builder.add(at, WORD(width))
+            builder.cbranch(builder.icmp_signed("<=", end, self.size), body, after)
+            builder.position_at_end(body)
+            total = self._sum(builder.gep(self.rows, [at]), width)
+            place = builder.gep(self.out, [at])
+            builder.store(total, self._vector_at(place, FLOAT, width), align=4)
+            builder.store(end, done)
+            builder.branch(head)
+            builder.position_at_end(after)
+
+    def _sum(self, rows: Any, width: int) -> Any:
+        """Write the loop over points for ``width`` channels; return the sums."""
+        builder, kind = self.builder, ir.VectorType(FLOAT, width)
+        nothing = kind([0.0] * width)
+        before = builder.block
+        loop, inside, ahead, end = (
+            builder.append_basic_block(f"{part}{width}")
+            for part in ("point", "inside", "next", "end")
+        )
+        some = builder.icmp_signed("<", self.first, self.last)
+        builder.cbranch(some, loop, end)
+
+        builder.position_at_end(loop)
+        point, sums = builder.phi(WORD), builder.phi(kind)
+        point.add_incoming(self.first, before)
+        sums.add_incoming(nothing, before)
+        offset = builder.load(builder.gep(self.offsets, [point]))
+        builder.cbranch(builder.icmp_signed(">=", offset, INT(0)), inside, ahead)
+
+        builder.position_at_end(inside)
+        more = sums
+        for corner in range(CORNERS):
+            place = builder.add(point, WORD(corner * CAPACITY))
+            offset = builder.load(builder.gep(self.offsets, [place]))
+            weight = builder.load(builder.gep(self.weights, [place]))
+            row = self._row(builder.gep(rows, [builder.sext(offset, WORD)]), width)
+            part = builder.fmul(row, self._spread(weight, width), flags=("contract",))
+            more = builder.fadd(more, part, flags=("contract",))
+        builder.branch(ahead)
+
+        builder.position_at_end(ahead)
+        kept = builder.phi(kind)
+        kept.add_incoming(sums, loop)
+        kept.add_incoming(more, inside)
+        following = builder.add(point, WORD(1))
+        point.add_incoming(following, ahead)
+        sums.add_incoming(kept, ahead)
+        going_on = builder.icmp_signed("<", following, self.last)
+        builder.cbranch(going_on, loop, end)
+
+        builder.position_at_end(end)
+        total = builder.phi(kind)
+        total.add_incoming(nothing, before)
+        total.add_incoming(kept, ahead)
+        return total
+
+    def _row(self, place: Any, width: int) -> Any:
+        """Load a row as float."""
+        element = ELEMENTS[self.kind]
+        builder = self.builder
+        row = builder.load(
+            self._vector_at(place, element, width), align=4 if element is FLOAT else 1
+        )
+        if element is FLOAT:
+            return row
+        convert = builder.sitofp if self.kind.signed else builder.uitofp
+        return convert(row, ir.VectorType(FLOAT, width))
+
+    def _vector_at(self, place: Any, element: Any, width: int) -> Any:
+        return self.builder.bitcast(place, ir.VectorType(element, width).as_pointer())
+
+    def _spread(self, number: Any, width: int) -> Any:
+        """Write a number into every lane."""
+        blank = ir.VectorType(FLOAT, width)(ir.Undefined)
+        first = self.builder.insert_element(blank, number, INT(0))
+        lanes = ir.VectorType(INT, width)([0] * width)
+        return self.builder.shuffle_vector(first, blank, lanes)

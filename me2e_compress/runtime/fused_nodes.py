@@ -1,0 +1,154 @@
+"""Fused nodes of a graph that is to be opened: compiled kernels, or else bodies.
+
+A node for which there is a kernel is moved into a domain that belongs to the kernels.
+So nothing depends on whether onnxruntime prefers a function of the file or a registered
+operator of the same name, and no library of anybody else can claim a kernel's name or
+domain (which onnxruntime refuses as set twice).
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+
+import onnx_ir as ir
+import onnxruntime as ort
+from onnxruntime.capi import (
+    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
+)
+
+from me2e_compress import operators
+from me2e_compress.errors import GraphError, PreconditionError
+from me2e_compress.graph import is_standard
+from me2e_compress.operators import OWN_DOMAIN, kernels
+from me2e_compress.rewrite import value_names
+from me2e_compress.runtime.providers import CPU, Provider
+
+_BY = "session"
+_COMPILED = {each.op_type: each for each in kernels.KERNELS}
+
+
+@functools.cache
+def known_operators() -> frozenset[tuple[str, str]]:
+    """List the (domain, operator) pairs that are known; ai.onnx is written ``""``."""
+    return frozenset(
+        ("" if schema.domain == "ai.onnx" else schema.domain, schema.name)
+        for schema in _native.get_all_operator_schema()
+    )
+
+
+def unknown_nodes(model: ir.Model) -> Iterator[ir.Node]:
+    """Walk the nodes that onnxruntime does not know and that have no body in the file.
+
+    Those of the toolkit's own form have a compiled kernel though they may have a body.
+    """
+    known = known_operators()
+    for where in (*model.graphs(), *model.functions.values()):
+        for node in where:
+            domain = "" if is_standard(node) else node.domain
+            if (domain, node.op_type) in known:
+                continue
+            if node.op_identifier() not in model.functions or domain == OWN_DOMAIN:
+                yield node
+
+
+def runnable(
+    model: ir.Model, options: ort.SessionOptions, provider: Provider
+) -> ir.Model:
+    """Return a graph whose fused nodes onnxruntime can run with these options.
+
+    Args:
+        model: the graph; it stays as it is.
+        options: are told of the kernels that the graph needs.
+        provider: what runs the session. Kernels are for the CPU; what a library of
+            the user names is left to that library.
+
+    Returns:
+        The graph itself, where it has no fused nodes, or a copy.
+
+    Raises:
+        GraphError: a fused node is not used as its operator must be.
+    """
+    compiled = provider.native == CPU.native and kernels.why_not() is None
+    theirs = provider.claims
+    made, needed = compiled_or_expanded(model, compiled=compiled, theirs=theirs)
+    if not needed:
+        return made
+    from me2e_compress.operators.kernels import custom_ops  # needs the extra `fast`
+
+    try:
+        custom_ops.register(options, needed)
+    except (ImportError, OSError):
+        made, _ = compiled_or_expanded(model, compiled=False, theirs=theirs)
+    return made
+
+
+def compiled_or_expanded(
+    model: ir.Model,
+    *,
+    compiled: bool,
+    theirs: Callable[[str], bool] = lambda op_type: False,
+) -> tuple[ir.Model, tuple[kernels.Kernel, ...]]:
+    """Put kernels, or bodies, in the place of the fused nodes.
+
+    Args:
+        model: the graph; it stays as it is.
+        compiled: whether kernels may be used.
+        theirs: whether an operator is to be left as it is.
+
+    Returns:
+        A copy, or the graph itself if it has no fused nodes; and the kernels in it.
+
+    Raises:
+        GraphError: a fused node is not used as its operator must be.
+    """
+    names = {node.op_type for node in unknown_nodes(model) if is_fused(node)}
+    ours = {name for name in sorted(names) if not theirs(name)}
+    if not ours:
+        return model, ()
+    copy = model.clone()
+    taken = value_names(copy.graph)
+    try:
+        for node in list(unknown_nodes(copy)):
+            fused = node.op_type in ours and operators.find(node) is not None
+            if fused and node.domain != kernels.DOMAIN:
+                _replace(node, copy, taken, compiled)
+    except PreconditionError as error:
+        raise GraphError(str(error)) from error
+    needed: dict[str, kernels.Kernel] = {}
+    for node in unknown_nodes(copy):
+        if compiled and _takes(node.op_type, node) and node.domain == OWN_DOMAIN:
+            node.domain = kernels.DOMAIN
+            node.attributes.clear()
+        if node.domain == kernels.DOMAIN and node.graph is not None:
+            needed[node.op_type] = _COMPILED[node.op_type]
+            node.graph.opset_imports[kernels.DOMAIN] = 1
+    return copy, tuple(needed.values())
+
+
+def is_fused(node: ir.Node) -> bool:
+    """Return whether a kernel or a body is known for a node."""
+    kernel = node.domain == kernels.DOMAIN and node.op_type in _COMPILED
+    return kernel or operators.find(node) is not None
+
+
+def _takes(op_type: str, node: ir.Node) -> bool:
+    """Return whether there is a kernel for these inputs: it computes in float32."""
+    kinds = [value.dtype for value in node.inputs if value is not None]
+    return op_type in _COMPILED and all(
+        kind is None or kind == ir.DataType.FLOAT or kind.is_integer() for kind in kinds
+    )
+
+
+def _replace(node: ir.Node, model: ir.Model, names: set[str], compiled: bool) -> None:
+    """Write a node in the toolkit's own form, or as its body where no kernel fits."""
+    found, where = operators.find(node), node.graph
+    assert found is not None
+    assert where is not None
+    operator, dialect = found
+    opset = where.opset_imports.get("", model.opset_imports.get("", 1))
+    taken = names if isinstance(where, ir.Graph) else None
+    if compiled and _takes(operator.own.op_type, node):
+        if dialect is not operator.own:
+            own = operator.own
+            operators.translate(node, own, opset=opset, by=_BY, names=taken)
+    elif node.op_identifier() not in model.functions:
+        operators.expand(node, opset=opset, by=_BY, names=taken)

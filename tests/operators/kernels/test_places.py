@@ -1,0 +1,98 @@
+"""Where compiled code is kept, and what is done where that is not possible."""
+
+import ctypes
+import os
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.operators import kernels
+from me2e_compress.operators.kernels import store, trampoline
+
+needs_kernels = pytest.mark.skipif(
+    kernels.why_not() is not None, reason=str(kernels.why_not())
+)
+
+
+def test_the_folder_is_this_users_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "cache" / "kernels"
+
+    assert store.private(folder) == folder
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+    folder.chmod(0o777)
+    assert store.private(folder) is None
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+def test_the_shared_object_is_small(machine: str) -> None:
+    content = trampoline.shared_object(machine)
+
+    assert content.startswith(b"\x7fELF\2\1\1")
+    assert len(content) == {"x86_64": 0x1108, "aarch64": 0x10108}[machine]
+
+
+@needs_kernels
+def test_the_shared_object_is_written_and_opened(tmp_path: Path) -> None:
+    opened = trampoline.load(tmp_path / "kernels")
+
+    assert Path(opened.path).parent == tmp_path / "kernels"
+    add = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+    assert add(opened.address("CreateKernel"))(4096) == 4096 + trampoline.STATE_OFFSET
+
+
+@needs_kernels
+def test_no_writable_cache(tmp_path: Path) -> None:
+    (tmp_path / "kernels").write_text("in the way")
+
+    opened = trampoline.load(tmp_path / "kernels")
+
+    assert opened.path.startswith("/proc/self/fd/")
+    assert opened.address("KernelDestroy")
+
+
+@needs_kernels
+def test_a_cache_from_which_nothing_may_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = ctypes.CDLL
+
+    def strict(path: str) -> ctypes.CDLL:
+        if path.startswith(str(tmp_path)):
+            raise OSError("failed to map segment from shared object")
+        return real(path)
+
+    monkeypatch.setattr(ctypes, "CDLL", strict)
+
+    assert trampoline.load(tmp_path).path.startswith("/proc/self/fd/")
+
+
+@needs_kernels
+def test_code_is_compiled_once_and_read_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from me2e_compress.operators.kernels import machine_code
+
+    code = kernels.KERNELS[0]
+    made = bytes(next(store.default_folder().glob(f"{code.op_type}-*.o")).read_bytes())
+    compiled: list[object] = []
+    digest = machine_code._DIGEST
+
+    def counted(functions: object) -> bytes:
+        compiled.append(functions)
+        return made[digest:]
+
+    monkeypatch.setattr(machine_code, "_compiled", counted)
+
+    def load() -> int:
+        machine_code.load_or_compile(
+            code.op_type, code.module, tmp_path, lambda: compiled.append("begins")
+        )
+        return len(compiled)
+
+    assert load() == 2
+    assert load() == 2
+    (kept,) = tmp_path.iterdir()
+    assert kept.stat().st_mode & 0o777 == 0o600
+    os.truncate(kept, kept.stat().st_size // 2)  # a disk that was full
+    assert load() == 4
