@@ -234,6 +234,8 @@ def _infer(node: ir.Node, opset: int) -> None:
     for value in node.inputs:
         if value is None or not value.name:
             continue
+        if value.type is None:
+            return  # what the operands are of decides what the result is of
         info = ir.to_proto(value)
         types[value.name] = info.type
         known = array_of(value) if value.dtype == _INT64 else None

@@ -15,7 +15,7 @@ from onnxruntime.capi import (
     onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
-from me2e_compress import operators
+from me2e_compress import graph, operators
 from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import is_standard
 from me2e_compress.operators import OWN_DOMAIN, kernels
@@ -105,6 +105,8 @@ def compiled_or_expanded(
     if not ours:
         return model, ()
     copy = model.clone()
+    if any(_is_bare(node) for node in unknown_nodes(copy) if node.op_type in ours):
+        graph.infer_shapes(copy)  # the file does not say what bodies have to know
     taken = value_names(copy.graph)
     try:
         for node in list(unknown_nodes(copy)):
@@ -128,6 +130,14 @@ def is_fused(node: ir.Node) -> bool:
     """Return whether a kernel or a body is known for a node."""
     kernel = node.domain == kernels.DOMAIN and node.op_type in _COMPILED
     return kernel or operators.find(node) is not None
+
+
+def _is_bare(node: ir.Node) -> bool:
+    """Return whether the type or the rank of an input is not known."""
+    return any(
+        value is not None and (value.type is None or value.shape is None)
+        for value in node.inputs
+    )
 
 
 def _takes(op_type: str, node: ir.Node) -> bool:

@@ -52,14 +52,35 @@ def test_with_value_info_nothing_is_said(
     assert "value_info" not in "".join(capsys.readouterr().out.split())
 
 
+FRAME = {
+    "image": np.ones((1, 16, 8, 8), np.float32),
+    "angle": np.full(1, 30, np.float32),
+    "center": np.full(2, 4, np.float32),
+    "lidar": np.tile(2 * np.eye(4, dtype=np.float32), (1, 6, 1, 1)),
+}
+
+
+def test_plugins_run_where_nobody_has_their_library(
+    command: Command, plugins: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = record(plugins / "frames", [FRAME] * 4)
+    small = plugins / "small.onnx"
+    made = ("-r", "full", "--frames", frames, "--floor", "0", "-o", small)
+
+    assert command("compress", plugins / "shaped.onnx", *made) == 0, capsys.readouterr()
+    assert command("compare", plugins / "shaped.onnx", small, frames) == 0
+
+
 def test_calibrate_names_the_way_to_int8_without_running_the_graph(
     command: Command, plugins: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shapes = {"image": (1, 16, 8, 8), "angle": (1,), "center": (2,)}
-    shapes["lidar"] = (1, 6, 4, 4)
-    frame = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
-    record(plugins / "frames", [frame])
-    words = (plugins / "shaped.onnx", plugins / "frames", "-o", plugins / "r.json")
+    frames = record(plugins / "frames", [FRAME])
+    unknown = graph.load(plugins / "shaped.onnx")
+    unknown.graph[1].op_type = "VendorsOwn"
+    graph.save(unknown, plugins / "unknown.onnx")
+
+    words = (plugins / "unknown.onnx", frames, "-o", plugins / "r.json")
+
     assert command("calibrate", *words) == 1
     assert "calibrate --import CACHE" in " ".join(capsys.readouterr().err.split())
 
