@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from me2e_compress.passes import PASSES, Context, Pass, PassResult
     from me2e_compress.study import StudyResult, load_study, run_study
     from me2e_compress.study.write import write_study
+    from me2e_compress.workflows.build import BuildOptions, EngineResult, build
     from me2e_compress.workflows.calibrate import (
         CalibrateOptions,
         CalibrateResult,
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PASSES",
+    "BuildOptions",
     "CalibrateOptions",
     "CalibrateResult",
     "CalibrationSet",
@@ -60,6 +62,7 @@ __all__ = [
     "CompressOptions",
     "CompressResult",
     "Context",
+    "EngineResult",
     "EvaluateOptions",
     "EvaluateResult",
     "FramesOptions",
@@ -86,6 +89,7 @@ __all__ = [
     "StudyResult",
     "Verification",
     "__version__",
+    "build",
     "calibrate",
     "compare",
     "compress",
@@ -127,6 +131,7 @@ _ROOMS = {
     "passes": ("PASSES", "Context", "Pass", "PassResult"),
     "study": ("StudyResult", "load_study", "run_study"),
     "study.write": ("write_study",),
+    "workflows.build": ("BuildOptions", "EngineResult", "build"),
     "workflows.calibrate": ("CalibrateOptions", "CalibrateResult", "calibrate"),
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),

@@ -114,6 +114,11 @@ _ENTRIES = (
     ),
     CommandEntry(
         COMPRESS,
+        "build",
+        "Build a TensorRT engine of a graph, for the GPU of this machine.",
+    ),
+    CommandEntry(
+        COMPRESS,
         "sensitivity",
         "Measure what int8 costs per module and node, and write a recipe within a"
         " limit.",

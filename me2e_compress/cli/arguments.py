@@ -42,7 +42,7 @@ Provider = Annotated[
 ]
 Plugins = Annotated[
     list[Path] | None,
-    typer.Option(help="a library of onnxruntime operators; once for each"),
+    typer.Option(help="a library of operators or plugins; once for each"),
 ]
 Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; 0 takes all")]
 Workers = Annotated[int, typer.Option(min=1, help="processes: as many at a time")]

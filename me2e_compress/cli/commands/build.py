@@ -1,0 +1,39 @@
+"""``me2e-compress build``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from me2e_compress.cli import arguments as given
+from me2e_compress.cli.console import listening, show
+from me2e_compress.targets.tensorrt.engine import EngineSettings, Precision
+from me2e_compress.workflows import build as workflow
+
+Output = Annotated[Path, typer.Option("-o", "--output", help="the engine")]
+Types = Annotated[
+    Precision, typer.Option("--precision", help="graph: its own types; fp16: float too")
+]
+TacticSource = Annotated[
+    list[str] | None,
+    typer.Option(help="take kernels from CUBLAS, ... alone; once for each"),
+]
+
+
+def build(
+    model: given.Model,
+    output: Output,
+    precision: Types = "graph",
+    tactic_source: TacticSource = None,
+    plugins: given.Plugins = None,
+    force: given.Force = False,
+    as_json: given.Json = False,
+) -> None:
+    """Build a TensorRT engine of a graph, for the GPU of this machine."""
+    settings = EngineSettings(
+        precision, tuple(tactic_source or ()), tuple(plugins or ())
+    )
+    with listening() as listener:
+        options = workflow.BuildOptions(settings, force)
+        found = workflow.build(model, output, options, listener)
+    show(found, as_json)

@@ -1,0 +1,166 @@
+"""Build an engine of a graph by TensorRT itself, where it is installed."""
+
+import dataclasses
+import importlib
+import importlib.util
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import MissingPackageError, PreconditionError
+from me2e_compress.targets.quantized import PAIR
+
+Precision = Literal["graph", "fp16"]
+
+
+@dataclasses.dataclass(frozen=True)
+class EngineSettings:
+    """How an engine is built.
+
+    Attributes:
+        precision: ``graph``: in the types of the graph, int8 pairs as int8; ``fp16``:
+            what is float32 may run in float16 too. TensorRT 11 knows ``graph`` alone.
+        tactic_sources: libraries that kernels are taken from, these and no others, as
+            ``CUBLAS`` of TensorRT 10; none leaves the choice to TensorRT.
+        plugins: libraries of TensorRT plugins that the graph needs.
+    """
+
+    precision: Precision = "graph"
+    tactic_sources: tuple[str, ...] = ()
+    plugins: tuple[Path, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Engine:
+    """What TensorRT built.
+
+    Attributes:
+        content: the engine; it fits this GPU and this version.
+        version: of TensorRT.
+        layers: of the network that was parsed.
+        seconds: that it took.
+    """
+
+    content: bytes
+    version: str
+    layers: int
+    seconds: float
+
+
+def build_engine(path: Path, settings: EngineSettings) -> Engine:
+    """Parse a file and build an engine of it for the GPU of this machine.
+
+    Args:
+        path: the ONNX file, its weights beside it.
+        settings: how it is built.
+
+    Raises:
+        MissingPackageError: TensorRT is not installed.
+        PreconditionError: it lacks an option, or refuses the graph: the message names
+            the node.
+    """
+    trt, begun = _tensorrt(), time.perf_counter()
+    log = _log(trt)
+    _load_plugins(trt, log, settings.plugins)
+    builder = trt.Builder(log)
+    network = builder.create_network(0)
+    parser = trt.OnnxParser(network, log)
+    if not parser.parse_from_file(str(path)):
+        raise PreconditionError(f"{path}: {_refusal(trt, parser)}")
+    config = builder.create_builder_config()
+    _set_types(trt, config, graph.load(path), settings.precision)
+    if settings.tactic_sources:
+        config.set_tactic_sources(_sources(trt, settings.tactic_sources))
+    built = builder.build_serialized_network(network, config)
+    if built is None:
+        reason = log.lines[-1] if log.lines else "it does not say why"
+        raise PreconditionError(f"{path}: TensorRT {trt.__version__}: {reason}")
+    seconds = time.perf_counter() - begun
+    return Engine(bytes(built), trt.__version__, network.num_layers, seconds)
+
+
+def _tensorrt() -> Any:
+    """Import TensorRT, which has no types."""
+    if importlib.util.find_spec("tensorrt") is None:
+        raise MissingPackageError("tensorrt")
+    try:
+        return importlib.import_module("tensorrt")
+    except ImportError as error:  # its libraries are a package of their own
+        raise PreconditionError(f"tensorrt cannot be imported: {error}") from error
+
+
+def _log(trt: Any) -> Any:
+    """Return a logger that keeps errors and says nothing."""
+
+    class Log(trt.ILogger):  # type: ignore[misc]
+        def __init__(self) -> None:
+            trt.ILogger.__init__(self)
+            self.lines: list[str] = []
+
+        def log(self, severity: Any, message: str) -> None:
+            if severity <= trt.ILogger.Severity.ERROR:
+                self.lines.append(" ".join(message.split()))
+
+    return Log()
+
+
+def _load_plugins(trt: Any, log: Any, libraries: Sequence[Path]) -> None:
+    """Register TensorRT's own plugins, then those of the user."""
+    trt.init_libnvinfer_plugins(log, "")
+    for library in libraries:
+        if not library.is_file():
+            raise PreconditionError(f"plugins library {library}: no such file")
+        if trt.get_plugin_registry().load_library(str(library)) is None:
+            raise PreconditionError(f"plugins library {library}: TensorRT refuses it")
+
+
+def _refusal(trt: Any, parser: Any) -> str:
+    count = parser.num_errors
+    if not count:
+        return f"TensorRT {trt.__version__} refuses it and does not say why"
+    first = parser.get_error(0)
+    more = f", and {count - 1} more" if count > 1 else ""
+    where = f"{first.node_operator()} {first.node_name()!r}"
+    text = " ".join(str(first.desc()).split())
+    return f"TensorRT {trt.__version__} refuses {where}: {text}{more}"
+
+
+def _set_types(trt: Any, config: Any, model: ir.Model, precision: Precision) -> None:
+    """Allow the types that TensorRT 10 may choose; 11 takes those of the graph.
+
+    Raises:
+        PreconditionError: float16 of TensorRT 11 for a float32 graph.
+    """
+    flags = trt.BuilderFlag
+    if not hasattr(flags, "FP16"):
+        if precision == "fp16":
+            raise PreconditionError(
+                f"TensorRT {trt.__version__} takes the types of the graph: run"
+                " convert-float16 on it instead of --precision fp16"
+            )
+        return
+    if any(node.op_type in PAIR for node in graph.nodes_of(model)):
+        config.set_flag(flags.INT8)
+    weights = model.graph.initializers.values()
+    halves = any(value.dtype == ir.DataType.FLOAT16 for value in weights)
+    if precision == "fp16" or halves:
+        config.set_flag(flags.FP16)
+
+
+def _sources(trt: Any, names: Sequence[str]) -> int:
+    """Return the bits of some tactic sources.
+
+    Raises:
+        PreconditionError: this TensorRT has no such source; the message lists its own.
+    """
+    known = getattr(getattr(trt, "TacticSource", None), "__members__", {})
+    if missing := [name for name in names if name.upper() not in known]:
+        raise PreconditionError(
+            f"TensorRT {trt.__version__} has no tactic source {missing[0]}; it has"
+            f" {', '.join(known) or 'none'}"
+        )
+    return sum(1 << int(known[name.upper()]) for name in dict.fromkeys(names))

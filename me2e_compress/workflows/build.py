@@ -1,0 +1,101 @@
+"""A TensorRT engine of a graph, where TensorRT is."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.errors import GraphError
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.targets.tensorrt.engine import Engine, EngineSettings, build_engine
+from me2e_compress.workflows.checks import model_path, output_path
+from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.result import Result, Table, megabytes
+
+
+@dataclasses.dataclass(frozen=True)
+class BuildOptions:
+    """How an engine is built.
+
+    Attributes:
+        settings: of TensorRT.
+        force: replace outputs that are not as we left them, too.
+    """
+
+    settings: EngineSettings = dataclasses.field(default_factory=EngineSettings)
+    force: bool = False
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class EngineResult(Result):
+    """An engine that was written.
+
+    Attributes:
+        model: the graph.
+        output: the engine.
+        engine: what TensorRT built.
+    """
+
+    model: Path
+    output: Path
+    engine: Engine
+
+    @property
+    def headline(self) -> str:
+        """File, size, version, layers, time."""
+        found = self.engine
+        return (
+            f"{self.output}: {megabytes(len(found.content))} MB, TensorRT"
+            f" {found.version}, {found.layers} layers parsed, {found.seconds:.0f} s;"
+            " it fits this GPU and this version"
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return none: the line says it."""
+        return ()
+
+    def records(self) -> list[dict[str, object]]:
+        """Return one row."""
+        return [{"model": self.model, "output": self.output, **self.to_json()}]
+
+    def to_json(self) -> dict[str, object]:
+        """Return what is known of the engine but its bytes."""
+        return {
+            "engine_bytes": len(self.engine.content),
+            "tensorrt": self.engine.version,
+            "layers": self.engine.layers,
+            "seconds": self.engine.seconds,
+        }
+
+
+def build(
+    model: str | Path,
+    output: str | Path,
+    options: BuildOptions | None = None,
+    listener: Listener = SILENT,
+) -> EngineResult:
+    """Build a TensorRT engine of a graph for the GPU of this machine.
+
+    Args:
+        model: the ONNX file, or the name of one that ships.
+        output: the engine.
+        options: None takes the defaults.
+        listener: is called with progress.
+
+    Raises:
+        GraphError: no such model, or the output would harm an input.
+        MissingPackageError: TensorRT is not installed.
+        PreconditionError: TensorRT lacks an option, or refuses the graph.
+    """
+    options = options or BuildOptions()
+    source, output = model_path(model), output_path(output)
+    with writing([output], (source,), force=options.force):
+        listener.on_progress("build", 0, 1, source.name)
+        engine = build_engine(source, options.settings)
+        try:
+            write_bytes(output, engine.content)
+        except OSError as error:
+            raise GraphError(
+                f"{output}: cannot be written: {error.strerror}"
+            ) from error
+        listener.on_progress("build", 1, 1, source.name)
+    return EngineResult(source, output, engine)
