@@ -223,3 +223,21 @@ def test_new_nodes_know_their_module_and_every_origin() -> None:
         assert past.passes == ("hoist-linear",)
         assert {"product", "bias"} <= set(past.origins)
         assert (node.op_type == "Tile") == ("many" in past.origins)
+
+
+def test_a_decomposed_layer_norm_of_repeated_rows_is_computed_once() -> None:
+    model = hoist(
+        graph_of(
+            f"(float[1,{QUERIES},{WIDE}] x) => (float[{CAMERAS},{QUERIES},16] y)",
+            "many = Expand(x, cameras)  mean = ReduceMean<axes = [-1]>(many)"
+            " centred = Sub(many, mean)  square = Pow(centred, two)"
+            " variance = ReduceMean<axes = [2]>(square)  safe = Add(variance, tiny)"
+            " deviation = Sqrt(safe)  normal = Div(centred, deviation)"
+            " scaled = Mul(normal, gamma)  y = MatMul(scaled, w)",
+        ),
+        cameras=integers(CAMERAS, QUERIES, WIDE), two=normal(1)[0] * 0 + 2,
+        tiny=normal(1)[0] * 0 + 1e-5, gamma=normal(WIDE), w=normal(WIDE, 16),
+    )  # fmt: skip
+    assert products(model) == QUERIES * WIDE * 16
+    assert ops(model)[-1] == "Expand"
+    assert ops(model).count("Expand") == 1

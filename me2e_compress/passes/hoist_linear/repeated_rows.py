@@ -6,15 +6,16 @@ Result:  x -> Add(bias) -> LayerNormalization -> Relu -> Expand
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import is_standard, rank_of, static_shape
+from me2e_compress.graph import array_of, is_standard, rank_of, static_shape
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.row_moves import broadcasts, moved_rows
-from me2e_compress.passes.work import MOVED_BYTES_PER_NODE, work
-from me2e_compress.rewrite import is_read, sole_reader
+from me2e_compress.passes.work import MOVED_BYTES_PER_NODE
+from me2e_compress.rewrite import is_read, maker, sole_reader
 
 UNARY = frozenset(
     {
@@ -27,6 +28,11 @@ UNARY = frozenset(
 
 BINARY = frozenset({"Add", "Div", "Max", "Min", "Mul", "Pow", "Sub"})
 """Operators that map pairs of elements, and repeat what is smaller."""
+
+REDUCTIONS = frozenset(
+    {"ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum"}
+)
+"""Operators that make one number of every row where their axis is the last."""
 
 ALONG_AXIS = frozenset({"LayerNormalization", "LogSoftmax", "Softmax"})
 """Operators that map every row by itself where their axis is the last."""
@@ -56,20 +62,37 @@ class Repetition:
         return len(self.nodes) == 1 and all(map(broadcasts, self.nodes))
 
 
+@dataclasses.dataclass(frozen=True)
+class Move:
+    """A node in front of a repetition.
+
+    Attributes:
+        inputs: what it reads there.
+        shape: what it gives there.
+        found: the repetition that comes behind it.
+    """
+
+    inputs: tuple[ir.Value | None, ...]
+    shape: tuple[int, ...]
+    found: Repetition
+
+
 def do_before_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool:
     """Move a node in front of the repetition of its rows; False if it does not pay."""
     if not _is_row_wise(node, opset):
         return False
     shape = static_shape(node.outputs[0])
     for index, value in enumerate(node.inputs[:2]):
-        if value is None or shape is None or static_shape(value) != shape:
+        given = static_shape(value)
+        if value is None or not shape or not given or given[:-1] != shape[:-1]:
+            continue
+        if given[-1] != shape[-1] and node.op_type not in REDUCTIONS:
             continue
         found = _repetition(value)
-        inner = None if found is None else _inner_shape(node, index, found)
-        if found is None or inner is None or not _pays(node, found, inner):
-            continue
-        _rewrite(node, index, found, inner, rewriter)
-        return True
+        move = None if found is None else _move(node, index, found)
+        if move is not None and _pays(node, move):
+            _rewrite(node, move, rewriter)
+            return True
     return False
 
 
@@ -80,15 +103,28 @@ def _is_row_wise(node: ir.Node, opset: int) -> bool:
         return False
     if node.op_type in UNARY or node.op_type in BINARY:
         return True
+    rank = rank_of(node.outputs[0]) or 0
+    if node.op_type in REDUCTIONS:
+        return bool(node.attributes.get_int("keepdims", 1)) and _axes(node) in (
+            [-1],
+            [rank - 1],
+        )
     if node.op_type not in ALONG_AXIS:
         return False
     softmax = node.op_type != "LayerNormalization"
     if not softmax and rank_of(node.inputs[1]) != 1:
         return False
     default = 1 if softmax and opset < SOFTMAX_OPSET else -1
-    rank = len(static_shape(node.outputs[0]) or ())
-    axis = node.attributes.get_int("axis", default)
-    return axis in (-1, rank - 1)
+    return node.attributes.get_int("axis", default) in (-1, rank - 1)
+
+
+def _axes(node: ir.Node) -> list[int]:
+    """Return the axes of a reduction, an attribute before opset 18."""
+    given = node.attributes.get("axes")
+    if given is not None:
+        return [int(axis) for axis in given.as_ints()]
+    array = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
+    return [] if array is None else [int(axis) for axis in array.reshape(-1)]
 
 
 def _repetition(value: ir.Value) -> Repetition | None:
@@ -110,63 +146,81 @@ def _repetition(value: ir.Value) -> Repetition | None:
     return best
 
 
-def _inner_shape(
-    node: ir.Node, index: int, found: Repetition
-) -> tuple[int, ...] | None:
-    """Return the shape of what a node gives in front of a repetition; None if never.
+def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
+    """Say what a node does in front of a repetition; None if it cannot be there.
 
-    The other operand is one row, or what is repeated is repeated along axes that the
-    other operand does not have.
+    Its other operand is one row, or is repeated along the same axes, or has none of
+    the axes that are repeated.
     """
     small = static_shape(found.source)
-    if small is None or node.op_type not in BINARY:
-        return small
-    if len(node.inputs) != 2:
+    if not small:
         return None
-    other = static_shape(node.inputs[1 - index])
-    whole = static_shape(node.outputs[0]) or ()
+    inputs = list(node.inputs)
+    inputs[index] = found.source
+    if node.op_type not in BINARY:
+        ends = (static_shape(node.outputs[0]) or ())[-1:]
+        return Move(tuple(inputs), (*small[:-1], *ends), found)
+    other = static_shape(node.inputs[1 - index]) if len(inputs) == 2 else None
     if other is None:
         return None
     if math.prod(other[:-1]) == 1 and len(other) <= len(small):
-        return small
+        return Move(tuple(inputs), small, found)
     if not found.broadcasts:
         return None
+    again = maker(node.inputs[1 - index], "Expand", "Tile")
+    if again is not None and broadcasts(again):
+        inputs[1 - index] = again.inputs[0]
+        other = static_shape(again.inputs[0]) or ()
     inner = np.broadcast_shapes(small, other)
-    return inner if math.prod(inner) < math.prod(whole) else None
+    whole = static_shape(node.outputs[0]) or ()
+    if math.prod(inner) >= math.prod(whole):
+        return None
+    return Move(tuple(inputs), inner, found)
 
 
-def _pays(node: ir.Node, found: Repetition, inner: tuple[int, ...]) -> bool:
+def _pays(node: ir.Node, move: Move) -> bool:
     """Return whether a node's smaller work is worth the repetition of what it gives."""
-    dtype = node.outputs[0].dtype
-    item = 4.0 if dtype is None else dtype.itemsize
-    whole = math.prod(static_shape(node.outputs[0]) or ())
-    saved = 2 * (whole - math.prod(inner)) * item / MOVED_BYTES_PER_NODE
+    whole = static_shape(node.outputs[0]) or ()
+    saved = _traffic(node.inputs) - _traffic(move.inputs)
+    item = 4.0 if node.outputs[0].dtype is None else node.outputs[0].dtype.itemsize
+    saved += (math.prod(whole) - math.prod(move.shape)) * item
     owned, added = True, 0.0
-    for moving in found.nodes:
+    for moving in move.found.nodes:
         owned = owned and sole_reader(moving.outputs[0]) is not None
-        added += 0.0 if owned else work(moving)
-    return saved >= added + 1.0
+        if not owned:  # it stays for others, and is there twice
+            moved = _rows(moving.inputs[0]) + _rows(moving.outputs[0])
+            added += 1.0 + moved * move.shape[-1] * item / MOVED_BYTES_PER_NODE
+    return saved / MOVED_BYTES_PER_NODE > added
 
 
-def _rewrite(
-    node: ir.Node,
-    index: int,
-    found: Repetition,
-    inner: tuple[int, ...],
-    rewriter: Rewriter,
-) -> None:
-    inputs = [found.source if at == index else v for at, v in enumerate(node.inputs)]
-    old = node.outputs[0]
+def _rows(value: ir.Value | None) -> int:
+    return math.prod((static_shape(value) or ())[:-1])
+
+
+def _traffic(values: Sequence[ir.Value | None]) -> float:
+    total = 0.0
+    for value in values:
+        if value is not None and value.dtype is not None:
+            total += math.prod(static_shape(value) or ()) * value.dtype.itemsize
+    return total
+
+
+def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
+    old, found = node.outputs[0], move.found
     attributes = list(node.attributes.values())
     new = rewriter.write(
-        node.op_type, inputs, attributes, inner, sources=(node,), like=old
+        node.op_type, move.inputs, attributes, move.shape, sources=(node,), like=old
     )
-    for moving in reversed(found.nodes):
-        kind, given, attributes, shape = rewriter.move(moving, [new])
-        sources = (node, moving)
-        if found.broadcasts:
-            shape = static_shape(old) or ()
-            kind, attributes = "Expand", []
-            given = [new, rewriter.target(shape, f"{old.name}_shape")]
-        new = rewriter.write(kind, given, attributes, shape, sources=sources, like=old)
+    if found.broadcasts:
+        shape = static_shape(old) or ()
+        target = rewriter.target(shape, f"{old.name}_shape")
+        sources = (node, *found.nodes)
+        new = rewriter.write(
+            "Expand", [new, target], [], shape, sources=sources, like=old
+        )
+    for moving in () if found.broadcasts else reversed(found.nodes):
+        kind, inputs, attributes, shape = rewriter.move(moving, [new])
+        new = rewriter.write(
+            kind, inputs, attributes, shape, sources=(node, moving), like=old
+        )
     rewriter.swap(old, new)
