@@ -25,7 +25,13 @@ class Sizes:
 
 
 def decomposed(
-    s: Sizes, *, opset: int = 17, mode: str = "bilinear", split: bool = False
+    s: Sizes,
+    *,
+    opset: int = 17,
+    mode: str = "bilinear",
+    split: bool = False,
+    merge: str = "",
+    masked: bool = False,
 ) -> ir.Model:
     """mmcv's ``multi_scale_deformable_attn_pytorch`` as torch exports it.
 
@@ -34,6 +40,8 @@ def decomposed(
         opset: of ONNX.
         mode: what GridSample calls its interpolation.
         split: levels by Split and Squeeze, as dynamo writes them, not Slice and Gather.
+        merge: ReduceSum or ReduceMean over the images behind it.
+        masked: that of the images, times a mask.
     """
     shapes: dict[str, list[int]] = {"two": [], "one": []}
     lines = ["a = Mul(locations, two)", "grids = Sub(a, one)"]
@@ -78,13 +86,21 @@ def decomposed(
         "product = Mul(samples, w)",
         "total = ReduceSum<keepdims = 0>(product, last)",
         "heads = Reshape(total, joined)",
-        "y = Transpose<perm = [0, 2, 1]>(heads)",
+        f"{'per_image' if merge else 'y'} = Transpose<perm = [0, 2, 1]>(heads)",
     ]
+    if masked:
+        lines.append("seen = Mul(per_image, mask)")
+    if merge == "ReduceSum":
+        shapes["first"] = [0]
+        lines.append(f"y = ReduceSum({'seen' if masked else 'per_image'}, first)")
+    elif merge:
+        lines.append(f"y = {merge}<axes = [0]>({'seen' if masked else 'per_image'})")
+    port = f", float[{s.n},{s.q},1] mask" if masked else ""
     text = f"""<ir_version: 9, opset_import: ["" : {opset}]>
     g (float[{s.n},{s.pixels},{s.m},{s.d}] value,
        float[{s.n},{s.q},{s.m},{count},{s.p},2] locations,
-       float[{s.n},{s.q},{s.m},{count},{s.p}] weights)
-       => (float[{s.n},{s.q},{s.m * s.d}] y) {{
+       float[{s.n},{s.q},{s.m},{count},{s.p}] weights{port})
+       => (float[{1 if merge else s.n},{s.q},{s.m * s.d}] y) {{
     """ + "\n".join(lines) + "}"  # fmt: skip
     constants = {
         name: np.array(sizes, np.int64) for name, sizes in shapes.items() if sizes

@@ -1,3 +1,4 @@
+import math
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,11 @@ def fused(model: ir.Model) -> PassResult:
     return result
 
 
+def inferred(model: ir.Model) -> ir.Model:
+    infer_shapes(model)
+    return model
+
+
 def attention(model: ir.Model) -> ir.Node:
     (node,) = (node for node in model.graph if node.domain == "me2e")
     assert node.op_type == FUSED
@@ -64,7 +70,7 @@ def test_what_exporters_write_is_one_node(form: str, model: ir.Model) -> None:
     assert [value.name for value in attention(model).inputs if value is not None][
         ::3
     ] == ["value", "locations"]
-    assert "within" in result.notes[0]
+    assert "apart at most" in result.notes[0]
 
 
 def test_it_stands_for_all_that_it_was() -> None:
@@ -91,9 +97,78 @@ def test_it_stands_for_all_that_it_was() -> None:
         ).map(tuple),
     ),
     st.booleans(),
+    st.sampled_from(["", "ReduceSum", "ReduceMean"]),
 )
-def test_any_sizes(sizes: Sizes, split: bool) -> None:
-    fused(decomposed(sizes, split=split))
+def test_any_sizes(sizes: Sizes, split: bool, merge: str) -> None:
+    fused(decomposed(sizes, split=split, merge=merge, masked=bool(merge) and split))
+
+
+@pytest.mark.parametrize("merge", ["ReduceSum", "ReduceMean"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_images_that_are_added_up_are_levels(merge: str, masked: bool) -> None:
+    sizes = Sizes(n=3)
+    model = decomposed(sizes, merge=merge, masked=masked)
+    fused(model)
+    assert merge not in ops(model)
+    shapes = [value.shape for value in attention(model).inputs if value is not None]
+    levels = sizes.n * len(sizes.levels)
+    assert shapes[0] == (1, sizes.n * sizes.pixels, sizes.m, sizes.d)
+    assert shapes[1] == (levels, 2)
+    assert shapes[3] == (1, sizes.q, sizes.m, levels, sizes.p, 2)
+
+
+def test_images_are_kept_apart_if_asked() -> None:
+    model = decomposed(Sizes(n=3), merge="ReduceSum")
+    result = FuseOperators(merge_images=False).run(inferred(model), NO_MODULES)
+    assert result.changes == 1
+    assert "ReduceSum" in ops(model)
+
+
+SUM_OF_HEADS = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[6,4,5,7] image, float[6,9,3,2] grid, float[3] weights)
+  => (float[2,4,9] y) <int64[1] last = {-1}, int64[4] apart = {2, 3, 4, 9},
+     int64[1] second = {1}> {
+    s = GridSample(image, grid)
+    m = Mul(s, weights)
+    r = ReduceSum<keepdims = 0>(m, last)
+    h = Reshape(r, apart)
+    y = ReduceSum<keepdims = 0>(h, second)
+}"""
+
+
+def test_a_sum_over_some_of_the_batch() -> None:
+    model = read(SUM_OF_HEADS)
+    fused(model)
+    assert "ReduceSum" not in ops(model)
+
+
+POINTS = """<ir_version: 9, opset_import: ["" : 17]>
+g (float[2,35,4] value, float[2,9,1,2] at, float[1,9,3,2] offsets, float[2,9,3] weights,
+   float[2,9,1] mask) => (float[9,4] y) <float two = {2.0}, float one = {1.0},
+     int64[4] map = {2, 4, 5, 7}, int64[4] alone = {2, 1, 9, 3}, int64[1] last = {-1},
+     int64[1] first = {0}> {
+    t = Transpose<perm = [0, 2, 1]>(value)
+    image = Reshape(t, map)
+    places = Add(at, offsets)
+    a = Mul(places, two)
+    grid = Sub(a, one)
+    s = GridSample(image, grid)
+    w = Reshape(weights, alone)
+    m = Mul(s, w)
+    r = ReduceSum<keepdims = 0>(m, last)
+    e = Transpose<perm = [0, 2, 1]>(r)
+    seen = Mul(e, mask)
+    y = ReduceSum<keepdims = 0>(seen, first)
+}"""
+
+
+def test_reference_points_are_moved_before_they_are_repeated() -> None:
+    model = read(POINTS)
+    fused(model)
+    moved = [node for node in model.graph if node.op_type == "Transpose"]
+    sizes = [math.prod(static_shape(node.outputs[0]) or ()) for node in moved]
+    # at, weights, mask; the sum of at and offsets has 108
+    assert sorted(sizes) == [2 * 9, 2 * 9 * 2, 2 * 9 * 3]
 
 
 SAMPLED = 'GridSample<mode = "bilinear", padding_mode = "zeros">'
@@ -242,8 +317,7 @@ def test_what_the_body_does_not_agree_with_stays(
         return call.add("Mul", [result, call.numbers(1.01, result)])
 
     monkeypatch.setattr(DeformableAttention, "body", wrong)
-    model = decomposed(Sizes())
-    infer_shapes(model)
+    model = inferred(decomposed(Sizes()))
     before = digest(model)
     result = FuseOperators().run(model, NO_MODULES)
     assert result.changes == 0
@@ -273,9 +347,7 @@ def test_pieces_that_are_alike_are_proven_once(monkeypatch: pytest.MonkeyPatch) 
         return run(piece, given)
 
     monkeypatch.setattr(numeric_check, "run_piece", counted)
-    model = read(TWICE)
-    infer_shapes(model)
-    assert FuseOperators().run(model, NO_MODULES).changes == 2
+    assert FuseOperators().run(inferred(read(TWICE)), NO_MODULES).changes == 2
     assert len(runs) == 2
 
 

@@ -1,5 +1,6 @@
 """Put fused operators in the place of what exporters decompose them into."""
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar
@@ -54,11 +55,15 @@ class FuseOperators(Pass):
         tolerance: how far both may differ, as a part of the largest result (1e-4: what
             sums of float32 in another order, and positions rounded on the way to -1..1
             and back, cost).
+        merge_images: take in the sum, or mean, over cameras or frames that follows, and
+            the mask before it: each image is one more level then, and what is computed
+            for each image alone is never stored (BEVFormer's and VAD's encoders).
     """
 
     name: ClassVar[str] = "fuse-operators"
     exact: ClassVar[bool] = True
     tolerance: float = 1e-4
+    merge_images: bool = True
 
     def __post_init__(self) -> None:
         """Check the tolerance."""
@@ -97,7 +102,7 @@ class _Run:
         """Return sentences for the report."""
         fused = (
             f"fused: {self.done} deformable attentions of {self.samplers} GridSample,"
-            f" within {self.worst:.0e} of what they were"
+            f" {self.worst:.1g} apart at most"
         )
         return (*([fused] if self.done else ()), *self.left)
 
@@ -105,12 +110,19 @@ class _Run:
         """Fuse what a GridSample is a part of, or note why not."""
         try:
             found = decomposed.find(node)
-            self._replace(body, fused_form.plan(found))
+            self._replace(body, self._plan(found))
         except (PreconditionError, GraphError) as error:
             self.left.append(f"left {node.name}: {error}")
             return
         self.done += 1
         self.samplers += len(found.levels)
+
+    def _plan(self, found: decomposed.Decomposed) -> fused_form.Plan:
+        """Plan with the sum over images that follows, if that can be taken in."""
+        if self.current.merge_images:
+            with contextlib.suppress(PreconditionError):
+                return fused_form.plan(decomposed.with_images(found))
+        return fused_form.plan(found)
 
     def _replace(self, body: ir.Graph, plan: fused_form.Plan) -> None:
         old = plan.result.value
@@ -153,9 +165,14 @@ class _Run:
         node = next(
             each for each in nodes_between(new, views) if each.domain == OWN_DOMAIN
         )
-        for index, source in ((0, plan.value), (3, plan.locations), (4, plan.weights)):
+        mask = () if plan.mask is None else (plan.mask,)
+        for index, read in (
+            (0, plan.value.views),
+            (3, plan.locations.views),
+            (4, (*plan.weights.views, *mask)),
+        ):
             value = node.inputs[index]
-            constant = all(array_of(view.value) is not None for view in source)
+            constant = all(array_of(view.value) is not None for view in read)
             if value is None or value.producer() is None or not constant:
                 continue
             array = run_piece(piece_of(value, (), self.opset), ())

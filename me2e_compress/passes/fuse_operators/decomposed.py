@@ -16,11 +16,15 @@ from me2e_compress.graph.nodes import producer_of, sole_reader
 from me2e_compress.passes.fuse_operators.digits import (
     Digit,
     Digits,
-    Layout,
     flat,
     whole,
 )
-from me2e_compress.passes.fuse_operators.views import LAYOUT_OPERATORS, View, results
+from me2e_compress.passes.fuse_operators.views import (
+    LAYOUT_OPERATORS,
+    View,
+    aligned,
+    results,
+)
 
 BATCH, CHANNEL, LEVEL, PIXEL, XY = "batch", "channel", "level", "pixel", "xy"
 ROW, COLUMN = "row", "column"
@@ -66,6 +70,10 @@ class Decomposed:
         points: the digits of what is summed over, the level apart.
         batch: images times heads.
         channels: of one head.
+        mask: what the results of each image are multiplied by before they are added up;
+            None if by nothing.
+        images: the digits of the batch that are added up then, cameras or frames.
+        scale: what that sum is multiplied by: a mean divides.
     """
 
     levels: tuple[Level, ...]
@@ -75,6 +83,9 @@ class Decomposed:
     points: Digits
     batch: int
     channels: int
+    mask: View | None = None
+    images: Digits = ()
+    scale: float = 1.0
 
 
 def find(node: ir.Node) -> Decomposed:
@@ -85,7 +96,7 @@ def find(node: ir.Node) -> Decomposed:
     """
     levels, samples = _levels(node)
     product, weights = _weighted(samples)
-    total = _summed(list(results(product))[-1])
+    total, _ = _total(list(results(product))[-1], ("ReduceSum",))
     left, before = flat(total.layout), flat(product.layout)
     gone = _difference(before, left)
     if any(digit.axis in (BATCH, CHANNEL) for digit in gone):
@@ -100,6 +111,35 @@ def find(node: ir.Node) -> Decomposed:
         points=tuple(each for each in gone if each.axis in (ROW, COLUMN)),
         batch=(static_shape(levels[0].image.value) or (0,))[0],
         channels=(static_shape(levels[0].image.value) or (0, 0))[1],
+    )
+
+
+def with_images(found: Decomposed) -> Decomposed:
+    """Take in the sum, or mean, over images that follows, masked or not; if one does.
+
+    A sum over images of sums over points is a sum over both: each image is one more
+    level. BEVFormer (Li et al., 2022) adds up the cameras that see a pillar and takes
+    the mean over this frame and the last.
+    """
+    end, mask = found.results[-1], None
+    node = sole_reader(end.value)
+    try:
+        if node is not None and node.op_type == "Mul":
+            product, mask = _weighted(end)
+            end = list(results(product))[-1]
+        total, mean = _total(end, ("ReduceSum", "ReduceMean"))
+    except PreconditionError:
+        return found
+    gone = _difference(flat(end.layout), flat(total.layout))
+    if not gone or any(digit.axis != BATCH for digit in gone):
+        return found
+    count = math.prod(digit.size for digit in gone)
+    return dataclasses.replace(
+        found,
+        results=tuple(results(total)),
+        mask=mask,
+        images=gone,
+        scale=1 / count if mean else 1.0,
     )
 
 
@@ -188,21 +228,17 @@ def _weighted(samples: View) -> tuple[View, View]:
     shape, full = static_shape(other), static_shape(samples.value)
     if other is None or shape is None or static_shape(node.outputs[0]) != full:
         raise PreconditionError("what it samples is not multiplied by weights")
-    aligned = (1,) * (len(samples.layout) - len(shape)) + shape
-    layout: Layout = tuple(
-        digits if size > 1 else ()
-        for digits, size in zip(samples.layout, aligned, strict=True)
-    )
+    layout = aligned(samples.layout, shape)
     if any(digit.axis == CHANNEL for digit in flat(layout)):
         raise PreconditionError("the weights differ from channel to channel")
     product = dataclasses.replace(samples, value=node.outputs[0])
-    return product, View(other, layout[len(layout) - len(shape) :])
+    return product, View(other, layout)
 
 
-def _summed(product: View) -> View:
-    """Return the sum of the product over its points."""
+def _total(product: View, kinds: tuple[str, ...]) -> tuple[View, bool]:
+    """Return the sum over some axes, and whether it is a mean."""
     node = sole_reader(product.value)
-    if node is None or node.op_type != "ReduceSum" or not is_standard(node):
+    if node is None or node.op_type not in kinds or not is_standard(node):
         raise PreconditionError("the weighted samples are not summed")
     written = node.attributes.get_ints("axes")
     given = array_of(input_at(node, 1))
@@ -216,4 +252,4 @@ def _summed(product: View) -> View:
         for axis, digits in enumerate(product.layout)
         if keep or axis not in over
     )
-    return View(node.outputs[0], layout)
+    return View(node.outputs[0], layout), node.op_type == "ReduceMean"

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.errors import PreconditionError
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.fuse_operators.decomposed import (
     BATCH,
@@ -20,23 +21,24 @@ from me2e_compress.passes.fuse_operators.digits import (
     Digit,
     Layout,
     flat,
-    merged,
-    runs,
     sizes,
     split_like,
     whole,
 )
-from me2e_compress.passes.fuse_operators.views import (
-    Selection,
-    View,
-    joined,
-    sources,
+from me2e_compress.passes.fuse_operators.laid_out import combined, laid_out
+from me2e_compress.passes.fuse_operators.operand_sources import (
+    Source,
+    cheapest,
+    cost_of,
+    join_levels,
+    join_pixels,
+    options_of,
+    sums_of,
+    whole_views,
 )
+from me2e_compress.passes.fuse_operators.views import View
 
 OP_TYPE = "MultiScaleDeformableAttention"
-
-Source = tuple[View, ...]
-"""Where an operand comes from: one view of all levels, or one of every level."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +51,9 @@ class Plan:
         value: where the feature maps come from.
         locations: where the positions come from.
         weights: where the weights come from.
+        mask: what they are multiplied by; None if by nothing.
         result: what is replaced.
+        cost: bytes that are written to lay operands out.
     """
 
     found: Decomposed
@@ -57,34 +61,58 @@ class Plan:
     value: Source
     locations: Source
     weights: Source
+    mask: View | None
     result: View
+    cost: float
 
     @property
     def inputs(self) -> tuple[View, ...]:
         """Every view that the fused node is fed from."""
-        return (*self.value, *self.locations, *self.weights)
+        mask = () if self.mask is None else (self.mask,)
+        sources = (self.value, self.locations, self.weights)
+        return (*(view for each in sources for view in each.views), *mask)
 
 
 def plan(found: Decomposed) -> Plan:
-    """Choose where to read and what to replace, so that the least data is moved."""
-    value = _options([level.image for level in found.levels], _pixels)
-    locations = _options([level.grid for level in found.levels], _levels)
-    weights = _options([found.weights], _levels)
-    views = [view for option in (*value, *locations, *weights) for view in option]
+    """Choose where to read and what to replace, so that the least data is moved.
+
+    Raises:
+        PreconditionError: images are added up, and levels do not lie behind each other.
+    """
+    value = options_of([level.image for level in found.levels], join_pixels)
+    plain = options_of([level.grid for level in found.levels], join_levels)
+    # of equals the last one is taken: sums are the last resort
+    locations = [*(each for option in plain for each in sums_of(option)), *plain]
+    if found.images:  # their levels lie image by image: there is nothing to join
+        value = [each for each in value if len(each.views) == 1]
+        locations = [each for each in locations if len(each.views) == 1 or each.total]
+        if not (value and locations):
+            raise PreconditionError("its levels are made apart")
+    weights = [Source((view,)) for view in whole_views(found.weights)]
+    masks = [] if found.mask is None else whole_views(found.mask)
+    known = [view for each in (*value, *locations, *weights) for view in each.views]
     plans = []
-    for heads in _head_counts(found, [*views, *found.results]):
+    for heads in _head_counts(found, [*known, *masks, *found.results]):
         form = _Form(found, heads)
-        chosen = (
-            _cheapest(value, form.value),
-            _cheapest(locations, form.locations),
-            _cheapest(weights, form.weights),
+        covered = flat(found.mask.layout) if found.mask is not None else ()
+        read = cheapest(value, form.value)
+        places = cheapest(locations, form.locations)
+        shares = cheapest(weights, form.weights, covered)
+        mask = min(
+            reversed(masks),
+            key=lambda view: cost_of(view, form.weights(None), part=True),
+            default=None,
         )
         # of the results, the one furthest behind takes the most with it
         last = min(reversed(found.results), key=lambda view: form.result_cost(view))
-        cost = sum(each[0] for each in chosen) + form.result_cost(last)
-        read = [option for _, option in chosen]
-        plans.append((cost, Plan(found, heads, read[0], read[1], read[2], last)))
-    return min(plans, key=lambda each: each[0])[1]
+        cost = read[0] + places[0] + shares[0] + form.result_cost(last)
+        plans.append(
+            Plan(found, heads, read[1], places[1], shares[1], mask, last, cost)
+        )
+    best = min(plans, key=lambda each: each.cost)
+    if best.cost == math.inf:
+        raise PreconditionError("its operands have no layout in common")
+    return best
 
 
 def write(chosen: Plan, call: FusedCall) -> ir.Value:
@@ -94,23 +122,35 @@ def write(chosen: Plan, call: FusedCall) -> ir.Value:
         chosen: how.
         call: where: in front of the node that makes what is replaced.
     """
-    form = _Form(chosen.found, chosen.heads)
-    shapes = np.array([level.size for level in chosen.found.levels], np.int64)
-    starts = np.cumsum([0, *(each.pixels for each in chosen.found.levels[:-1])])
+    found = chosen.found
+    form = _Form(found, chosen.heads)
+    images = math.prod(digit.size for digit in found.images)
+    shapes = np.array([level.size for level in found.levels] * images, np.int64)
+    areas = shapes.prod(axis=1)
     made = call.add(
         OP_TYPE,
         [
             _operand(call, chosen.value, form.value, 1),
             call.constant(shapes, "spatial_shapes"),
-            call.constant(starts.astype(np.int64), "level_start_index"),
+            call.constant(np.cumsum(areas) - areas, "level_start_index"),
             _operand(call, chosen.locations, form.locations, 3),
-            _operand(call, chosen.weights, form.weights, 3),
+            _weights(call, chosen, form),
         ],
         domain=OWN_DOMAIN,
     )
     made.dtype = ir.DataType.FLOAT
     made.shape = ir.Shape(sizes(form.result))
-    return _laid_out(call, View(made, form.result), chosen.result.layout)
+    return laid_out(call, View(made, form.result), chosen.result.layout)
+
+
+def _weights(call: FusedCall, chosen: Plan, form: "_Form") -> ir.Value:
+    """Write the weights, times the mask and the scale of what is added up behind."""
+    factors = [*chosen.weights.views, *([chosen.mask] if chosen.mask else [])]
+    value = combined(call, "Mul", factors, form.weights(None))
+    scale = chosen.found.scale
+    return (
+        value if scale == 1.0 else call.add("Mul", [value, call.numbers(scale, value)])
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,8 +163,9 @@ class _Form:
     def value(self, level: int | None) -> Layout:
         levels = self.found.levels
         total = sum(each.pixels for each in levels)
-        pixels = total if level is None else levels[level].pixels
-        return (*self._outer(whole(PIXEL, pixels)), whole(CHANNEL, self.found.channels))
+        pixels = whole(PIXEL, total if level is None else levels[level].pixels)
+        outer = self._outer((*self.found.images, *pixels))
+        return (*outer, whole(CHANNEL, self.found.channels))
 
     def locations(self, level: int | None) -> Layout:
         return (*self.weights(level), whole(XY, 2))
@@ -132,7 +173,8 @@ class _Form:
     def weights(self, level: int | None) -> Layout:
         levels = len(self.found.levels) if level is None else 1
         outer = self._outer(self.found.queries)
-        return (*outer, whole(LEVEL, levels), self.found.points)
+        both = (*self.found.images, *whole(LEVEL, levels))
+        return (*outer, both, self.found.points)
 
     @property
     def result(self) -> Layout:
@@ -140,142 +182,36 @@ class _Form:
         return (*outer, whole(CHANNEL, self.found.channels))
 
     def result_cost(self, view: View) -> float:
-        return _cost(View(view.value, self.result), view.layout)
+        return cost_of(View(view.value, self.result), view.layout)
 
     def _outer(self, middle: tuple[Digit, ...]) -> Layout:
         images = self.found.batch // self.heads
         batch = (Digit(BATCH, self.heads, images),) if images > 1 else ()
-        return (batch, middle, whole(BATCH, self.heads))
-
-
-def _pixels(selections: Sequence[Selection]) -> View | None:
-    """Join feature maps that were cut from one row of pixels, level after level."""
-    for each in selections:
-        digits = merged(each.view.layout[each.axis])
-        if digits != whole(PIXEL, each.size):
-            return None
-    return joined(selections, whole(PIXEL, sum(each.size for each in selections)))
-
-
-def _levels(selections: Sequence[Selection]) -> View | None:
-    """Join positions that were cut from one row of levels."""
-    first = selections[0]
-    digits = first.view.layout[first.axis]
-    if any(each.view.layout[each.axis] != digits for each in selections):
-        return None
-    return joined(selections, (*whole(LEVEL, len(selections)), *digits))
-
-
-def _options(
-    views: Sequence[View], join: Callable[[Sequence[Selection]], View | None]
-) -> list[Source]:
-    """List where an operand may be read: of every level, then of all together."""
-    walks = [list(sources(view)) for view in views]
-    ends = [walk[-1] for walk in walks]
-    options: list[Source] = list(
-        zip(
-            *([each for each in walk if isinstance(each, View)] for walk in walks),
-            strict=False,  # a level may be read from further away than another
-        )
-    )
-    selections = [each for each in ends if isinstance(each, Selection)]
-    if len(selections) < len(ends):
-        return options
-    first = selections[0]
-    together = (
-        joined(selections, first.view.layout[first.axis])
-        if len(selections) == 1
-        else join(selections)
-    )
-    return options if together is None else [*options, *_options([together], join)]
+        kept = split_like(batch, self.found.images)
+        kept = tuple(digit for digit in kept if digit not in self.found.images)
+        return (kept, middle, whole(BATCH, self.heads))
 
 
 def _head_counts(found: Decomposed, views: Sequence[View]) -> list[int]:
-    """List the numbers of heads that the layouts suggest, the most first."""
+    """List the numbers of heads that the layouts suggest, the most first.
+
+    The images that are added up are none of them.
+    """
     counts = {1, found.batch}
     for view in views:
         for digit in flat(view.layout):
             if digit.axis == BATCH:
                 counts |= {digit.stride, digit.end}
-    return sorted(counts, reverse=True)
-
-
-def _cheapest(
-    options: Sequence[Source], form: Callable[[int | None], Layout]
-) -> tuple[float, Source]:
-    """Return the source that costs least to lay out; of equals the last one."""
-
-    def cost(option: Source) -> float:
-        if len(option) == 1:
-            return _cost(option[0], form(None))
-        joint = sum(_bytes(view) for view in option)
-        parts = (_cost(view, form(level)) for level, view in enumerate(option))
-        return joint + sum(parts)
-
-    best = min(reversed(options), key=cost)
-    return cost(best), best
-
-
-def _bytes(view: View) -> float:
-    return 4.0 * math.prod(sizes(view.layout))
-
-
-def _cost(view: View, form: Layout) -> float:
-    """Count the bytes that are written to lay a view out."""
-    have, wanted = flat(view.layout), flat(form)
-    have, wanted = split_like(have, wanted), split_like(wanted, have)
-    present = tuple(digit for digit in wanted if digit in have)
-    if set(have) - set(present):
-        return math.inf
-    steps = int(present != have) + 2 * int(_moved(view) != (1.0, 0.0))
-    repeated = 4.0 * math.prod(sizes(form)) if len(present) < len(wanted) else 0.0
-    return steps * _bytes(view) + repeated
-
-
-def _moved(view: View) -> tuple[float, float]:
-    """Return what a view's elements are multiplied by, and what is added then.
-
-    A grid's are taken from -1..1, between the outer edges, to 0..1.
-    """
-    if not any(digit.axis == XY for digit in flat(view.layout)):
-        return view.scale, view.shift
-    return view.scale / 2, (view.shift + 1) / 2
+    least = min((digit.stride for digit in found.images), default=found.batch)
+    return sorted((count for count in counts if count <= least), reverse=True)
 
 
 def _operand(
     call: FusedCall, source: Source, form: Callable[[int | None], Layout], axis: int
 ) -> ir.Value:
-    if len(source) == 1:
-        return _laid_out(call, source[0], form(None))
-    parts = [_laid_out(call, view, form(level)) for level, view in enumerate(source)]
+    if source.total:
+        return combined(call, "Add", source.views, form(None))
+    if len(source.views) == 1:
+        return laid_out(call, source.views[0], form(None))
+    parts = [laid_out(call, v, form(level)) for level, v in enumerate(source.views)]
     return call.concat(parts, axis)
-
-
-def _laid_out(call: FusedCall, view: View, form: Layout) -> ir.Value:
-    """Write the operators that take a view to a layout; none where it has it."""
-    value = view.value
-    scale, shift = _moved(view)
-    if scale != 1.0:
-        value = call.add("Mul", [value, call.numbers(scale, value)])
-    if shift != 0.0:
-        value = call.add("Add", [value, call.numbers(shift, value)])
-    have, wanted = flat(view.layout), flat(form)
-    have, wanted = split_like(have, wanted), split_like(wanted, have)
-    present = tuple(digit for digit in wanted if digit in have)
-    shape = sizes(view.layout)
-    if present != have:
-        pieces, order = runs(have, present)
-        value = call.transpose(_shaped(call, value, shape, sizes(tuple(pieces))), order)
-        shape = tuple(sizes(tuple(pieces))[place] for place in order)
-    if len(present) < len(wanted):
-        ones = [digit.size if digit in have else 1 for digit in wanted]
-        full = [digit.size for digit in wanted]
-        value = _shaped(call, value, shape, ones)
-        value, shape = call.add("Expand", [value, call.integers(full)]), tuple(full)
-    return _shaped(call, value, shape, sizes(form))
-
-
-def _shaped(
-    call: FusedCall, value: ir.Value, have: Sequence[int], wanted: Sequence[int]
-) -> ir.Value:
-    return value if tuple(have) == tuple(wanted) else call.reshape(value, list(wanted))

@@ -4,10 +4,11 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, input_at, is_standard, static_shape
-from me2e_compress.graph.nodes import producer_of, scalar_of, sole_reader
+from me2e_compress.graph.nodes import numbers_of, producer_of, sole_reader
 from me2e_compress.passes.fuse_operators.digits import Digits, Layout, regrouped
 
 REGROUPING = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
@@ -111,6 +112,30 @@ def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
     return dataclasses.replace(first.view, layout=tuple(layout))
 
 
+def terms(view: View) -> tuple[View, View] | None:
+    """Return the two that a value is the sum of; None if it is not, or read besides."""
+    node = producer_of(view.value)
+    if node is None or node.op_type != "Add" or not is_standard(node):
+        return None
+    shapes = [static_shape(each) for each in node.inputs]
+    if sole_reader(view.value) is None or None in shapes:
+        return None
+    first, second = (
+        dataclasses.replace(view, value=each, layout=aligned(view.layout, shape))
+        for each, shape in zip(node.inputs, shapes, strict=True)
+        if each is not None and shape is not None
+    )
+    return first, second
+
+
+def aligned(layout: Layout, shape: Sequence[int]) -> Layout:
+    """Return the layout of what is repeated to one: no digits where its size is 1."""
+    last = layout[len(layout) - len(shape) :]
+    return tuple(
+        digits if size > 1 else () for digits, size in zip(last, shape, strict=True)
+    )
+
+
 def _without(layout: Layout, axis: int) -> Layout:
     return layout[:axis] + layout[axis + 1 :]
 
@@ -131,6 +156,8 @@ def _before(view: View) -> View | Selection | None:
     layout: Layout | None = None
     if node.op_type in REGROUPING:
         layout = regrouped(view.layout, shape)
+    elif node.op_type == "Expand":
+        layout = aligned(view.layout, shape)
     elif node.op_type == "Transpose":
         order = _order(node, len(shape))
         layout = tuple(view.layout[order.index(axis)] for axis in range(len(shape)))
@@ -167,11 +194,11 @@ def _order(node: ir.Node, rank: int) -> list[int]:
 
 
 def _unscaled(node: ir.Node, view: View) -> View | None:
-    """Undo a sum or product with a constant of one element."""
+    """Undo a sum or product with a constant, the same for all elements."""
     left, right = node.inputs[0], node.inputs[1]
-    constant, source = scalar_of(right), left
+    constant, source = _number(right), left
     if constant is None and node.op_type in ("Add", "Mul"):
-        constant, source = scalar_of(left), right
+        constant, source = _number(left), right
     if constant is None or source is None or source.dtype != view.value.dtype:
         return None
     if static_shape(source) != static_shape(view.value) or constant == 0.0:
@@ -184,6 +211,14 @@ def _unscaled(node: ir.Node, view: View) -> View | None:
     else:
         shift += scale * (constant if node.op_type == "Add" else -constant)
     return dataclasses.replace(view, value=source, scale=scale, shift=shift)
+
+
+def _number(value: ir.Value | None) -> float | None:
+    """Return the number that a constant is made of; None if it holds several."""
+    numbers = numbers_of(value)
+    if numbers is None or numbers.size == 0 or np.ptp(numbers) != 0.0:
+        return None
+    return float(numbers.flat[0])
 
 
 def _selected(node: ir.Node, view: View) -> Selection | None:
