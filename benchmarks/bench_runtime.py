@@ -53,7 +53,7 @@ class Entry:
     passes: str = ""
 
 
-BEFORE = "import-normalize,fold-constants,eliminate-redundant"
+BEFORE = "import-normalize,fold-constants,eliminate-redundant,hoist-linear"
 FUSED = f"{BEFORE},fuse-operators,fuse-basic"
 INT8 = "quantize-int8{target=onnxruntime}"
 ENTRIES = {
