@@ -64,7 +64,10 @@ def _found_in(
 
 
 def import_domains(model: ir.Model) -> None:
-    """Import every domain that is used, and no plugin domain that no longer is."""
+    """Import every domain that is used, and no plugin domain that no longer is.
+
+    What was written into functions is made such that a file can hold it.
+    """
     bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
     for body in bodies:
         used = {node.domain for node in nodes_in(body)}
@@ -73,6 +76,8 @@ def import_domains(model: ir.Model) -> None:
                 del body.opset_imports[domain]
         for domain in sorted(used - {*STANDARD, *body.opset_imports}):
             body.opset_imports[domain] = 1
+    for function in model.functions.values():
+        hold_constants(function)
 
 
 def expand(
@@ -163,6 +168,20 @@ def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
     if result.type is None and value is not None and value.dtype is not None:
         result.type, known = ir.TensorType(value.dtype), True
     return known
+
+
+def hold_constants(function: ir.Function) -> None:
+    """Make Constant nodes of a function's initializers, which no file can hold."""
+    graph = function.graph
+    for name, value in list(graph.initializers.items()):
+        tensor = value.const_value
+        made = ir.node("Constant", [], {"value": tensor}, num_outputs=1)
+        result = made.outputs[0]
+        made.name = result.name = name
+        result.type, result.shape, result.const_value = value.type, value.shape, tensor
+        del graph.initializers[name]
+        value.replace_all_uses_with(result)
+        graph.insert_before(graph[0], made)
 
 
 def _found(node: ir.Node) -> tuple[Operator, Dialect]:

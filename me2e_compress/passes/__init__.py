@@ -25,6 +25,7 @@ PASSES: Registry[Pass] = Registry(
         "fuse-basic": f"{_HERE}.fuse_basic:FuseBasic",
         "expand-operators": f"{_HERE}.expand_operators:ExpandOperators",
         "translate-plugins": f"{_HERE}.translate_plugins:TranslatePlugins",
+        "attach-bodies": f"{_HERE}.attach_bodies:AttachBodies",
         "quantize-int8": f"{_HERE}.quantize_int8:QuantizeInt8",
         "convert-float16": f"{_HERE}.convert_float16:ConvertFloat16",
         "convert-float32": f"{_HERE}.convert_float32:ConvertFloat32",

@@ -1,0 +1,158 @@
+"""Bodies of fused operators, as functions in the file."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph, operators
+from me2e_compress.graph.nodes import Array
+from me2e_compress.graph.shapes import Dims, open_shape
+from me2e_compress.graph.validity import ORIGINAL_DOMAIN
+from me2e_compress.operators.replace import FusedNode, hold_constants
+from me2e_compress.passes.base import Context, Pass, PassResult
+
+LARGEST_TABLE = 256
+"""Numbers of a constant operand that a body may hold itself: sizes of feature maps."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AttachBodies(Pass):
+    """Give every fused operator a body of standard operators, so that any runtime runs.
+
+    Given:   y = me2e.MultiScaleDeformableAttention(value, sizes, starts, at, weights)
+    Result:  the same node, and a function me2e.MultiScaleDeformableAttention in the
+             file: { ... GridSample ... Mul ... ReduceSum ... }
+
+    A runtime that has no such operator inlines the function; one that has it, this
+    toolkit's sessions or TensorRT with its plugin, takes its own. All nodes of a name
+    share one function: what they agree on, the sizes of feature maps above all, stands
+    in it as constants, the rest is computed. Nodes that differ in attributes, and
+    plugins without a domain, which functions cannot have, stay without a body; the
+    notes name them.
+    """
+
+    name: ClassVar[str] = "attach-bodies"
+    exact: ClassVar[bool] = True
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Add a function for each kind of fused node that has none.
+
+        Raises:
+            PreconditionError: an opset below 13; or a plugin has an attribute, or
+                inputs, that its dialect does not know.
+        """
+        kinds: dict[ir.OperatorIdentifier, list[FusedNode]] = {}
+        for fused in operators.fused_nodes(model):
+            kinds.setdefault(fused.node.op_identifier(), []).append(fused)
+        made, notes = 0, []
+        for identifier, calls in kinds.items():
+            if identifier in model.functions:
+                continue
+            if reason := _why_not(calls):
+                notes.append(
+                    f"no body for {len(calls)} {calls[0].node.op_type}: {reason}"
+                )
+                continue
+            model.functions[identifier] = self._body(calls)
+            made += 1
+            notes.append(f"a body for {len(calls)} {calls[0].node.op_type}")
+        return PassResult(model, made, tuple(notes))
+
+    def _body(self, calls: Sequence[FusedNode]) -> ir.Function:
+        """Write the function that all these nodes can call."""
+        first = calls[0]
+        inputs = [
+            _parameter(index, [each.node.inputs[index] for each in calls])
+            for index in range(len(first.node.inputs))
+        ]
+        result = ir.Value(name="y")
+        node = ir.Node(
+            first.node.domain,
+            first.node.op_type,
+            [value for value, _ in inputs],
+            list(first.node.attributes.values()),
+            outputs=[result],
+            name=first.operator.name,
+        )
+        opsets = {"": first.opset}
+        body = ir.Graph(
+            [value for value, _ in inputs], [result], nodes=[node], opset_imports=opsets
+        )
+        function = ir.Function(
+            node.domain,
+            node.op_type,
+            graph=body,
+            attributes=[
+                ir.Attr(name, each.type, each.value)
+                for name, each in node.attributes.items()
+            ],
+        )
+        for value, known in inputs:
+            if known is not None:
+                _hold(function, node, value, known)
+        operators.expand(node, opset=first.opset, by=self.name)
+        hold_constants(function)
+        return function
+
+
+def _why_not(calls: Sequence[FusedNode]) -> str:
+    """Return why nodes cannot share a body; empty if they can."""
+    first = calls[0].node
+    if not first.domain or ORIGINAL_DOMAIN in first.metadata_props:
+        return "it has no domain of its own"
+    said = {
+        tuple(sorted((name, str(a.value)) for name, a in each.node.attributes.items()))
+        for each in calls
+    }
+    if len(said) > 1:
+        return "its nodes differ in attributes"
+    if len({len(each.node.inputs) for each in calls}) > 1:
+        return "its nodes differ in inputs"
+    return ""
+
+
+def _parameter(
+    index: int, given: Sequence[ir.Value | None]
+) -> tuple[ir.Value, Array | None]:
+    """Make a function's input of what its callers give: what they all agree on."""
+    shapes = [open_shape(value) for value in given if value is not None]
+    types = {value.dtype for value in given if value is not None}
+    value = ir.Value(name=f"x{index}", shape=_agreed(shapes))
+    if len(types) == 1 and (kind := next(iter(types))) is not None:
+        value.type = ir.TensorType(kind)
+    arrays = [None if each is None else graph.array_of(each) for each in given]
+    first = arrays[0]
+    if first is None or first.size > LARGEST_TABLE:
+        return value, None
+    same = all(
+        other is not None
+        and other.dtype == first.dtype
+        and np.array_equal(first, other)
+        for other in arrays
+    )
+    return value, first if same else None
+
+
+def _agreed(shapes: Sequence[Dims | None]) -> ir.Shape | None:
+    """Return the dimensions that shapes have in common; None without a common rank."""
+    known = [shape for shape in shapes if shape is not None]
+    if len(known) < len(shapes) or len({len(shape) for shape in known}) != 1:
+        return None
+    return ir.Shape(
+        [
+            sizes[0] if len(set(sizes)) == 1 else None
+            for sizes in zip(*known, strict=True)
+        ]
+    )
+
+
+def _hold(function: ir.Function, node: ir.Node, value: ir.Value, known: Array) -> None:
+    """Let a node read a constant in the place of a function's input."""
+    constant = ir.node("Constant", [], {"value": ir.tensor(known)}, num_outputs=1)
+    constant.name = constant.outputs[0].name = f"{value.name}_known"
+    constant.outputs[0].type, constant.outputs[0].shape = value.type, value.shape
+    function.insert_before(node, constant)
+    value.replace_all_uses_with(constant.outputs[0])
