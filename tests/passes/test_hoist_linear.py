@@ -41,10 +41,10 @@ def test_the_keys_and_values_of_a_motion_decoder() -> None:
 
 CAMERAS, QUERIES = 6, 500
 
-SAMPLING = graph_of(
+SAMPLING = (
     f"(float[1,{QUERIES},{WIDE}] x) => (float[{CAMERAS},{QUERIES},16] offsets,"
     f" float[{CAMERAS},{QUERIES},8] weights)",
-    "many = Expand(x, cameras)  placed = Add(many, position)"
+    " placed = Add(many, position)"
     " query = LayerNormalization<axis = -1>(placed, gamma, beta)"
     " flat = Reshape(query, rows)"
     " off = Gemm<transB = 1>(flat, wo, bo)  offsets = Reshape(off, offset_shape)"
@@ -52,17 +52,27 @@ SAMPLING = graph_of(
 )
 
 
-def test_sampling_offsets_and_weights_of_queries_repeated_for_cameras() -> None:
+REPEATS = {
+    "Expand": "many = Expand(x, cameras)",
+    "Tile": "many = Tile(x, times)",
+    "stack": "many = Concat<axis = 0>(x, x, x, x, x, x)",
+}
+
+
+@pytest.mark.parametrize("repeat", REPEATS)
+def test_sampling_offsets_and_weights_of_queries_repeated_for_cameras(
+    repeat: str,
+) -> None:
     model = hoist(
-        SAMPLING,
+        graph_of(SAMPLING[0], REPEATS[repeat] + SAMPLING[1]),
+        times=integers(CAMERAS, 1, 1),
         cameras=integers(CAMERAS, QUERIES, WIDE), position=normal(QUERIES, WIDE),
         gamma=normal(WIDE), beta=normal(WIDE), rows=integers(-1, WIDE),
         wo=normal(16, WIDE), bo=normal(16), ww=normal(WIDE, 8), bw=normal(8),
         offset_shape=integers(CAMERAS, QUERIES, 16),
     )  # fmt: skip
     assert products(model) == QUERIES * WIDE * (16 + 8)
-    names = ops(model)
-    assert names.index("LayerNormalization") < names.index("Expand")
+    assert ops(model)[:2] == ["Add", "LayerNormalization"]
 
 
 def test_a_self_attention_of_constants_is_folded_and_its_product_not_repeated() -> None:
@@ -241,3 +251,16 @@ def test_a_decomposed_layer_norm_of_repeated_rows_is_computed_once() -> None:
     assert products(model) == QUERIES * WIDE * 16
     assert ops(model)[-1] == "Expand"
     assert ops(model).count("Expand") == 1
+
+
+def test_a_copy_for_every_camera_is_multiplied_once() -> None:
+    model = hoist(
+        graph_of(
+            f"(float[4,{QUERIES},{WIDE}] x) => (float[24,{QUERIES},{WIDE}] y)",
+            "many = Concat<axis = 0>(x, x, x, x, x, x)  placed = Relu(many)"
+            " z = MatMul(placed, w)  y = Add(z, b)",
+        ),
+        w=normal(WIDE, WIDE), b=normal(WIDE),
+    )  # fmt: skip
+    assert products(model) == 4 * QUERIES * WIDE**2
+    assert ops(model) == ["Relu", "MatMul", "Add", "Concat"]

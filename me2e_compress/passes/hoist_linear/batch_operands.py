@@ -17,7 +17,7 @@ from me2e_compress.passes.hoist_linear.head_layout import HeadLayout, layout_of
 from me2e_compress.passes.hoist_linear.least_work import terms_of
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
-from me2e_compress.passes.hoist_linear.row_moves import broadcasts
+from me2e_compress.passes.hoist_linear.row_moves import without_repeats
 from me2e_compress.passes.work import work
 from me2e_compress.rewrite import Array, maker, sole_reader
 
@@ -96,19 +96,20 @@ def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
     """List the terms of a sum, or what is repeated, and the nodes in between."""
     if sole_reader(value) is None:
         return None
-    repeated = maker(value, "Expand", "Tile")
-    if repeated is not None and repeated.inputs[0] is not None:
-        return ([repeated.inputs[0]], [repeated]) if broadcasts(repeated) else None
+    node, source = value.producer(), without_repeats(value)
+    if node is not None and source is not None:
+        return [source], [node]
     total = maker(value, "Add")
     if total is None:
         return None
     found = [term for term, _, _ in terms_of(total, static_shape(value) or ())]
     between = [
-        node
+        repeat
         for operand in total.inputs
-        if operand not in found
-        and (node := maker(operand, "Expand", "Tile")) is not None
-        and sole_reader(node.outputs[0]) is not None
+        if operand is not None
+        and operand not in found
+        and (repeat := operand.producer()) is not None
+        and sole_reader(operand) is not None
     ]
     return (found, [total, *between]) if found else None
 

@@ -17,7 +17,11 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
-from me2e_compress.passes.hoist_linear.row_moves import VIEWS, broadcasts, moved_rows
+from me2e_compress.passes.hoist_linear.row_moves import (
+    VIEWS,
+    moved_rows,
+    without_repeats,
+)
 from me2e_compress.passes.hoist_linear.ways import (
     Composed,
     Direct,
@@ -29,7 +33,7 @@ from me2e_compress.passes.hoist_linear.ways import (
     uses_weight,
 )
 from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE, work
-from me2e_compress.rewrite import holds_numbers, is_standard, maker, sole_reader
+from me2e_compress.rewrite import holds_numbers, is_standard, sole_reader
 
 DEEPEST = 32
 """How many nodes before a product are looked at, in a row."""
@@ -166,13 +170,13 @@ class Prices:
     def _moved(
         self, asked: Question, node: ir.Node, sources: tuple[ir.Value, ...]
     ) -> Price:
-        parts = [self.cheapest(asked.of(value)) for value in sources]
-        cost = 1.0 + sum(part.work for part in parts)
+        prices = {id(value): self.cheapest(asked.of(value)) for value in sources}
+        cost = 1.0 + sum(part.work for part in prices.values())  # each is made once
         if node.op_type not in VIEWS:
             read = sum(asked.of(value).product_bytes for value in sources)
             cost += (read + asked.product_bytes) / MOVED_BYTES_PER_NODE
-        way = Moved(node, tuple(part.way for part in parts))
-        return Price(way, cost, sum(part.macs for part in parts))
+        way = Moved(node, tuple(prices[id(value)].way for value in sources))
+        return Price(way, cost, sum(part.macs for part in prices.values()))
 
     def _composed(self, asked: Question, layer: LinearLayer) -> Price:
         owned = asked.owned and all(
@@ -273,12 +277,10 @@ def terms_of(
     start = 0
     for at, value in enumerate(values):
         owned = sole_reader(value) is not None
-        small = maker(value, "Expand", "Tile")
-        if small is not None and broadcasts(small) and moved_rows(small) is not None:
-            source = small.inputs[0]
-            assert source is not None
-            lead = (static_shape(source) or (0,))[:-1]
-            others = [*leads[:at], lead, *leads[at + 1 :]]
+        source = without_repeats(value)
+        inner = static_shape(source)
+        if source is not None and inner and inner[-1] == widths[at]:
+            others = [*leads[:at], inner[:-1], *leads[at + 1 :]]
             if np.broadcast_shapes(*others) == shape[:-1]:
                 leads = others
                 owned = owned and sole_reader(source) is not None

@@ -169,7 +169,9 @@ class _Writer:
         if len(way.parts) == 1:
             parts = [self._write_way(way.parts[0], matrix, vector)]
         else:
-            parts = [self.build(part, matrix, vector) for part in way.parts]
+            once = {id(part): part for part in way.parts}  # some stand there twice
+            made = {key: self.build(part, matrix, vector) for key, part in once.items()}
+            parts = [made[id(part)] for part in way.parts]
         return self._write(*self.rewriter.move(way.node, parts), also=way.node)
 
     def _distribute(

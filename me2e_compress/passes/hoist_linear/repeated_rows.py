@@ -13,9 +13,13 @@ import onnx_ir as ir
 
 from me2e_compress.graph import array_of, is_standard, rank_of, static_shape
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
-from me2e_compress.passes.hoist_linear.row_moves import broadcasts, moved_rows
+from me2e_compress.passes.hoist_linear.row_moves import (
+    broadcasts,
+    moved_rows,
+    without_repeats,
+)
 from me2e_compress.passes.work import MOVED_BYTES_PER_NODE
-from me2e_compress.rewrite import is_read, maker, sole_reader
+from me2e_compress.rewrite import is_read, sole_reader
 
 UNARY = frozenset(
     {
@@ -136,7 +140,7 @@ def _repetition(value: ir.Value) -> Repetition | None:
         if node is None or node.graph is not value.graph:
             break
         sources = moved_rows(node)
-        if sources is None or len(sources) != 1:
+        if sources is None or len(set(sources)) != 1:  # a Concat may repeat one
             break
         nodes.append(node)
         value = sources[0]
@@ -167,10 +171,10 @@ def _move(node: ir.Node, index: int, found: Repetition) -> Move | None:
         return Move(tuple(inputs), small, found)
     if not found.broadcasts:
         return None
-    again = maker(node.inputs[1 - index], "Expand", "Tile")
-    if again is not None and broadcasts(again):
-        inputs[1 - index] = again.inputs[0]
-        other = static_shape(again.inputs[0]) or ()
+    again = without_repeats(node.inputs[1 - index])
+    if again is not None:
+        inputs[1 - index] = again
+        other = static_shape(again) or ()
     inner = np.broadcast_shapes(small, other)
     whole = static_shape(node.outputs[0]) or ()
     if math.prod(inner) >= math.prod(whole):
@@ -219,7 +223,8 @@ def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
             "Expand", [new, target], [], shape, sources=sources, like=old
         )
     for moving in () if found.broadcasts else reversed(found.nodes):
-        kind, inputs, attributes, shape = rewriter.move(moving, [new])
+        count = len(moving.inputs) if moving.op_type == "Concat" else 1
+        kind, inputs, attributes, shape = rewriter.move(moving, [new] * count)
         new = rewriter.write(
             kind, inputs, attributes, shape, sources=(node, moving), like=old
         )

@@ -14,7 +14,8 @@ from me2e_compress.graph import array_of, is_standard, rank_of, static_shape
 VIEWS = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
 """Those that move nothing, and that a Reshape can say."""
 
-REPEATS = frozenset({"Expand", "Tile"})
+REPEATS = frozenset({"Concat", "Expand", "Tile"})
+"""Those that may repeat axes of size 1."""
 
 
 def moved_rows(node: ir.Node) -> tuple[ir.Value, ...] | None:
@@ -38,14 +39,25 @@ def moved_rows(node: ir.Node) -> tuple[ir.Value, ...] | None:
 
 
 def broadcasts(node: ir.Node) -> bool:
-    """Return whether a node repeats only axes of size 1, as an Add does by itself."""
-    if node.op_type not in REPEATS:
+    """Return whether a node repeats only axes of size 1, as an Add does by itself.
+
+    So does a Concat of the same value, again and again: ``torch.stack([x] * 6)``.
+    """
+    if not is_standard(node) or node.op_type not in REPEATS:
+        return False
+    if node.op_type == "Concat" and len(set(node.inputs)) != 1:
         return False
     small, large = static_shape(node.inputs[0]), static_shape(node.outputs[0])
     if small is None or large is None:
         return False
     ends = large[len(large) - len(small) :]
     return all(one in (1, many) for one, many in zip(small, ends, strict=True))
+
+
+def without_repeats(value: ir.Value | None) -> ir.Value | None:
+    """Return what a value repeats along axes of size 1; None if it does not."""
+    node = None if value is None else value.producer()
+    return node.inputs[0] if node is not None and broadcasts(node) else None
 
 
 def _always(node: ir.Node, rank: int) -> bool:
@@ -89,7 +101,7 @@ def _gather_nd(node: ir.Node, rank: int) -> bool:
 
 
 _RULES: dict[str, Callable[[ir.Node, int], bool]] = {
-    **dict.fromkeys(sorted(VIEWS | REPEATS), _always),
+    **dict.fromkeys((*sorted(VIEWS), "Expand", "Tile"), _always),
     "Concat": _axis(0),
     "Gather": _axis(0),
     "GatherND": _gather_nd,
