@@ -12,6 +12,7 @@ from me2e_compress.passes.hoist_linear.least_work import Prices
 from me2e_compress.passes.hoist_linear.linear_layers import layer_at
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeated_rows import do_before_repeats
+from me2e_compress.passes.hoist_linear.shared_sources import merge_layers
 from me2e_compress.passes.work import BYTES_PER_NODE
 from me2e_compress.rewrite import graphs_of, remove_dead, value_names
 
@@ -29,11 +30,12 @@ class _Tally:
     products: int = 0
     others: int = 0
     operands: int = 0
+    merged: int = 0
     macs: int = 0
 
     @property
     def changes(self) -> int:
-        return self.products + self.others + self.operands
+        return self.products + self.others + self.operands + self.merged
 
     def notes(self) -> tuple[str, ...]:
         found = []
@@ -42,6 +44,8 @@ class _Tally:
             found.append(f"moved {products} products: {less}")
         if self.others:
             found.append(f"moved {self.others} other nodes in front of repeated rows")
+        if self.merged:
+            found.append(f"merged {self.merged} layers that share what they read")
         return tuple(found)
 
 
@@ -65,11 +69,15 @@ class HoistLinear(Pass):
 
     Attributes:
         bytes_per_node: how many bytes of new weights the work of one node may cost.
+        merge_shared: merge the layers of a module that read the same value (queries,
+            keys and values) into one and split what it gives; off, since onnxruntime
+            is slower so from 300 rows on, and int8 would have one range for all.
     """
 
     name: ClassVar[str] = "hoist-linear"
     exact: ClassVar[bool] = True
     bytes_per_node: int = BYTES_PER_NODE
+    merge_shared: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Ask for every node whether there is a cheaper way, until there is none."""
@@ -82,6 +90,8 @@ class HoistLinear(Pass):
             for _ in range(ROUNDS):
                 before = tally.changes
                 self._round(body, rewriter, opset, tally)
+                if self.merge_shared and tally.changes == before:
+                    tally.merged += merge_layers(body, rewriter, opset)
                 if tally.changes == before:
                     break
         if tally.changes:
