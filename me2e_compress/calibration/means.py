@@ -11,11 +11,17 @@ import onnx_ir as ir
 from me2e_compress.calibration.archives import load_arrays
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frames
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
 
 
 def token_means(
-    model: ir.Model, frames: Frames, values: Sequence[str], *, threads: int = 0
+    model: ir.Model,
+    frames: Frames,
+    values: Sequence[str],
+    *,
+    threads: int = 0,
+    provider: Provider = CPU,
 ) -> dict[str, Array]:
     """Average values over a recording, element by element, in one streaming pass.
 
@@ -28,6 +34,7 @@ def token_means(
         frames: the recording.
         values: names of values anywhere in the main graph.
         threads: within an operator; 0 for every core.
+        provider: what runs the model.
 
     Returns:
         One array a value, of its own shape and type.
@@ -39,7 +46,7 @@ def token_means(
     """
     if not values:
         return {}
-    session = Session(_exposed(model, values), threads=threads)
+    session = Session(_exposed(model, values), threads=threads, provider=provider)
     averages = {name: _Average(name) for name in values}
     for index, found in enumerate(replay(session, frames, list(values))):
         for name, average in averages.items():

@@ -13,6 +13,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph.shapes import is_static
 from me2e_compress.manager.report import Verification
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, detached, replay
 
 TOLERANCES = {"float64": 1e-9, "float32": 1e-4, "float16": 1e-2, "bfloat16": 5e-2}
@@ -34,10 +35,12 @@ class VerificationInputs:
     Attributes:
         frames: what is fed, in order.
         kind: ``recorded`` or ``synthetic``.
+        provider: what runs both.
     """
 
     frames: Sequence[Frame]
     kind: str
+    provider: Provider = CPU
 
     @classmethod
     def of(
@@ -47,6 +50,7 @@ class VerificationInputs:
         seed: int,
         count: int,
         successor: ir.Model | None = None,
+        provider: Provider = CPU,
     ) -> "VerificationInputs":
         """Take the first recorded frames, or make seeded inputs where none are given.
 
@@ -57,16 +61,18 @@ class VerificationInputs:
             count: how many frames.
             successor: what passes made of the graph: where its inputs have the sizes
                 that the graph leaves open, those are taken.
+            provider: what runs the graphs.
 
         Raises:
             PreconditionError: none are given and the inputs have no static shape.
         """
         if frames is not None:
             chosen = [frames[i] for i in range(min(count, len(frames)))]
-            return cls(chosen, "recorded")
+            return cls(chosen, "recorded", provider)
         if successor is not None and not is_static(model):
             model = successor
-        return cls(list(synthetic(model, seed=seed, count=count)), "synthetic")
+        made = list(synthetic(model, seed=seed, count=count))
+        return cls(made, "synthetic", provider)
 
     def run(self, model: ir.Model) -> Iterator[Outputs]:
         """Run a graph over the frames, recurrent state fed forward.
@@ -77,7 +83,8 @@ class VerificationInputs:
         Raises:
             GraphError: onnxruntime cannot run it, or an output is no tensor.
         """
-        for outputs in replay(Session(model), self.frames):
+        session = Session(model, provider=self.provider)
+        for outputs in replay(session, self.frames):
             for name, value in outputs.items():
                 if not isinstance(value, np.ndarray):
                     raise GraphError(f"output {name} is no tensor: not compared")
@@ -92,7 +99,7 @@ class VerificationInputs:
             )
             for frame in self.frames
         ]
-        return VerificationInputs(frames, self.kind)
+        return VerificationInputs(frames, self.kind, self.provider)
 
 
 def _nudge(
@@ -190,7 +197,8 @@ def unsteadiness(
     Returns:
         Output name -> the largest max|a-b|/max|a| of ``NUDGES`` trials.
     """
-    session, worst = Session(model), dict.fromkeys(answers[0], 0.0)
+    session = Session(model, provider=inputs.provider)
+    worst = dict.fromkeys(answers[0], 0.0)
     for seed in range(NUDGES):
         moved = errors(answers, replay(session, inputs.nudged(seed).frames))
         worst = {name: max(worst[name], moved[name]) for name in worst}

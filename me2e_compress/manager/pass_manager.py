@@ -194,7 +194,7 @@ class _Books:
             names = tuple(current.name for current, _ in stretch[first:])
             try:
                 inputs = equivalence.VerificationInputs.of(
-                    before, frames, context.seed, count, model
+                    before, frames, context.seed, count, model, context.provider
                 )
                 found = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:
@@ -259,7 +259,9 @@ def _fails_alike(
     if not current.exact or isinstance(error, PassError):
         return False
     try:
-        inputs = equivalence.VerificationInputs.of(part, None, context.seed, 1)
+        inputs = equivalence.VerificationInputs.of(
+            part, None, context.seed, 1, provider=context.provider
+        )
         found = equivalence.verify((), part, result.result.model, inputs)
     except (GraphError, PreconditionError):
         return False

@@ -9,7 +9,6 @@ import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
 from me2e_compress.calibration.means import load_means, token_means
-from me2e_compress.calibration.sample import Recording
 from me2e_compress.errors import FramesError, PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import Substitute
@@ -121,7 +120,7 @@ class AblateModules(Pass):
         """Put constants in the place of all that leaves the dropped modules."""
         where, exits = model.graph, self._exits(model)
         if self.fill == "means":
-            means, how = _means_of(model, exits, context.frames, self.means)
+            means, how = _means_of(model, exits, context, self.means)
             for value in exits:
                 mean = means[str(value.name)]
                 replace_readers(value, constant_like(where, value, mean))
@@ -223,7 +222,7 @@ def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
 def _means_of(
     model: ir.Model,
     values: Sequence[ir.Value],
-    frames: Recording | None,
+    context: Context,
     file: Path | None,
 ) -> tuple[dict[str, Array], str]:
     """Read means from a file, or measure them on frames.
@@ -231,7 +230,7 @@ def _means_of(
     Args:
         model: the graph that makes the values.
         values: of its main graph.
-        frames: the recording; None if there is none.
+        context: has the recording, or none.
         file: an ``.npz`` by value name, which goes before frames; None for frames.
 
     Returns:
@@ -246,10 +245,12 @@ def _means_of(
     names = [str(value.name) for value in values]
     if file is not None:
         return load_means(file, names), f"its mean in {file}"
+    frames = context.frames
     if frames is None:
         raise FramesError(
             "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"
             " a mean is never made up"
         )
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
-    return token_means(model, frames, names), f"its mean over {count}"
+    means = token_means(model, frames, names, provider=context.provider)
+    return means, f"its mean over {count}"

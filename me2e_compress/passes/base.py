@@ -14,6 +14,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import Recording
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.modules import ModuleMap
+from me2e_compress.runtime.providers import CPU, Provider
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +25,7 @@ class Context:
         modules: which part of the graph is which.
         frames: recorded inputs, in scenes; None where the user gave none.
         seed: for everything random.
+        provider: what runs graphs.
         measured: the ranges that passes measured on the frames, by the pass's name: a
             pass that runs again on the same graph need not measure again.
     """
@@ -31,6 +33,7 @@ class Context:
     modules: ModuleMap
     frames: Recording | None = None
     seed: int = 0
+    provider: Provider = CPU
     measured: dict[str, Ranges] = dataclasses.field(
         default_factory=dict, compare=False, repr=False
     )
@@ -73,7 +76,9 @@ class Context:
             )
         known = self.measured.get(name)
         if known is None or not known.hold_for(graph.digest(model), tensors, method):
-            known = Calibrator(method).run(model, tensors, self.frames)
+            known = Calibrator(method, provider=self.provider).run(
+                model, tensors, self.frames
+            )
             self.measured[name] = known
         return known
 

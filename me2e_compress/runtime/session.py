@@ -75,6 +75,7 @@ class Session:
         outputs: by name, what comes out, in order.
         metadata: the model's own metadata.
         recurrent: ``{input: output}`` of the state that is fed forward.
+        provider: what runs it.
 
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
@@ -96,6 +97,7 @@ class Session:
     ) -> None:
         options = ort.SessionOptions()
         provider.attach(options)
+        self.provider = provider
         options.intra_op_num_threads = threads
         options.log_severity_level = 4
         # Idle threads that spin slow down whatever else runs on the machine.

@@ -69,7 +69,7 @@ class Suffix:
         known = {str(each.name) for each in probe.graph.outputs}
         added = [values[name] for name in self.boundary if name not in known]
         probe.graph.outputs.extend(added)
-        session = Session(probe, release=True)
+        session = Session(probe, release=True, provider=reference.session.provider)
         found = replay(session, reference.frames, self.boundary)
         frames = [
             dataclasses.replace(

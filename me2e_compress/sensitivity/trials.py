@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import TypeAlias
 
 import onnx_ir as ir
@@ -15,6 +16,7 @@ from me2e_compress.quantization.plan.overrides import Override
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
 
@@ -92,6 +94,7 @@ class Trials:
         frames: to judge on; read once for every variant.
         drive: the hook for closed-loop scores; None where nothing is driven.
         threads: of onnxruntime; 0 takes all.
+        provider: what runs the variants.
 
     Attributes:
         model: as given; ``modules`` and ``ranges`` too.
@@ -110,6 +113,7 @@ class Trials:
         *,
         drive: Drive | None = None,
         threads: int = 0,
+        provider: Provider = CPU,
     ) -> None:
         self.model = model
         self.modules = modules
@@ -118,12 +122,12 @@ class Trials:
         self._target = target
         self.ranges = ranges
         self._drive = drive
-        self._threads = threads
+        self._session = partial(
+            Session, threads=threads, release=True, provider=provider
+        )
         self._known: dict[Int8Choice, Score] = {}
         self._driven: dict[Int8Choice, float] = {}
-        self.reference = Reference.of(
-            Session(model, threads=threads, release=True), frames
-        )
+        self.reference = Reference.of(self._session(model), frames)
 
     def plan(self, choice: Int8Choice) -> QuantPlan:
         """Decide for every node, as ``quantize-int8`` will for the recipe."""
@@ -146,9 +150,8 @@ class Trials:
         """
         if choice not in self._known:
             graph_of_choice = self.variant(choice)
-            session = Session(graph_of_choice, threads=self._threads, release=True)
             self._known[choice] = Score(
-                self.reference.compare(session),
+                self.reference.compare(self._session(graph_of_choice)),
                 graph.size(graph_of_choice).weight_bytes,
             )
             self.done += 1

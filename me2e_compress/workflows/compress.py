@@ -23,6 +23,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import (
     check_count,
     check_number,
@@ -68,6 +69,7 @@ class CompressOptions:
         floor: least SQNR of an output, in dB, without a warning.
         allow_empty: write the graph although nothing in it became int8.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        provider: what runs graphs, to calibrate, check and measure.
         force: replace outputs that are not as we left them, too.
 
     Raises:
@@ -88,6 +90,7 @@ class CompressOptions:
     floor: float = SQNR_FLOOR_DB
     allow_empty: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -177,6 +180,7 @@ def compress(
         FramesError: frames that do not fit the model.
         PreconditionError: nothing became int8 although a pass quantizes; nothing is
             written.
+        ProviderError: the provider is not there.
         Me2eError: a pass refused the graph or broke.
     """
     options = options or CompressOptions()
@@ -194,21 +198,24 @@ def compress(
         modules = load_map(options.module_map, loaded)
         frames_of = _split(source, loaded, frames, passes, options)
         seen = frames_of.calibration or frames_of.samples
-        try_first(loaded, source.name, listener, file=source, frames=seen)
-        context = Context(modules, frames_of.calibration, options.seed)
+        first = partial(try_first, listener=listener, provider=options.provider)
+        first(loaded, source.name, file=source, frames=seen)
+        context = Context(
+            modules, frames_of.calibration, options.seed, options.provider
+        )
         manager = PassManager(
             passes,
             options.verify_frames,
             output.parent,
             frames_of.samples,
-            partial(try_first, listener=listener),
+            first,
         )
         progress = partial(listener.on_progress, "passes")
         report = manager.run(loaded, context, progress)
         int8 = Int8Outcome.of(report, context)
         _refuse_empty(int8, options, listener)
         if report.lossy and frames_of.measured is not None:
-            try_first(report.model, output.name, listener)
+            first(report.model, output.name)
         loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
         seconds = process_time() - start
         return _write(report, source, output, int8, loss, seconds)

@@ -8,6 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
 
+import onnx_ir as ir
+
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import Recording, hold_out
 from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eError
@@ -215,7 +217,10 @@ class _Measurement:
         return reference, self._compare(reference)
 
     def _reference(self, first: LossyPass) -> Reference:
-        return Reference.of(Session(first.before, release=True), self.frames)
+        return Reference.of(self._session(first.before), self.frames)
 
     def _compare(self, reference: Reference) -> Fidelity:
-        return reference.compare(Session(self.report.model, release=True))
+        return reference.compare(self._session(self.report.model))
+
+    def _session(self, model: ir.Model) -> Session:
+        return Session(model, release=True, provider=self.context.provider)

@@ -14,6 +14,7 @@ from me2e_compress.passes import Pass
 from me2e_compress.passes.fix_shapes import FixShapes, with_sizes
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.checks import (
@@ -42,6 +43,7 @@ class TrialOptions:
         count: frames to judge on.
         threads: of onnxruntime; 0 takes all.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        provider: what runs the graphs.
         force: replace outputs that are not as we left them, too.
 
     Raises:
@@ -56,6 +58,7 @@ class TrialOptions:
     count: int = 4
     threads: int = 0
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -114,7 +117,14 @@ class TrialFiles:
         recording.check(loaded)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
         name = self.model.name
-        try_first(loaded, name, listener, file=self.model, frames=recording)
+        try_first(
+            loaded,
+            name,
+            listener,
+            file=self.model,
+            frames=recording,
+            provider=options.provider,
+        )
         ready = PreparedGraph.of(
             self.model, loaded, options.module_map, options.exact()
         )
@@ -127,6 +137,7 @@ class TrialFiles:
             draw(recording, options.count, 0),
             drive=drive,
             threads=options.threads,
+            provider=options.provider,
         )
         return made, scheme.modules
 
@@ -155,7 +166,7 @@ def _ranges(
         digest = graph.digest(ready.model)
         ranges.check(model=digest, tensors=tensors, method=ranges.method)
         return ranges
-    return Calibrator(threads=options.threads).run(
+    return Calibrator(threads=options.threads, provider=options.provider).run(
         ready.model,
         tensors,
         recording,

@@ -59,8 +59,11 @@ class RemedyTrials:
             suffix, reference = found
             part = suffix.cut(made)
             if part is not None:
-                return reference.compare(Session(part, release=True))
-        return self._reference.compare(Session(made, release=True))
+                return reference.compare(self._session(part))
+        return self._reference.compare(self._session(made))
+
+    def _session(self, model: ir.Model) -> Session:
+        return Session(model, release=True, provider=self._context.provider)
 
     def _build(self, floats: Sequence[Int8Node]) -> ir.Model:
         asked = getattr(self._quantizer.applied, "overrides", None)

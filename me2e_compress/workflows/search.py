@@ -157,6 +157,7 @@ def _search(
 
 def _seconds(trials: Trials, threads: int, made: ir.Model) -> float:
     """Return the least wall time of a frame, of 5."""
-    session = Session(made, threads=threads, release=True)
+    provider = trials.reference.session.provider
+    session = Session(made, threads=threads, release=True, provider=provider)
     first = next(iter(trials.reference.frames))
     return time_interleaved({"int8": session}, [first], 5)["int8"].best_wall_s

@@ -10,6 +10,7 @@ from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import compress as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -42,6 +43,8 @@ def compress(
     floor: Floor = SQNR_FLOOR_DB,
     allow_empty: AllowEmpty = False,
     set_dim: given.SetDim = None,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
@@ -57,6 +60,7 @@ def compress(
         method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
         measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
         weight_only_gemv=weight_only_gemv, force=force, dims=sizes(set_dim or ()),
+        provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.compress(model, output, wanted, frames, options, listener)

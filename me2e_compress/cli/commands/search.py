@@ -6,6 +6,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import search as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -29,6 +30,8 @@ def search(
     set_dim: given.SetDim = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
@@ -37,6 +40,7 @@ def search(
         max_mb=max_mb, max_ms=max_ms, scheme=scheme, rules=rules, target=target,
         ranges=ranges, module_map=module_map, count=count, threads=threads,
         dims=sizes(set_dim or ()), force=force,
+        provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.search(model, frames, output, options, listener)

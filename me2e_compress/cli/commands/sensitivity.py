@@ -6,6 +6,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import sensitivity as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -42,6 +43,8 @@ def sensitivity(
     set_dim: given.SetDim = None,
     count: given.JudgedFrames = 4,
     threads: given.Threads = 0,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
@@ -57,6 +60,7 @@ def sensitivity(
         drive_limit=drive_limit, adapter=adapter, workers=workers,
         node_trials=node_trials, ranges=ranges, module_map=module_map, count=count,
         threads=threads, dims=sizes(set_dim or ()), force=force,
+        provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
         found = workflow.measure_sensitivity(model, frames, output, options, listener)
