@@ -1,7 +1,6 @@
 """The two layouts of deformable attention that differ from TensorRT OSS's."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,8 +8,8 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import array_of
-from me2e_compress.graph.nodes import maker
 from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators.before_softmax import before_softmax
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import Arrays, Dialect, NdArray, Values
 
@@ -106,19 +105,15 @@ class RawAttention(Dialect):
         return self.in_types(call, given)
 
     def _before_softmax(self, call: FusedCall, weights: ir.Value) -> ir.Value:
-        values = math.prod(dim for dim in _tail(weights, 2) if dim)
-        source: ir.Value | None = weights
-        while node := maker(source, "Reshape", "Identity", "Cast"):
-            source = node.inputs[0]
-        softmax = maker(source, "Softmax")
-        last = None if source is None or source.shape is None else source.shape[-1]
-        if softmax is None or softmax.inputs[0] is None or last != values:
+        """Write what the softmax reads in the layout of what it gives."""
+        found = before_softmax(call, weights, 2)
+        if found is None:
             raise PreconditionError(
                 f"node {call.node.name}: {self.op_type} of {self.source} takes weights"
                 f" before their softmax, and {weights.name} is not of a softmax over"
                 " all levels and points"
             )
-        return softmax.inputs[0]
+        return found
 
     def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
         """Compute locations, the softmax and where each level begins."""

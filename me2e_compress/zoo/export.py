@@ -17,10 +17,13 @@ from me2e_compress.zoo.stacks import Stack, find
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from me2e_compress.zoo.vad.config import HeadsName
+    from me2e_compress.zoo.vad.config import HeadsName, Sampling
 
 GRID_SAMPLE_OPSET = 16
 """GridSample exists from here on; below, sampling is spelled with Gather."""
+
+FUSED_DOMAIN = "me2e"
+"""Of the nodes that stand for a whole operator."""
 
 OPSETS = range(13, 18)
 """From the first that onnxruntime and TensorRT agree on to the last that torch's
@@ -34,6 +37,7 @@ def export(
     opset: int = 17,
     seed: int = 0,
     heads: "HeadsName" = "nuscenes",
+    fused: bool = False,
 ) -> Path:
     """Build a stack from a seed and write it as one ONNX file.
 
@@ -47,6 +51,7 @@ def export(
         opset: 13 to 17; below 16 grid sampling is decomposed into gathers.
         seed: Of all weights.
         heads: Sizes of the last layers.
+        fused: Whether deformable attention is one node, of the domain ``me2e``.
 
     Returns:
         The path.
@@ -61,7 +66,7 @@ def export(
         raise GraphError(
             f"cannot export {stack} at opset {opset}: {OPSETS[0]} to {OPSETS[-1]} work"
         )
-    model = build(stack, opset=opset, seed=seed, heads=heads)
+    model = build(stack, opset=opset, seed=seed, heads=heads, fused=fused)
     return save(trace(spec, model, opset), spec.metadata(heads), path)
 
 
@@ -82,7 +87,12 @@ def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Pat
 
 
 def build(
-    stack: str, *, opset: int = 17, seed: int = 0, heads: "HeadsName" = "nuscenes"
+    stack: str,
+    *,
+    opset: int = 17,
+    seed: int = 0,
+    heads: "HeadsName" = "nuscenes",
+    fused: bool = False,
 ) -> "nn.Module":
     """Return the torch module of a stack, initialised from a seed, ready to run.
 
@@ -98,10 +108,8 @@ def build(
         raise MissingExtraError("torch", "zoo")
     from me2e_compress.zoo.vad.initialise import build as build_vad
 
-    native = opset >= GRID_SAMPLE_OPSET
-    return build_vad(
-        seed=seed, heads=heads, sampling="operator" if native else "gather"
-    )
+    native: Sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
+    return build_vad(seed=seed, heads=heads, sampling="fused" if fused else native)
 
 
 def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
@@ -130,7 +138,7 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
         )
         graph = onnx.load(file)
     written = {entry.domain: entry.version for entry in graph.opset_import}
-    if written != {"": opset}:
+    if written not in ({"": opset}, {"": opset, FUSED_DOMAIN: 1}):
         raise GraphError(f"{spec.name}: asked for opset {opset}, torch wrote {written}")
     return graph
 

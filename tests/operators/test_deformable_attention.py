@@ -78,7 +78,7 @@ def arrays_of(dialect: Dialect, call: dict[str, Any]) -> dict[str, npt.NDArray[A
     }
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     dialect=dialects,
     call=calls,
@@ -124,7 +124,7 @@ def test_in_float64_the_body_is_the_reference_to_rounding(name: str) -> None:
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-12)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(call=calls, one=dialects, other=dialects)
 def test_a_round_trip_through_another_dialect_gives_the_same(
     call: dict[str, Any], one: Dialect, other: Dialect

@@ -18,6 +18,15 @@ Seed = Annotated[
     typer.Option(min=0, help="of everything random: of the weights; default 0"),
 ]
 
+Operators = Annotated[
+    Literal["standard", "plugin"],
+    typer.Option(help="plugin: deformable attention of vad-tiny as one node"),
+]
+DialectName = Annotated[
+    str | None,
+    typer.Option(help="of that node's plugin library; default me2e, our own form"),
+]
+
 
 def export(
     stack: Annotated[str, typer.Argument(help="vad-tiny or highway")],
@@ -25,11 +34,13 @@ def export(
     opset: Annotated[int, typer.Option(help="ONNX opset of the file")] = workflow.OPSET,
     heads: Heads = None,
     seed: Seed = None,
+    operators: Operators = "standard",
+    dialect: DialectName = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
     """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver."""
-    options = workflow.ExportOptions(opset, heads, seed, force)
+    options = workflow.ExportOptions(opset, heads, seed, force, operators, dialect)
     with listening() as listener:
         listener.on_progress(f"exporting {stack}", 0, 1, "")
         workflow.export_stack(stack, output, options)

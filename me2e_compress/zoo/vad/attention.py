@@ -10,6 +10,7 @@ from me2e_compress.zoo.vad.config import (
     FEED_FORWARD,
     Sampling,
 )
+from me2e_compress.zoo.vad.fused_attention import fused_deformable_attention
 from me2e_compress.zoo.vad.sampling import sample
 
 MASKED_LOGIT = -1.0e4
@@ -112,11 +113,13 @@ def deformable_attention(
         hw: Height and width of the level.
         locations: [B, Q, heads, 1, P, 2], x then y; 0 and 1 are the outer edges.
         weights: [B, Q, heads, 1, P], summing to 1 over the last two axes.
-        sampling: See `sample`.
+        sampling: See `sample`; ``fused`` exports one node for all of it.
 
     Returns:
         [B, Q, heads * 32].
     """
+    if sampling == "fused":
+        return fused_deformable_attention(value, hw, locations, weights).flatten(2)
     batch, _, heads, channels = value.shape
     queries, points = locations.shape[1], locations.shape[4]
     image = value.flatten(2).transpose(1, 2).reshape(batch * heads, channels, *hw)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 HeadsName = Literal["nuscenes", "bench2drive"]
-Sampling = Literal["operator", "gather"]
+Sampling = Literal["operator", "gather", "fused"]
 
 CAMERAS = 6
 IMAGE_HW = (384, 640)

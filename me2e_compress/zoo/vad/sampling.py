@@ -21,8 +21,8 @@ def sample(
     Args:
         image: [N, C, H, W] float32.
         grid: [N, Q, P, 2] float32, x then y, -1 and 1 are the outer edges.
-        sampling: ``operator`` uses grid_sample (ONNX opset 16 and later), ``gather``
-            writes the same in operators of opset 13.
+        sampling: ``operator`` uses grid_sample (ONNX opset 16 and later), the others
+            write the same in operators of opset 13.
         mode: How values between pixels are made.
 
     Returns:
