@@ -96,6 +96,7 @@ def made(subject: Subject, entry: Entry, frames: int) -> str | None:
         command = ["-m", "me2e_compress", "compress", str(subject.source), "--passes"]
         command += [entry.passes, "--frames", str(subject.frames), "-o", str(path)]
         command += ["--map", str(subject.map), "--verify-frames", "0"]
+        command += ["--measure-frames", "0"]
     elif entry.file == "onnxsim":
         write = (
             "import onnx, onnxsim, sys; onnx.save(onnxsim.simplify(sys.argv[1])[0],"
