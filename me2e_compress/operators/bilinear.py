@@ -3,7 +3,7 @@
 A position 0..1 of a map of W columns is column position * W - 0.5; what lies outside of
 the map is zero (``grid_sample`` with ``align_corners=False``, zeros). Once with
 GridSample, where the graph tells the sizes of the maps, once with Gather, which any
-opset has; and in numpy.
+opset has, once by a compiled kernel; and in numpy.
 """
 
 import functools
@@ -15,6 +15,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import array_of
 from me2e_compress.operators.call import FusedCall
+from me2e_compress.operators.kernels.kernel import DOMAIN
 
 GRID_SAMPLE_OPSET = 16
 """The first opset of ONNX's GridSample."""
@@ -51,7 +52,9 @@ def sample_levels(
             call.cast(each, ir.DataType.FLOAT) for each in (value, locations, weights)
         )
     known, first = array_of(sizes), array_of(starts)
-    if known is None or first is None or call.opset < GRID_SAMPLE_OPSET:
+    if call.compiled and value.dtype in (None, ir.DataType.FLOAT):
+        result = _by_kernel(call, value, sizes, starts, locations, weights)
+    elif known is None or first is None or call.opset < GRID_SAMPLE_OPSET:
         result = _by_gather(call, value, sizes, starts, locations, weights)
     else:
         maps = [
@@ -60,6 +63,16 @@ def sample_levels(
         ]
         result = _by_grid_sample(call, value, maps, locations, weights)
     return call.cast(result, kind) if kind is not None else result
+
+
+def _by_kernel(call: FusedCall, *inputs: ir.Value) -> ir.Value:
+    """Write one node; its kernel takes what :func:`sample_levels` takes."""
+    value, weights = inputs[0], inputs[-1]
+    result = call.add("MultiScaleDeformableAttention", inputs, domain=DOMAIN)
+    sizes = [call.known_size(weights, axis) for axis in range(3)]
+    result.shape = ir.Shape([*sizes, call.known_size(value, 3)])
+    result.type = ir.TensorType(ir.DataType.FLOAT)
+    return result
 
 
 def _by_grid_sample(

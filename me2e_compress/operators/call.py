@@ -32,14 +32,22 @@ class FusedCall:
         by: the name of the pass, for the provenance.
         names: of all values of the model; new ones are entered. None looks at the
             whole graph, which whoever rewrites many nodes had better do once.
+        compiled: whether a body may call compiled kernels.
     """
 
     def __init__(
-        self, node: ir.Node, *, opset: int, by: str, names: set[str] | None = None
+        self,
+        node: ir.Node,
+        *,
+        opset: int,
+        by: str,
+        names: set[str] | None = None,
+        compiled: bool = False,
     ) -> None:
         if node.graph is None:
             raise GraphError(f"node {node.name} is not in a graph")
         self.node, self.opset, self.by = node, opset, by
+        self.compiled = compiled
         self._where: ir.Graph | ir.Function = node.graph
         self.names = names_in(self._where) if names is None else names
         self._stem = node.name or str(node.outputs[0].name)
@@ -116,12 +124,15 @@ class FusedCall:
 
     def size(self, value: ir.Value, axis: int) -> Size:
         """Return how large a dimension is: a number where the graph knows it."""
-        shape = value.shape
-        dim = None if shape is None else shape[axis]
-        if isinstance(dim, int):
-            return dim
+        if (known := self.known_size(value, axis)) is not None:
+            return known
         shown = self.add("Shape", [value])
         return self.add("Gather", [shown, self.integers([axis])], {"axis": 0})
+
+    def known_size(self, value: ir.Value, axis: int) -> int | None:
+        """Return how large a dimension is, if the graph knows it."""
+        dim = None if value.shape is None else value.shape[axis]
+        return dim if isinstance(dim, int) else None
 
     def value_of(self, size: Size) -> ir.Value:
         """Return a size as an int64 value of shape [1]."""

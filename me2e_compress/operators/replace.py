@@ -81,7 +81,12 @@ def import_domains(model: ir.Model) -> None:
 
 
 def expand(
-    node: ir.Node, *, opset: int, by: str, names: set[str] | None = None
+    node: ir.Node,
+    *,
+    opset: int,
+    by: str,
+    names: set[str] | None = None,
+    compiled: bool = False,
 ) -> None:
     """Put standard operators in the place of a fused node.
 
@@ -91,6 +96,8 @@ def expand(
         opset: of ONNX's own operators, 13 or later.
         by: the name of the pass, for the provenance.
         names: of all values of the model, where many nodes are expanded.
+        compiled: whether the body may call compiled kernels; a session must then
+            register them (:mod:`me2e_compress.operators.kernels`).
 
     Raises:
         PreconditionError: the node's attributes, or its inputs' number, types or
@@ -102,7 +109,7 @@ def expand(
         raise PreconditionError(
             f"{by} needs opset {_LEAST_OPSET} or later; the graph is of {opset}"
         )
-    call = FusedCall(node, opset=opset, by=by, names=names)
+    call = FusedCall(node, opset=opset, by=by, names=names, compiled=compiled)
     inputs, attributes = _own_call(call, dialect)
     result = operator.body(call, inputs, attributes)
     _take_place(call, dialect.result_from_own(call, result, inputs))

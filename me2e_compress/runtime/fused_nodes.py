@@ -1,9 +1,10 @@
-"""Fused nodes of a graph that is to be opened: compiled kernels, or else bodies.
+"""Fused nodes of a graph that is to be opened: their bodies, with compiled kernels.
 
-A node for which there is a kernel is moved into a domain that belongs to the kernels.
-So nothing depends on whether onnxruntime prefers a function of the file or a registered
-operator of the same name, and no library of anybody else can claim a kernel's name or
-domain (which onnxruntime refuses as set twice).
+A node is replaced by its body, in which compiled kernels are called, where there are
+any, in a domain that belongs to them. So nothing depends on whether onnxruntime prefers
+a function of the file or a registered operator of the same name, and no library of
+anybody else can claim a kernel's name or domain (which onnxruntime refuses as set
+twice).
 """
 
 import functools
@@ -20,9 +21,11 @@ from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import is_standard
 from me2e_compress.operators import OWN_DOMAIN, kernels
 from me2e_compress.rewrite import value_names
+from me2e_compress.runtime.int8_values import read_int8
 from me2e_compress.runtime.providers import CPU, Provider
 
 _BY = "session"
+_FLOAT_KERNEL = kernels.KERNELS[0].op_type
 _COMPILED = {each.op_type: each for each in kernels.KERNELS}
 
 
@@ -110,16 +113,15 @@ def compiled_or_expanded(
     taken = value_names(copy.graph)
     try:
         for node in list(unknown_nodes(copy)):
-            fused = node.op_type in ours and operators.find(node) is not None
-            if fused and node.domain != kernels.DOMAIN:
-                _replace(node, copy, taken, compiled)
+            if node.op_type in ours and operators.find(node) is not None:
+                _expand(node, copy, taken, compiled)
     except PreconditionError as error:
         raise GraphError(str(error)) from error
+    for node in list(unknown_nodes(copy)):
+        if compiled and _calls_kernel(node):
+            read_int8(node, _opset(node, copy), _names(node, taken))
     needed: dict[str, kernels.Kernel] = {}
     for node in unknown_nodes(copy):
-        if compiled and _takes(node.op_type, node) and node.domain == OWN_DOMAIN:
-            node.domain = kernels.DOMAIN
-            node.attributes.clear()
         if node.domain == kernels.DOMAIN and node.graph is not None:
             needed[node.op_type] = _COMPILED[node.op_type]
             node.graph.opset_imports[kernels.DOMAIN] = 1
@@ -140,25 +142,22 @@ def _is_bare(node: ir.Node) -> bool:
     )
 
 
-def _takes(op_type: str, node: ir.Node) -> bool:
-    """Return whether there is a kernel for these inputs: it computes in float32."""
-    kinds = [value.dtype for value in node.inputs if value is not None]
-    return op_type in _COMPILED and all(
-        kind is None or kind == ir.DataType.FLOAT or kind.is_integer() for kind in kinds
-    )
+def _expand(node: ir.Node, model: ir.Model, names: set[str], compiled: bool) -> None:
+    """Write a node as its body, unless it has one in the file that may run."""
+    if node.op_identifier() in model.functions and not compiled:
+        return
+    opset, taken = _opset(node, model), _names(node, names)
+    operators.expand(node, opset=opset, by=_BY, names=taken, compiled=compiled)
 
 
-def _replace(node: ir.Node, model: ir.Model, names: set[str], compiled: bool) -> None:
-    """Write a node in the toolkit's own form, or as its body where no kernel fits."""
-    found, where = operators.find(node), node.graph
-    assert found is not None
-    assert where is not None
-    operator, dialect = found
-    opset = where.opset_imports.get("", model.opset_imports.get("", 1))
-    taken = names if isinstance(where, ir.Graph) else None
-    if compiled and _takes(operator.own.op_type, node):
-        if dialect is not operator.own:
-            own = operator.own
-            operators.translate(node, own, opset=opset, by=_BY, names=taken)
-    elif node.op_identifier() not in model.functions:
-        operators.expand(node, opset=opset, by=_BY, names=taken)
+def _calls_kernel(node: ir.Node) -> bool:
+    return node.domain == kernels.DOMAIN and node.op_type == _FLOAT_KERNEL
+
+
+def _opset(node: ir.Node, model: ir.Model) -> int:
+    assert node.graph is not None
+    return node.graph.opset_imports.get("", model.opset_imports.get("", 1))
+
+
+def _names(node: ir.Node, names: set[str]) -> set[str] | None:
+    return names if isinstance(node.graph, ir.Graph) else None

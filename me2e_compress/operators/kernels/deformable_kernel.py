@@ -33,8 +33,8 @@ QUERIES = 128
 
 # words of one call, as `compute` hands them to every `block`
 VALUE, SHAPES, STARTS, PLACES, SHARES, SCALE, ZERO, OUT = range(8)
-N, S, M, D, L, Q, P, SCALES, WIDE_SHAPES, WIDE_STARTS = range(8, 18)
-WORDS = 18
+N, S, M, D, L, Q, P, SCALES, WIDE_SHAPES, WIDE_STARTS, SHARED = range(8, 19)
+WORDS = 19
 
 RANKS = (4, 2, 1, 6, 5, 1, 1)
 RANK_WRONG, SIZE_WRONG, NOT_WHOLE, BEYOND, TOO_LARGE, TOO_MANY, SCALE_WRONG = range(7)
@@ -150,6 +150,8 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
         to_query = min(from_query + QUERIES, a[Q])
         points, row = a[L] * a[P], a[M] * a[D]
         at_once = a[M] if points == 0 else min(a[M], CAPACITY // points)
+        if a[SHARED]:
+            at_once = 1  # one head after the other looks at the same places
         w, o = _floats(), _ints()
         _tables(a, w, o, at_once)
         for q in range(from_query, to_query):
@@ -157,7 +159,8 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
             while m < a[M]:
                 heads = min(at_once, a[M] - m)
                 first = (n * a[Q] + q) * a[M] + m
-                places = floats(a[PLACES] + first * points * 8)
+                looked_at = n * a[Q] + q if a[SHARED] else first
+                places = floats(a[PLACES] + looked_at * points * 8)
                 shares = floats(a[SHARES] + first * points * 4)
                 _corners(w, o, places, shares, heads * points, row)
                 rows = a[VALUE] + (n * a[S] * row + m * a[D]) * bytes_each
@@ -207,11 +210,11 @@ def _read(t: Any, context: int, index: int, to: int) -> Word:
 def _misfit(a: Any, x: Any) -> Word:
     """Return which message says what does not fit; -1 if everything does."""
     s, m, d, levels, points = x[1], x[2], x[3], x[10], x[34]
-    shared = x[30] == x[0] and x[32] == m and x[33] == levels and x[35] == 2
-    if not (shared and x[11] == 2 and x[20] == levels):
+    same = x[30] == x[0] and x[33] == levels and x[35] == 2 and x[42] == m
+    if not (same and x[11] == 2 and x[20] == levels):
         return SIZE_WRONG
     for k in range(5):
-        if x[40 + k] != x[30 + k]:
+        if x[40 + k] != x[30 + k] and not (k == 2 and x[32] == 1):
             return SIZE_WRONG
     if x[10 + TYPE] not in WHOLE or x[20 + TYPE] not in WHOLE:
         return NOT_WHOLE
@@ -249,6 +252,7 @@ def _compute(inputs: int) -> Callable[[int, int], Word]:
             a[i] = x[EACH * i + ADDRESS]
         a[N], a[S], a[M], a[D] = x[0], x[1], x[2], x[3]
         a[L], a[Q], a[P], a[SCALES] = x[10], x[31], x[34], x[EACH * SCALE]
+        a[SHARED] = x[32] == 1 and a[M] != 1
         a[WIDE_SHAPES] = x[10 + TYPE] == abi.INT64
         a[WIDE_STARTS] = x[20 + TYPE] == abi.INT64
         misfit = _misfit(a, x)

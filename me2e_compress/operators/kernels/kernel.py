@@ -32,8 +32,8 @@ _DEFORMABLE = (
     "the inputs have not the ranks that they must: value 4, spatial_shapes 2,"
     " level_start_index 1, sampling_locations 6, attention_weights 5",
     "the inputs do not fit each other: they must be value [N,S,M,D], spatial_shapes"
-    " [L,2], level_start_index [L], sampling_locations [N,Q,M,L,P,2] and"
-    " attention_weights [N,Q,M,L,P]",
+    " [L,2], level_start_index [L], sampling_locations [N,Q,M,L,P,2] (or M"
+    " 1) and attention_weights [N,Q,M,L,P]",
     "spatial_shapes and level_start_index must be int32 or int64",
     "a level lies outside of value: level_start_index + height x width is more than"
     " value has rows, or a number is negative",

@@ -3,11 +3,13 @@
 from typing import Any
 
 import numpy as np
+import onnx_ir as ir
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.operators import Dialect, kernels
+from me2e_compress.operators.deformable_aggregation import DeformableAggregation
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.runtime import fused_nodes
 from me2e_compress.runtime.session import Session
@@ -57,3 +59,89 @@ def test_every_dialect_answers_its_reference(
 
     expected = OPERATOR.dialect_reference(dialect, list(arrays.values()), {})
     assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
+    random = np.random.default_rng(3)
+    sizes = np.array([[[4, 6], [2, 3]], [[3, 5], [0, 2]]], np.int32)
+    areas = sizes.astype(np.int64).prod(axis=-1)
+    starts = (areas.ravel().cumsum() - areas.ravel()).reshape(2, 2)
+    float32 = np.float32
+    arrays: dict[str, Any] = {
+        "mc_ms_feat": random.normal(size=(2, areas.sum(), 12)).astype(float32),
+        "spatial_shape": sizes,
+        "scale_start_index": starts.astype(np.int32),
+        "sampling_location": random.uniform(-0.2, 1.2, (2, 200, 5, 2, 2)),
+        "weights": random.normal(size=(2, 200, 5, 2, 2, 3)).astype(float32),
+    }
+    arrays["sampling_location"] = arrays["sampling_location"].astype(float32)
+    operator = DeformableAggregation()
+    model = graph_of(operator.dialects[0], arrays, opset=17)
+    _, needed = fused_nodes.compiled_or_expanded(model, compiled=True)
+    assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]
+
+    found = Session(model, threads=1).run(arrays)["result"]
+
+    expected = operator.reference(list(arrays.values()), {})
+    assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+STORED = """
+<ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1]>
+call (TYPE[2,63,24] stored, int32[2,2] sizes, int32[2] starts,
+      float[2,50,3,2,4,2] at, float[2,50,3,2,4] w, float[24] by_channel)
+    => (float[2,50,3,8] y)
+<float one = {0.02}, TYPE zero = {ZERO}, int64[4] parted = {0, 0, 3, 8}> {
+    MADE
+    value = Reshape(real, parted)
+    y = MultiscaleDeformableAttnPlugin_TRT(value, sizes, starts, at, w)
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "made"),
+    [
+        ("uint8", "real = DequantizeLinear(stored, one, zero)"),
+        ("int8", "real = DequantizeLinear(stored, one, zero)"),
+        ("int8", "real = DequantizeLinear<axis=2>(stored, by_channel)"),
+        ("int8", "c = Cast<to=1>(stored) real = Mul(c, by_channel)"),
+    ],
+)
+def test_int8_values_are_read_as_they_are(kind: str, made: str) -> None:
+    zero = {"uint8": "119", "int8": "-3"}[kind]
+    text = STORED.replace("TYPE", kind).replace("ZERO", zero).replace("MADE", made)
+    model = ir.from_onnx_text(text)
+    random = np.random.default_rng(4)
+    low, high = np.iinfo(kind).min, np.iinfo(kind).max
+    feeds: dict[str, Any] = {
+        "stored": random.integers(low, high + 1, (2, 63, 24)).astype(kind),
+        "sizes": np.array([[5, 11], [2, 4]], np.int32),
+        "starts": np.array([0, 55], np.int32),
+        "at": random.uniform(-0.2, 1.2, (2, 50, 3, 2, 4, 2)).astype(np.float32),
+        "w": random.uniform(0, 1, (2, 50, 3, 2, 4)).astype(np.float32),
+        "by_channel": random.uniform(0.01, 0.03, 24).astype(np.float32),
+    }
+    ready, needed = fused_nodes.compiled_or_expanded(model, compiled=True)
+    assert [each.op_type for each in needed] == [
+        f"MultiScaleDeformableAttention{kind.capitalize()}"
+    ]
+    assert not {"DequantizeLinear", "Cast"} & {node.op_type for node in ready.graph}
+
+    found = Session(model, threads=1).run(feeds)["y"]
+
+    stored = feeds["stored"].astype(np.float64)
+    plain = "by_channel" in made
+    real = stored * feeds["by_channel"] if plain else (stored - int(zero)) * 0.02
+    inputs = [real.reshape(2, 63, 3, 8), *list(feeds.values())[1:5]]
+    assert np.allclose(found, OPERATOR.reference(inputs, {}), rtol=1e-4, atol=1e-4)
+
+
+def test_scales_that_the_kernel_does_not_know_stay_in_float() -> None:
+    made = "p = Reshape(stored, parted) real = DequantizeLinear<axis=3>(p, by_head)"
+    text = STORED.replace("TYPE", "int8").replace("ZERO", "0").replace("MADE", made)
+    text = text.replace("float[24] by_channel", "float[8] by_head")
+
+    _, needed = fused_nodes.compiled_or_expanded(ir.from_onnx_text(text), compiled=True)
+
+    assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]
