@@ -1,0 +1,134 @@
+"""What ``hoist-linear`` saves, and what merging layers that share their input costs.
+
+    python -m benchmarks.bench_hoisting
+
+The keys of VAD-tiny's motion decoder as they are exported and behind the pass, then
+queries, keys and values (or sampling offsets and weights) apart and merged: CPU time
+of onnxruntime on two threads, the least of rounds that alternate.
+"""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+import onnx_ir as ir
+import onnxruntime
+
+from me2e_compress import graph
+from me2e_compress.graph import provenance
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes.base import Context
+from me2e_compress.passes.hoist_linear import HoistLinear
+
+ROUNDS = 10
+AGENTS, TOKENS, HEADS, CHANNELS = 1800, 101, 8, 32
+WIDTH = HEADS * CHANNELS
+KEYS = f"""<ir_version: 8, opset_import: ["" : 17]>
+keys (float[1,{TOKENS},{WIDTH}] map, float[{AGENTS},{TOKENS},2] position,
+      float[{AGENTS},{HEADS},1,{CHANNELS}] q) => (float[A,B,C,D] scores) {{
+    linear = MatMul(position, embed)  wide = Add(linear, start)  query = Add(map, wide)
+    product = MatMul(query, weight)  keys = Add(product, bias)
+    split = Reshape(keys, heads)  turned = Transpose<perm = [0, 2, 3, 1]>(split)
+    scores = MatMul(q, turned)
+}}"""
+LAYERS = (
+    (20, 64, (64, 64, 64)),
+    (150, 64, (64, 64, 64)),
+    (300, 256, (256, 256, 256)),
+    (2_000, 256, (256, 256, 256)),
+    (10_000, 256, (128, 64)),
+)
+"""Rows, their width, and the columns of the layers that read them."""
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+
+def normal(*shape: int) -> npt.NDArray[np.float32]:
+    numbers = np.random.default_rng(0).normal(size=shape) / 10
+    return numbers.astype(np.float32)
+
+
+def model_of(text: str, weights: Arrays) -> ir.Model:
+    proto = onnx.parser.parse_model(text)
+    for name, array in weights.items():
+        proto.graph.initializer.append(onnx.numpy_helper.from_array(array, name))
+    model = ir.from_proto(proto)
+    for index, node in enumerate(model.graph):
+        node.name = f"n{index}"
+        provenance.stamp(node, provenance.Provenance("all", (node.name,)))
+    graph.infer_shapes(model)
+    return model
+
+
+def hoisted(text: str, weights: Arrays, *, merge: bool) -> ir.Model:
+    model = model_of(text, weights)
+    context = Context(ModuleMap.whole())
+    return HoistLinear(merge_shared=merge).run(model, context).model
+
+
+def session_of(model: ir.Model) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 2
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    data = ir.to_proto(model).SerializeToString()
+    return onnxruntime.InferenceSession(
+        data, options, providers=["CPUExecutionProvider"]
+    )
+
+
+def milliseconds(models: list[ir.Model], feeds: Arrays, runs: int) -> list[float]:
+    """Time models in turns: the least CPU time of a run of each."""
+    sessions = [session_of(model) for model in models]
+    least = [float("inf")] * len(models)
+    for _ in range(ROUNDS):
+        for at, session in enumerate(sessions):
+            start = time.process_time()
+            for _ in range(runs):
+                session.run(None, dict(feeds))
+            least[at] = min(least[at], (time.process_time() - start) / runs * 1e3)
+    return least
+
+
+def show_keys() -> None:
+    weights = {
+        "embed": normal(2, WIDTH), "start": normal(WIDTH),
+        "weight": normal(WIDTH, WIDTH), "bias": normal(WIDTH),
+        "heads": np.array((AGENTS, TOKENS, HEADS, CHANNELS)),
+    }  # fmt: skip
+    feeds = {
+        "map": normal(1, TOKENS, WIDTH),
+        "position": normal(AGENTS, TOKENS, 2),
+        "q": normal(AGENTS, HEADS, 1, CHANNELS),
+    }
+    models = [model_of(KEYS, weights), hoisted(KEYS, weights, merge=False)]
+    before, after = milliseconds(models, feeds, 1)
+    print(f"keys of the motion decoder: {before:.1f} ms, hoisted {after:.1f} ms")
+
+
+def show_layers(rows: int, width: int, columns: tuple[int, ...]) -> None:
+    weights: dict[str, npt.NDArray[Any]] = {}
+    body, outputs = [], []
+    for at, count in enumerate(columns):
+        weights |= {f"w{at}": normal(width, count), f"b{at}": normal(count)}
+        body.append(f"p{at} = MatMul(x, w{at})  s{at} = Add(p{at}, b{at})")
+        body.append(f"y{at} = Relu(s{at})")
+        outputs.append(f"float[1,{rows},{count}] y{at}")
+    opset = '<ir_version: 8, opset_import: ["" : 17]>'
+    head = f"{opset}\nlayers (float[1,{rows},{width}] x) => ({', '.join(outputs)})"
+    text = f"{head} {{ {'  '.join(body)} }}"
+    models = [model_of(text, weights), hoisted(text, weights, merge=True)]
+    runs = max(1, 20_000_000 // (rows * width * sum(columns)))
+    apart, merged = milliseconds(models, {"x": normal(1, rows, width)}, runs)
+    print(
+        f"{rows:>6} x {width} @ {columns}: {apart:.3f} ms apart,"
+        f" merged {merged:.3f} ms, {merged / apart:.2f}"
+    )
+
+
+if __name__ == "__main__":
+    show_keys()
+    for each in LAYERS:
+        show_layers(*each)
