@@ -14,6 +14,7 @@ from me2e_compress.driving.latency import LATENCY_SOURCES
 from me2e_compress.driving.policies import POLICIES
 from me2e_compress.errors import RecipeError
 from me2e_compress.evaluators import EVALUATORS
+from me2e_compress.operators import OPERATORS
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES
 from me2e_compress.registry import Entry, Option, Registry, describe
@@ -116,6 +117,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "latency-sources": LATENCY_SOURCES,
     "evaluators": EVALUATORS,
     "providers": PROVIDERS,
+    "operators": OPERATORS,
 }
 """To which other packages add."""
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
