@@ -25,6 +25,7 @@ from me2e_compress.runtime.fused_nodes import compiled_or_expanded
 from me2e_compress.runtime.opening import open_graph
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.doctor import doctor
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import CALL, arrays_of
 
@@ -226,6 +227,15 @@ def test_without_kernels_bodies_run(
     found = Session(model, threads=1).run(arrays)["result"]
 
     assert np.allclose(found, expected(arrays), atol=1e-4)
+
+
+def test_doctor_says_why_no_kernel_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(availability, "find_spec", lambda name: None)
+
+    (found,) = (each for each in doctor().checkups if each.what == "compiled kernels")
+
+    assert found.found is None
+    assert found.advice.endswith("pip install 'me2e-compress[fast]'")
 
 
 @needs_kernels
