@@ -5,7 +5,7 @@ onnxruntime's CPU (1.31, two cores of an AMD Zen 5, ``python -m
 benchmarks.bench_hoisting``) queries, keys and values of 20 rows of 64 take 0.8 to 0.9
 of the time of three products, of 150 rows the same, of 300 x 256 1.0 to 1.1, of
 2,000 x 256 at least 1.2; sampling offsets and weights of 10,000 rows 1.1. In int8 all
-columns would share one range besides. TensorRT joins such products by itself.
+columns would share one range besides.
 """
 
 import itertools
