@@ -2,10 +2,14 @@ import numpy as np
 import onnx_ir as ir
 import onnxruntime
 
+from me2e_compress import recipe
+from me2e_compress.graph import static_shape
+from me2e_compress.manager import PassManager
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.attach_bodies import AttachBodies
 from me2e_compress.passes.expand_operators import ExpandOperators
-from tests.passes.small import apply, compute, read
+from tests.passes.decomposed import Sizes, decomposed
+from tests.passes.small import NO_MODULES, apply, compute, ops, read
 
 HEAD = """<ir_version: 9, opset_import: ["" : 17, "me2e" : 1, "mmdeploy" : 1]>
 net (float[1,20,2,4] v, float[1,5,2,2,3,2] at, float[1,5,2,2,3] w, float[1,4,2,4] u)
@@ -76,6 +80,21 @@ def test_nodes_of_other_sizes_share_one_that_reads_them_when_it_runs() -> None:
         "u", np.array([[1, 2], [1, 2]]), np.array([0, 2])
     )
     np.testing.assert_allclose(in_plain_onnxruntime(model), expected, atol=1e-5)
+
+
+def test_the_recipe_that_fuses_writes_what_plain_onnxruntime_runs() -> None:
+    model = decomposed(Sizes())
+    draws = np.random.default_rng(6)
+    fed = {
+        str(port.name): draws.normal(size=static_shape(port)).astype(np.float32)
+        for port in model.graph.inputs
+    }
+
+    made = PassManager(recipe.load("fused")).run(model.clone(), NO_MODULES).model
+
+    assert "MultiScaleDeformableAttention" in ops(made)
+    for one, other in zip(compute(made, fed), compute(model, fed), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4)
 
 
 def test_a_second_time_there_is_nothing_to_do() -> None:
