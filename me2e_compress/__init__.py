@@ -25,11 +25,8 @@ if TYPE_CHECKING:
     from me2e_compress.study import StudyResult, load_study, run_study
     from me2e_compress.study.write import write_study
     from me2e_compress.workflows.build import BuildOptions, EngineResult, build
-    from me2e_compress.workflows.calibrate import (
-        CalibrateOptions,
-        CalibrateResult,
-        calibrate,
-    )
+    from me2e_compress.workflows.calibrate import CalibrateOptions, calibrate
+    from me2e_compress.workflows.calibrate_result import CalibrateResult
     from me2e_compress.workflows.compare import CompareResult, compare
     from me2e_compress.workflows.compress import CompressOptions, compress
     from me2e_compress.workflows.compress_result import CompressResult
@@ -132,7 +129,8 @@ _ROOMS = {
     "study": ("StudyResult", "load_study", "run_study"),
     "study.write": ("write_study",),
     "workflows.build": ("BuildOptions", "EngineResult", "build"),
-    "workflows.calibrate": ("CalibrateOptions", "CalibrateResult", "calibrate"),
+    "workflows.calibrate": ("CalibrateOptions", "calibrate"),
+    "workflows.calibrate_result": ("CalibrateResult",),
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),

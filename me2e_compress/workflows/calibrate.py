@@ -23,6 +23,7 @@ from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.workflows.calibrate_result import CalibrateResult
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
@@ -36,10 +37,6 @@ from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
-from me2e_compress.workflows.result import Result, Table
-
-_SHOWN = 5
-"""How many of a kind are listed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,64 +93,6 @@ class CalibrateOptions:
                 "a shard has no ranges yet: leave --tensorrt-cache and"
                 " --onnxruntime-table to --merge"
             )
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class CalibrateResult(Result):
-    """Ranges, or the statistics of one shard.
-
-    Attributes:
-        output: the file that was written.
-        frames: how many frames were seen.
-        ranges: of every tensor; None of a shard.
-        shard: ``2/4`` of a shard, else None.
-    """
-
-    output: Path
-    frames: int
-    ranges: Ranges | None
-    shard: str | None = None
-
-    @property
-    def headline(self) -> str:
-        """File, tensors, method, frames."""
-        if self.ranges is None:
-            return f"{self.output}: shard {self.shard}, {self.frames} frames"
-        found = self.ranges
-        return (
-            f"{self.output}: {len(found.tensors)} tensors, {found.method},"
-            f" {found.frames} frames"
-        )
-
-    def lines(self) -> tuple[str, ...]:
-        """Return the headline, and which ranges deserve a look."""
-        if self.ranges is None:
-            return (self.headline,)
-        worst = sorted(self.ranges.outliers.items(), key=lambda item: -item[1])
-        outliers = [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
-        return (
-            self.headline,
-            *_first(list(self.ranges.dead), "always zero"),
-            *_first(outliers, "a few elements make the range"),
-        )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return none: the lines say what there is to read."""
-        return ()
-
-    def records(self) -> list[dict[str, object]]:
-        """Return a row a tensor."""
-        tensors = {} if self.ranges is None else self.ranges.tensors
-        return [
-            {"tensor": name, "low": low, "high": high}
-            for name, (low, high) in tensors.items()
-        ]
-
-    def to_json(self) -> object:
-        """Return the ranges, and which are always zero; of a shard which it is."""
-        if self.ranges is None:
-            return {"shard": self.shard, "frames": self.frames}
-        return {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
 
 
 def calibrate(
@@ -300,10 +239,3 @@ def _fraction(text: str) -> tuple[int, int]:
     if not slash or not (number.isdecimal() and count.isdecimal()):
         raise RecipeError(f"--shard is {text!r}; write 2/4 for the second of four")
     return int(number), int(count)
-
-
-def _first(names: list[str], what: str) -> tuple[str, ...]:
-    if not names:
-        return ()
-    more = f"; and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return (f"{len(names)} {what}: {'; '.join(names[:_SHOWN])}{more}",)

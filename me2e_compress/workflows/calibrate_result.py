@@ -1,0 +1,75 @@
+"""What a calibration found: ranges, or the statistics of one shard."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.workflows.result import Result, Table
+
+_SHOWN = 5
+"""How many of a kind are listed."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CalibrateResult(Result):
+    """Ranges, or the statistics of one shard.
+
+    Attributes:
+        output: the file that was written.
+        frames: how many frames were seen.
+        ranges: of every tensor; None of a shard.
+        shard: ``2/4`` of a shard, else None.
+    """
+
+    output: Path
+    frames: int
+    ranges: Ranges | None
+    shard: str | None = None
+
+    @property
+    def headline(self) -> str:
+        """File, tensors, method, frames."""
+        if self.ranges is None:
+            return f"{self.output}: shard {self.shard}, {self.frames} frames"
+        found = self.ranges
+        return (
+            f"{self.output}: {len(found.tensors)} tensors, {found.method},"
+            f" {found.frames} frames"
+        )
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the headline, and which ranges deserve a look."""
+        if self.ranges is None:
+            return (self.headline,)
+        worst = sorted(self.ranges.outliers.items(), key=lambda item: -item[1])
+        outliers = [f"{name} (largest / rms {crest:.0f})" for name, crest in worst]
+        return (
+            self.headline,
+            *_first(list(self.ranges.dead), "always zero"),
+            *_first(outliers, "a few elements make the range"),
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return none: the lines say what there is to read."""
+        return ()
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a tensor."""
+        tensors = {} if self.ranges is None else self.ranges.tensors
+        return [
+            {"tensor": name, "low": low, "high": high}
+            for name, (low, high) in tensors.items()
+        ]
+
+    def to_json(self) -> object:
+        """Return the ranges, and which are always zero; of a shard which it is."""
+        if self.ranges is None:
+            return {"shard": self.shard, "frames": self.frames}
+        return {**dataclasses.asdict(self.ranges), "dead": self.ranges.dead}
+
+
+def _first(names: list[str], what: str) -> tuple[str, ...]:
+    if not names:
+        return ()
+    more = f"; and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return (f"{len(names)} {what}: {'; '.join(names[:_SHOWN])}{more}",)
