@@ -29,6 +29,6 @@ def knowledge() -> PluginKnowledge:
     their entries; a graph without plugins never imports it.
     """
     found: PluginKnowledge = pkgutil.resolve_name(
-        "me2e_compress.operators.knowledge:Knowledge"
+        "me2e_compress.operators.dialect_knowledge:DialectKnowledge"
     )()
     return found

@@ -29,7 +29,7 @@ OPERATORS: Registry[Operator] = Registry(
         "grid-sampler-3d": f"{_HERE}.grid_sampler:GridSampler3D",
         "select-and-pad": f"{_HERE}.select_and_pad:SelectAndPad",
         "bev-pool": f"{_HERE}.bev_pool:BEVPool",
-        "multi-head-attention": f"{_HERE}.multi_head_attention:MultiHeadAttention",
+        "multi-head-attention": f"{_HERE}.multi_head_attention:FusedMultiHeadAttention",
         "deformable-convolution": (
             f"{_HERE}.deformable_convolution:DeformableConvolution"
         ),

@@ -35,7 +35,7 @@ def _dialect(name: str, op_type: str, domain: str, source: str) -> Dialect:
 
 
 @dataclasses.dataclass(frozen=True)
-class MultiHeadAttention(Operator):
+class FusedMultiHeadAttention(Operator):
     """Softmax(query key^T / sqrt(C)) value, for each head.
 
     Own form ``me2e::MultiHeadAttention``: query [B, Q, C]; key and value [B, K, C]; the

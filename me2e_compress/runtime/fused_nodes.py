@@ -89,7 +89,7 @@ def compiled_or_expanded(
     *,
     compiled: bool,
     theirs: Callable[[str], bool] = lambda op_type: False,
-) -> tuple[ir.Model, tuple[kernels.Kernel, ...]]:
+) -> tuple[ir.Model, tuple[kernels.CompiledKernel, ...]]:
     """Put kernels, or bodies, in the place of the fused nodes.
 
     Args:
@@ -120,7 +120,7 @@ def compiled_or_expanded(
     for node in list(unknown_nodes(copy)):
         if compiled and _calls_kernel(node):
             read_int8(node, _opset(node, copy), _names(node, taken))
-    needed: dict[str, kernels.Kernel] = {}
+    needed: dict[str, kernels.CompiledKernel] = {}
     for node in unknown_nodes(copy):
         if node.domain == kernels.DOMAIN and node.graph is not None:
             needed[node.op_type] = _COMPILED[node.op_type]

@@ -5,7 +5,11 @@ from pathlib import Path
 
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.targets.tensorrt.engine import Engine, EngineSettings, build_engine
+from me2e_compress.targets.tensorrt.tensorrt_engine import (
+    EngineSettings,
+    TensorRTEngine,
+    build_engine,
+)
 from me2e_compress.workflows.checks import model_path, output_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -37,7 +41,7 @@ class EngineResult(Result):
 
     model: Path
     output: Path
-    engine: Engine
+    engine: TensorRTEngine
 
     @property
     def headline(self) -> str:

@@ -5,7 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.targets.tensorrt.engine import Engine, EngineSettings
+from me2e_compress.targets.tensorrt.tensorrt_engine import (
+    EngineSettings,
+    TensorRTEngine,
+)
 from me2e_compress.workflows import build as workflow
 from tests.cli.conftest import Command
 from tests.docs.documents import faults
@@ -16,9 +19,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[EngineSettings]:
     """What TensorRT was asked for; it answers at once."""
     found: list[EngineSettings] = []
 
-    def build_engine(path: Path, settings: EngineSettings) -> Engine:
+    def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
         found.append(settings)
-        return Engine(b"engine", "10.4.0", 3, 1.5)
+        return TensorRTEngine(b"engine", "10.4.0", 3, 1.5)
 
     monkeypatch.setattr(workflow, "build_engine", build_engine)
     return found

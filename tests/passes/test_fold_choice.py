@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.passes import PassResult
 from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.fold_constants.min_cut import Network
+from me2e_compress.passes.fold_constants.min_cut import FlowNetwork
 from tests.passes.small import apply, ops, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
@@ -33,7 +33,7 @@ def cost(given_edges: Edges, side: set[int]) -> int:
 @settings(max_examples=100, deadline=None)
 @given(edges())
 def test_no_cut_is_cheaper_and_no_equal_one_larger(given_edges: Edges) -> None:
-    network = Network()
+    network = FlowNetwork()
     for _ in range(6):
         network.vertex()
     for tail, head, price in given_edges:

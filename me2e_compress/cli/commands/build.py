@@ -7,7 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
-from me2e_compress.targets.tensorrt.engine import EngineSettings, Precision
+from me2e_compress.targets.tensorrt.tensorrt_engine import EngineSettings, Precision
 from me2e_compress.workflows import build as workflow
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="the engine")]

@@ -5,6 +5,6 @@ A session calls them on its own threads, in the place of the nodes that
 """
 
 from me2e_compress.operators.kernels.availability import why_not
-from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, Kernel
+from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, CompiledKernel
 
-__all__ = ["DOMAIN", "KERNELS", "Kernel", "why_not"]
+__all__ = ["DOMAIN", "KERNELS", "CompiledKernel", "why_not"]

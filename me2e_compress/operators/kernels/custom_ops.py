@@ -14,7 +14,7 @@ from typing import Any
 import onnxruntime as ort
 
 from me2e_compress.operators.kernels import abi
-from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, Kernel
+from me2e_compress.operators.kernels.kernel import DOMAIN, KERNELS, CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
 from me2e_compress.operators.kernels.store import default_folder
 from me2e_compress.operators.kernels.trampoline import STATE_OFFSET, trampoline
@@ -28,7 +28,7 @@ _asked = threading.local()
 
 def register(
     options: ort.SessionOptions,
-    kernels: Iterable[Kernel],
+    kernels: Iterable[CompiledKernel],
     begins: Callable[[], None] = lambda: None,
 ) -> None:
     """Let sessions of these options run kernels; to be called once for them.
@@ -85,7 +85,7 @@ _KEPT: list[object] = []
 
 
 @functools.cache
-def _operator(kernel: Kernel, compute: int, block: int, base: int) -> Any:
+def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> Any:
     """Write an ``OrtCustomOp``, and behind it the state of its kernels."""
     name = ctypes.create_string_buffer(kernel.op_type.encode())
     said = [

@@ -6,7 +6,7 @@ from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, UINT8
 
 
 @dataclasses.dataclass(frozen=True)
-class Kernel:
+class CompiledKernel:
     """A compiled operator.
 
     Attributes:
@@ -45,7 +45,7 @@ _DEFORMABLE = (
 _INPUTS = (FLOAT, ANY, ANY, FLOAT, FLOAT)
 
 KERNELS = tuple(
-    Kernel(
+    CompiledKernel(
         f"MultiScaleDeformableAttention{word}", "deformable_kernel", inputs, _DEFORMABLE
     )
     for word, inputs in (

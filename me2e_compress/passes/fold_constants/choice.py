@@ -17,7 +17,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.passes.fold_constants.knowledge import Expression, Knowledge
-from me2e_compress.passes.fold_constants.min_cut import Network
+from me2e_compress.passes.fold_constants.min_cut import FlowNetwork
 from me2e_compress.passes.work import work
 
 ENTRY_BYTES = 64
@@ -118,7 +118,7 @@ class _Market:
 
     def cheapest(self, lot: list[Expression]) -> list[Expression]:
         """Return what goes of a lot where that costs least: the source's side."""
-        network = Network()
+        network = FlowNetwork()
         source, sink = network.vertex(), network.vertex()
         place = {one: network.vertex() for one in lot}
         for one in lot:  # one that stays is paid for in every frame

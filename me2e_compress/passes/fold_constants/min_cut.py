@@ -4,7 +4,7 @@ import math
 from collections import deque
 
 
-class Network:
+class FlowNetwork:
     """Vertices, numbered from 0, and edges between them, each with a capacity."""
 
     def __init__(self) -> None:

@@ -23,7 +23,7 @@ from me2e_compress.rewrite import Array, maker, sole_reader
 
 
 @dataclasses.dataclass(frozen=True)
-class Operand:
+class BatchOperand:
     """The right operand of a batched product, taken apart.
 
     Attributes:
@@ -61,7 +61,7 @@ def split_operand(product: ir.Node, rewriter: Rewriter) -> int | None:
     return saved
 
 
-def _operand(product: ir.Node) -> Operand | None:
+def _operand(product: ir.Node) -> BatchOperand | None:
     if product.op_type != "MatMul" or product.domain not in ("", "ai.onnx"):
         return None
     right = product.inputs[1]
@@ -89,7 +89,7 @@ def _operand(product: ir.Node) -> Operand | None:
             return None
     if not shared and any(layer.bias() is not None for layer in narrow):
         return None
-    return Operand(layout, tuple(shared), tuple(narrow), tuple(nodes))
+    return BatchOperand(layout, tuple(shared), tuple(narrow), tuple(nodes))
 
 
 def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
@@ -117,7 +117,9 @@ def _terms(value: ir.Value) -> tuple[list[ir.Value], list[ir.Node]] | None:
 class _Writer:
     """Writes the products of the terms before the product of their sum."""
 
-    def __init__(self, product: ir.Node, found: Operand, rewriter: Rewriter) -> None:
+    def __init__(
+        self, product: ir.Node, found: BatchOperand, rewriter: Rewriter
+    ) -> None:
         self.product, self.found, self.rewriter = product, found, rewriter
         self.values: list[ir.Value] = []
 

@@ -27,7 +27,7 @@ from me2e_compress.passes.hoist_linear.ways import (
     Direct,
     Distributed,
     Moved,
-    Stored,
+    Precomputed,
     Term,
     Way,
     uses_weight,
@@ -142,7 +142,7 @@ class Prices:
     def direct(self, asked: Question) -> Price:
         """Price the product of the value as it is, kept for it if it is owned."""
         if holds_numbers(asked.value):
-            return Price(Stored(asked.value), asked.product_bytes / self.rate, 0)
+            return Price(Precomputed(asked.value), asked.product_bytes / self.rate, 0)
         macs = _size(asked.shape) * asked.columns
         moved = asked.product_bytes + _size(asked.shape) * _item(asked.value)
         cost = 1.0 + macs / MACS_PER_NODE + moved / MOVED_BYTES_PER_NODE

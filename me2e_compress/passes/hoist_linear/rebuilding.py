@@ -14,7 +14,7 @@ from me2e_compress.passes.hoist_linear.ways import (
     Composed,
     Direct,
     Distributed,
-    Stored,
+    Precomputed,
     Term,
     Way,
 )
@@ -160,7 +160,7 @@ class _Writer:
         """Write a way, and one vector for all that it adds to every row."""
         if isinstance(way, Direct):
             return self._multiply(way.value, matrix, vector)
-        if isinstance(way, Stored):
+        if isinstance(way, Precomputed):
             return self._constant(times(way.value, matrix, vector), matrix.name)
         if isinstance(way, Composed):
             return self._write_way(way.way, matrix.behind(way), vector)
@@ -241,12 +241,12 @@ def _without_vectors(
     kept = [
         term
         for term in terms
-        if not isinstance(term.way, Stored) or math.prod(term.shape[:-1]) != 1
+        if not isinstance(term.way, Precomputed) or math.prod(term.shape[:-1]) != 1
     ]
     full = np.broadcast_shapes(*(term.shape[:-1] for term in terms))
     if not kept or np.broadcast_shapes(*(term.shape[:-1] for term in kept)) != full:
         return terms, vector
     for term in terms:
-        if term not in kept and isinstance(term.way, Stored):
+        if term not in kept and isinstance(term.way, Precomputed):
             vector = times(term.way.value, matrix.part(term), vector).reshape(-1)
     return kept, vector

@@ -16,7 +16,7 @@ class Direct:
 
 
 @dataclasses.dataclass(frozen=True)
-class Stored:
+class Precomputed:
     """Multiply a constant once and for all."""
 
     value: ir.Value
@@ -61,7 +61,7 @@ class Distributed:
     terms: tuple[Term, ...]
 
 
-Way: TypeAlias = Direct | Stored | Moved | Composed | Distributed
+Way: TypeAlias = Direct | Precomputed | Moved | Composed | Distributed
 
 
 def uses_weight(way: Way) -> bool:

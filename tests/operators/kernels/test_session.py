@@ -18,7 +18,7 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.operators import dialect_of, kernels
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.kernels import availability, custom_ops, store, trampoline
-from me2e_compress.operators.kernels.kernel import Kernel
+from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
 from me2e_compress.runtime.first_opening import try_apart
 from me2e_compress.runtime.fused_nodes import compiled_or_expanded
@@ -173,7 +173,7 @@ def test_a_library_that_claims_the_operator_does_no_harm(
     model, arrays = call()
     node = model.graph[0]
     mine = kernels.KERNELS[0]
-    theirs = Kernel(node.op_type, mine.module, mine.inputs, ("theirs",) * 9)
+    theirs = CompiledKernel(node.op_type, mine.module, mine.inputs, ("theirs",) * 9)
     options = ort.SessionOptions()
     code = load_or_compile(
         mine.op_type, mine.module, store.default_folder(), lambda: None

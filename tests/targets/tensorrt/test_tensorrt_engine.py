@@ -12,7 +12,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import MissingPackageError, PreconditionError
-from me2e_compress.targets.tensorrt.engine import EngineSettings, build_engine
+from me2e_compress.targets.tensorrt.tensorrt_engine import EngineSettings, build_engine
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]> m (float[2] x) => (float[2] y)'
 FLOAT = f"{HEAD} {{ y = Neg(x) }}"

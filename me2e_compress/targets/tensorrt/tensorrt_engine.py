@@ -35,7 +35,7 @@ class EngineSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Engine:
+class TensorRTEngine:
     """What TensorRT built.
 
     Attributes:
@@ -51,7 +51,7 @@ class Engine:
     seconds: float
 
 
-def build_engine(path: Path, settings: EngineSettings) -> Engine:
+def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
     """Parse a file and build an engine of it for the GPU of this machine.
 
     Args:
@@ -80,7 +80,7 @@ def build_engine(path: Path, settings: EngineSettings) -> Engine:
         reason = log.lines[-1] if log.lines else "it does not say why"
         raise PreconditionError(f"{path}: TensorRT {trt.__version__}: {reason}")
     seconds = time.perf_counter() - begun
-    return Engine(bytes(built), trt.__version__, network.num_layers, seconds)
+    return TensorRTEngine(bytes(built), trt.__version__, network.num_layers, seconds)
 
 
 def _tensorrt() -> Any:

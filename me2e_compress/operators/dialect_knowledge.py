@@ -7,7 +7,7 @@ from me2e_compress.operators.lookup import find
 from me2e_compress.operators.replace import set_output
 
 
-class Knowledge:
+class DialectKnowledge:
     """See :class:`me2e_compress.graph.plugins.PluginKnowledge`.
 
     A node that its dialect refuses is one that nobody knows: whoever rewrites it says
