@@ -87,6 +87,7 @@ def expand(
     by: str,
     names: set[str] | None = None,
     compiled: bool = False,
+    known: tuple[Operator, Dialect] | None = None,
 ) -> None:
     """Put standard operators in the place of a fused node.
 
@@ -98,13 +99,15 @@ def expand(
         names: of all values of the model, where many nodes are expanded.
         compiled: whether the body may call compiled kernels; a session must then
             register them (:mod:`me2e_compress.operators.kernels`).
+        known: what the node is; None asks :func:`~me2e_compress.operators.find`, which
+            knows registered operators only.
 
     Raises:
         PreconditionError: the node's attributes, or its inputs' number, types or
             shapes, are of no such call.
         GraphError: it is no fused operator.
     """
-    operator, dialect = _found(node)
+    operator, dialect = _found(node, known)
     if opset < _LEAST_OPSET:
         raise PreconditionError(
             f"{by} needs opset {_LEAST_OPSET} or later; the graph is of {opset}"
@@ -122,6 +125,7 @@ def translate(
     opset: int,
     by: str,
     names: set[str] | None = None,
+    known: tuple[Operator, Dialect] | None = None,
 ) -> None:
     """Put the same call in another dialect in the place of a fused node.
 
@@ -134,12 +138,13 @@ def translate(
         opset: of ONNX's own operators.
         by: the name of the pass, for the provenance.
         names: of all values of the model, where many nodes are translated.
+        known: see :func:`expand`.
 
     Raises:
         PreconditionError: see :func:`expand`; or the dialect cannot say it.
         GraphError: it is no fused operator.
     """
-    operator, dialect = _found(node)
+    operator, dialect = _found(node, known)
     call = FusedCall(node, opset=opset, by=by, names=names)
     own, attributes = _own_call(call, dialect)
     inputs = to.inputs_from_own(call, own, attributes)
@@ -191,8 +196,10 @@ def hold_constants(function: ir.Function) -> None:
         graph.insert_before(graph[0], made)
 
 
-def _found(node: ir.Node) -> tuple[Operator, Dialect]:
-    found = find(node)
+def _found(
+    node: ir.Node, known: tuple[Operator, Dialect] | None
+) -> tuple[Operator, Dialect]:
+    found = find(node) if known is None else known
     if found is None:
         raise GraphError(f"node {node.name}: {node.op_type} is no fused operator")
     if read := [value.name for value in node.outputs[1:] if is_read(value)]:

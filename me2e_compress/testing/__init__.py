@@ -2,14 +2,18 @@
 
 from me2e_compress.testing.check_evaluator import check_evaluator
 from me2e_compress.testing.check_observer import check_observer
+from me2e_compress.testing.check_operator import check_operator
 from me2e_compress.testing.check_pass import check_pass
 from me2e_compress.testing.check_policy import check_policy
+from me2e_compress.testing.drawn_calls import DrawnCall
 from me2e_compress.testing.form import check_form
 
 __all__ = [
+    "DrawnCall",
     "check_evaluator",
     "check_form",
     "check_observer",
+    "check_operator",
     "check_pass",
     "check_policy",
 ]

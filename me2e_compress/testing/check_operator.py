@@ -1,0 +1,163 @@
+"""Check that a fused operator's body, reference and shapes say the same."""
+
+import dataclasses
+
+import numpy as np
+
+from me2e_compress.errors import PreconditionError, VerificationError
+from me2e_compress.operators import (
+    OPERATORS,
+    OWN_DOMAIN,
+    Dialect,
+    Operator,
+    expand,
+    import_domains,
+    set_output,
+    translate,
+)
+from me2e_compress.operators.dialect import NdArray
+from me2e_compress.runtime.session import run_once
+from me2e_compress.testing.drawn_calls import Draw, DrawnCall, drawn, graph_of
+from me2e_compress.testing.form import check_form
+
+OPSETS = (13, 17)
+TOLERANCE = 1e-4
+"""Allowed max|a-b| / max(1, max|b|) of float32 against float64."""
+
+_NO_ATTRIBUTE = "no_such_attribute"
+
+
+def check_operator(
+    operator: Operator, draw: Draw | None = None, *, seed: int = 0, calls: int = 3
+) -> None:
+    """Check that an operator computes the same, in whatever dialect it is called.
+
+    It has the form of :func:`check_form`, and an own form that is called ``me2e`` in
+    the domain of that name. For every dialect, at opsets 13 and 17, on random inputs:
+    the body, run in float32, is the float64 reference within 1e-4; the output has the
+    shape that is told; calls in the own form are translated into the dialect, unless
+    that refuses them, and compute the same there; and an attribute that the dialect
+    does not have is refused.
+
+    Args:
+        operator: the operator; it need not be installed.
+        draw: makes a call in a dialect; None draws what the dialect's operands tell,
+            any shape where they tell none.
+        seed: of the draws.
+        calls: how many are drawn for each dialect and opset.
+
+    Raises:
+        VerificationError: it broke a promise; the message says which.
+        Me2eError: it refused a call in a dialect of its own.
+    """
+    check_form(operator, OPERATORS)
+    if (operator.own.name, operator.own.domain) != (OWN_DOMAIN, OWN_DOMAIN):
+        raise VerificationError(
+            f"{operator.name}: the own form is {operator.own.name!r} in the domain"
+            f" {operator.own.domain!r}, both must be {OWN_DOMAIN!r}"
+        )
+    make = drawn if draw is None else draw
+    for dialect in operator.all_dialects():
+        random = np.random.default_rng(seed)
+        for opset in OPSETS:
+            for _ in range(calls):
+                case = _Case(operator, dialect, opset)
+                case.check_call(make(dialect, random))
+                case.check_translated(make(operator.own, random))
+        _Case(operator, dialect, OPSETS[0]).check_attributes(make(dialect, random))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Case:
+    """An operator in a dialect, in graphs of an opset."""
+
+    operator: Operator
+    dialect: Dialect
+    opset: int
+
+    def check_call(self, call: DrawnCall) -> None:
+        """Compare the body and the told shape of a call with its reference."""
+        model = graph_of(call, self.dialect, self.opset)
+        node = model.graph[0]
+        self.dialect.check(node)
+        want = self._reference(self.dialect, call)
+        set_output(node, self.operator, self.dialect)
+        told = node.outputs[0].shape
+        if told is not None and not _fits(tuple(told), want.shape):
+            raise self._broken(
+                f"the output is said to be {list(told)}, it is {list(want.shape)}"
+            )
+        node.outputs[0].shape = node.outputs[0].type = None  # the body says it itself
+        known = (self.operator, self.dialect)
+        expand(node, opset=self.opset, by="check-operator", known=known)
+        import_domains(model)
+        found = run_once(model, call.inputs)["result"]
+        self._compare("the body", found, want)
+
+    def check_translated(self, call: DrawnCall) -> None:
+        """Compare a call in the own form, said in the dialect, with its reference."""
+        own = self.operator.own
+        if self.dialect == own:
+            return
+        model = graph_of(call, own, self.opset)
+        by = "check-operator"
+        try:
+            translate(
+                model.graph[0],
+                self.dialect,
+                opset=self.opset,
+                by=by,
+                known=(self.operator, own),
+            )
+            (node,) = (
+                each for each in model.graph if each.op_type == self.dialect.op_type
+            )
+            known = (self.operator, self.dialect)
+            expand(node, opset=self.opset, by=by, known=known)
+        except PreconditionError:
+            return  # a dialect need not be able to say everything
+        import_domains(model)
+        found = run_once(model, call.inputs)["result"]
+        self._compare("a translated call", found, self._reference(own, call))
+
+    def check_attributes(self, call: DrawnCall) -> None:
+        """Give a node an attribute that no dialect has."""
+        attributes = {**call.attributes, _NO_ATTRIBUTE: 1}
+        strange = dataclasses.replace(call, attributes=attributes)
+        node = graph_of(strange, self.dialect, self.opset).graph[0]
+        try:
+            self.dialect.attributes_of(node)
+        except PreconditionError:
+            return
+        raise self._broken("it takes an attribute that it does not have")
+
+    def _reference(self, dialect: Dialect, call: DrawnCall) -> NdArray:
+        node = graph_of(call, dialect, self.opset).graph[0]
+        return self.operator.dialect_reference(
+            dialect, tuple(call.inputs.values()), dialect.attributes_of(node)
+        )
+
+    def _compare(self, what: str, found: NdArray, want: NdArray) -> None:
+        if found.shape != want.shape:
+            raise self._broken(
+                f"{what} gives {list(found.shape)}, the reference {list(want.shape)}"
+            )
+        scale = max(1.0, float(np.abs(want).max(initial=0.0)))
+        error = float(np.abs(found - want).max(initial=0.0)) / scale
+        if not error <= TOLERANCE:  # NaN is not
+            raise self._broken(
+                f"{what} is off the reference by {error:.2g}, of {TOLERANCE:g} allowed"
+            )
+
+    def _broken(self, why: str) -> VerificationError:
+        return VerificationError(
+            f"{self.operator.name} in the dialect {self.dialect.name}, opset"
+            f" {self.opset}: {why}"
+        )
+
+
+def _fits(told: tuple[object, ...], shape: tuple[int, ...]) -> bool:
+    return len(told) == len(shape) and all(
+        dim == size or not isinstance(dim, int)
+        for dim, size in zip(told, shape, strict=True)
+    )

@@ -1,0 +1,148 @@
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import VerificationError
+from me2e_compress.graph.shapes import Dims
+from me2e_compress.operators import (
+    OPERATORS,
+    Attribute,
+    Dialect,
+    FusedCall,
+    Operand,
+    Operator,
+)
+from me2e_compress.operators.call import Attributes, AttributeValue
+from me2e_compress.operators.dialect import Arrays, NdArray, Values, number, present
+from me2e_compress.testing import DrawnCall, check_operator
+
+
+def matrices(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
+    matrix = random.normal(size=(2, 3, 4, 4)) + 4 * np.eye(4)
+    return DrawnCall({"matrix": matrix.astype(np.float32)})
+
+
+@pytest.mark.parametrize("name", ["select-and-pad", "multi-head-attention"])
+def test_our_operators_hold(name: str) -> None:
+    check_operator(OPERATORS.build(name, {}), calls=2)
+
+
+def test_inputs_may_be_given() -> None:
+    check_operator(OPERATORS.build("inverse", {}), matrices, calls=1)
+
+
+def _plugin(name: str, op_type: str, domain: str) -> Dialect:
+    gain = (Attribute("gain", 2),)
+    return Dialect(name, op_type, domain, (Operand("x"),), "test", gain)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gain(Operator):
+    """Multiply by a whole number; those below err in one way."""
+
+    name: ClassVar[str] = "gain"
+    own: ClassVar[Dialect] = _plugin("me2e", "Gain", "me2e")
+    dialects: ClassVar[tuple[Dialect, ...]] = (_plugin("test", "GainPlugin", "some"),)
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        (x,) = present(inputs)
+        return call.add("Mul", [x, call.numbers(number(attributes, "gain"), x)])
+
+    def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
+        result: NdArray = np.asarray(inputs[0], np.float64) * number(attributes, "gain")
+        return result
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        return shapes[0]
+
+    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+        return None
+
+
+def test_an_operator_that_is_not_installed_holds_too() -> None:
+    check_operator(Gain(), calls=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherBody(Gain):
+    """A body that adds."""
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        (x,) = present(inputs)
+        return call.add("Add", [x, call.numbers(2, x)])
+
+
+@dataclasses.dataclass(frozen=True)
+class FlatBody(Gain):
+    """A body that loses the shape."""
+
+    def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
+        return call.reshape(super().body(call, inputs, attributes), (1, 1, 1, 1, -1))
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherShape(Gain):
+    """A shape that is too long."""
+
+    def output_shape(
+        self, shapes: Sequence[Dims | None], attributes: Attributes
+    ) -> Dims | None:
+        return None if shapes[0] is None else (*shapes[0], 1)
+
+
+class Forgetful(Dialect):
+    """Translates into a call without the attribute."""
+
+    def options_from_own(self, attributes: Attributes) -> Attributes:
+        return {"gain": 3}
+
+
+class Lax(Dialect):
+    """Takes any attribute."""
+
+    def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
+        return {"gain": 2}
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherTranslation(Gain):
+    """A dialect that loses the attribute."""
+
+    dialects: ClassVar[tuple[Dialect, ...]] = (Forgetful(**vars(Gain.dialects[0])),)
+
+
+@dataclasses.dataclass(frozen=True)
+class LaxAttributes(Gain):
+    """A dialect that refuses nothing."""
+
+    dialects: ClassVar[tuple[Dialect, ...]] = (Lax(**vars(Gain.dialects[0])),)
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherOwn(Gain):
+    """No own form."""
+
+    own: ClassVar[Dialect] = Gain.dialects[0]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (OtherBody(), "gain in the dialect me2e, opset 13: the body is off"),
+        (FlatBody(), r"me2e, opset 13: the body gives \[1, 1, 1, 1, \d+\]"),
+        (OtherShape(), "me2e, opset 13: the output is said to be"),
+        (OtherTranslation(), "test, opset 13: a translated call is off"),
+        (LaxAttributes(), "test, opset 13: it takes an attribute"),
+        (OtherOwn(), "gain: the own form is 'test' in the domain 'some'"),
+    ],
+    ids=lambda each: type(each).__name__,
+)
+def test_what_is_wrong_is_named(wrong: Operator, message: str) -> None:
+    with pytest.raises(VerificationError, match=message):
+        check_operator(wrong, calls=1)
