@@ -12,7 +12,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
-from me2e_compress.operators.call import Attributes, FusedCall
+from me2e_compress.operators.call import Attributes, FusedCall, Size
 from me2e_compress.operators.dialect import (
     FLOAT32,
     FLOATS,
@@ -121,75 +121,10 @@ class DeformableConvolution(Operator):
                 "offset_group": number(attributes, "deform_groups"),
             }
             return call.add("DeformConv", [image, weight, offset, bias, mask], options)
-        result = self._by_samples(call, image, offset, mask, weight, attributes)
+        result = _by_samples(call, image, offset, mask, weight, attributes)
         if bias is None:
             return result
         return call.add("Add", [result, call.unsqueeze(bias, (0, 2, 3))])
-
-    def _by_samples(
-        self,
-        call: FusedCall,
-        image: ir.Value,
-        offset: ir.Value,
-        mask: ir.Value,
-        weight: ir.Value,
-        attributes: Attributes,
-    ) -> ir.Value:
-        """Sample for each element of the kernel; multiply by the weight."""
-        batch, channels, height, width = (call.size(image, axis) for axis in range(4))
-        rows, columns = call.size(offset, 2), call.size(offset, 3)
-        outs, per_group, *kernel = (call.size(weight, axis) for axis in range(4))
-        sizes = [channels, height, width, rows, columns, outs, per_group, *kernel]
-        known = [size for size in sizes if isinstance(size, int)]
-        if len(known) < len(sizes):
-            raise PreconditionError(
-                f"node {call.node.name}: below opset {DEFORM_CONV_OPSET} the shapes of"
-                f" {image.name}, {offset.name} and {weight.name} must be known"
-            )
-        deep, high, wide, down, across, out, part, *elements = known
-        count, places = elements[0] * elements[1], down * across
-        parts, groups = number(attributes, "deform_groups"), deep // part
-        value = call.reshape(image, (batch, parts, deep // parts, high * wide))
-        value = call.transpose(value, (0, 3, 1, 2))  # [N, H*W, parts, C / parts]
-        moved = call.reshape(offset, (batch, parts, count, 2, places))
-        moved = call.transpose(moved, (0, 4, 2, 1, 3))  # [N, F*G, elements, parts, 2]
-        grid = kernel_positions((down, across), (elements[0], elements[1]), attributes)
-        at = call.add(
-            "Add",
-            [
-                moved,
-                call.numbers_of(grid, moved),
-            ],
-        )
-        y, x = call.split_last(at, 2)
-        half = call.numbers(0.5, at)
-        edges = [
-            call.unsqueeze(
-                call.add(
-                    "Div",
-                    [call.add("Add", [axis, half]), call.numbers(float(size), axis)],
-                ),
-                (-1,),
-            )
-            for axis, size in ((x, wide), (y, high))
-        ]
-        shape = (batch, places * count, parts, 1, 1)
-        shares = call.reshape(mask, (batch, parts, count, places))
-        shares = call.reshape(call.transpose(shares, (0, 3, 2, 1)), shape)
-        taken = sample_levels(
-            call,
-            value,
-            call.sizes((high, wide), (1, 2)),
-            call.integers([0]),
-            call.reshape(call.concat(edges, -1), (*shape, 2)),
-            shares,
-        )
-        taken = call.reshape(taken, (batch, places, count, groups, part))
-        taken = call.transpose(taken, (0, 3, 4, 2, 1))
-        taken = call.reshape(taken, (batch, groups, part * count, places))
-        matrix = call.reshape(weight, (groups, out // groups, part * count))
-        result = call.add("MatMul", [matrix, taken])
-        return call.reshape(result, (batch, out, down, across))
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, O, F, G] float64."""
@@ -252,3 +187,109 @@ def kernel_positions(
     grid[..., 0] = axes[0][:, None, :, None]
     grid[..., 1] = axes[1][None, :, None, :]
     return grid.reshape(out[0] * out[1], kernel[0] * kernel[1], 1, 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    """The sizes of one call; all but the batch are known.
+
+    Attributes:
+        batch: images.
+        image: channels, height and width.
+        out: channels, height and width.
+        part: channels that one group reads.
+        kernel: height and width.
+    """
+
+    batch: Size
+    image: tuple[int, int, int]
+    out: tuple[int, int, int]
+    part: int
+    kernel: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls, call: FusedCall, image: ir.Value, offset: ir.Value, weight: ir.Value
+    ) -> "_Sizes":
+        """Read them from the shapes of the inputs."""
+        batch, *sizes = (call.size(image, axis) for axis in range(4))
+        sizes += (call.size(offset, axis) for axis in (2, 3))
+        sizes += (call.size(weight, axis) for axis in range(4))
+        known = [size for size in sizes if isinstance(size, int)]
+        if len(known) < len(sizes):
+            raise PreconditionError(
+                f"node {call.node.name}: below opset {DEFORM_CONV_OPSET} the shapes of"
+                f" {image.name}, {offset.name} and {weight.name} must be known"
+            )
+        deep, high, wide, down, across, out, part, *kernel = known
+        return cls(
+            batch, (deep, high, wide), (out, down, across), part, (kernel[0], kernel[1])
+        )
+
+    @property
+    def count(self) -> int:
+        """Elements of the kernel."""
+        return math.prod(self.kernel)
+
+    @property
+    def places(self) -> int:
+        """Pixels of the output."""
+        return math.prod(self.out[1:])
+
+
+def _by_samples(
+    call: FusedCall,
+    image: ir.Value,
+    offset: ir.Value,
+    mask: ir.Value,
+    weight: ir.Value,
+    attributes: Attributes,
+) -> ir.Value:
+    """Sample for each element of the kernel; multiply by the weight."""
+    sizes = _Sizes.of(call, image, offset, weight)
+    (deep, high, wide), part, count = sizes.image, sizes.part, sizes.count
+    batch, places = sizes.batch, sizes.places
+    parts, groups = number(attributes, "deform_groups"), deep // part
+    value = call.reshape(image, (batch, parts, deep // parts, high * wide))
+    value = call.transpose(value, (0, 3, 1, 2))  # [N, H*W, parts, C / parts]
+    locations = _locations(call, offset, sizes, attributes)
+    shape = (batch, places * count, parts, 1, 1)
+    shares = call.reshape(mask, (batch, parts, count, places))
+    shares = call.reshape(call.transpose(shares, (0, 3, 2, 1)), shape)
+    taken = sample_levels(
+        call,
+        value,
+        call.sizes((high, wide), (1, 2)),
+        call.integers([0]),
+        call.reshape(locations, (*shape, 2)),
+        shares,
+    )
+    taken = call.reshape(taken, (batch, places, count, groups, part))
+    taken = call.transpose(taken, (0, 3, 4, 2, 1))
+    taken = call.reshape(taken, (batch, groups, part * count, places))
+    matrix = call.reshape(weight, (groups, sizes.out[0] // groups, part * count))
+    return call.reshape(call.add("MatMul", [matrix, taken]), (batch, *sizes.out))
+
+
+def _locations(
+    call: FusedCall, offset: ir.Value, sizes: _Sizes, attributes: Attributes
+) -> ir.Value:
+    """Write where each element of the kernel looks: x and y, 0..1 of the image.
+
+    Returns:
+        [N, F * G, elements, deform_groups, 2].
+    """
+    parts = number(attributes, "deform_groups")
+    shape = (sizes.batch, parts, sizes.count, 2, sizes.places)
+    moved = call.transpose(call.reshape(offset, shape), (0, 4, 2, 1, 3))
+    grid = kernel_positions(sizes.out[1:], sizes.kernel, attributes)
+    at = call.add("Add", [moved, call.numbers_of(grid, moved)])
+    y, x = call.split_last(at, 2)
+    half = call.numbers(0.5, at)
+    _, high, wide = sizes.image
+    edges = []
+    for axis, size in ((x, wide), (y, high)):
+        centre = call.add("Add", [axis, half])
+        share = call.add("Div", [centre, call.numbers(float(size), axis)])
+        edges.append(call.unsqueeze(share, (-1,)))
+    return call.concat(edges, -1)

@@ -101,21 +101,31 @@ def break_down(
         for node, copy in zip(model.graph, source.graph, strict=True)
     }
     found = optimized(source, provider)
-    places = {
-        name: modules[str(node.name)] for name, node in origins(source, found).items()
-    }
+    made_of = origins(source, found)
+    places = {name: modules[str(node.name)] for name, node in made_of.items()}
     wanted = max(1, min(runs, MOST_EVENTS // max(1, len(found.graph))))
     with tempfile.TemporaryDirectory(prefix="me2e-profile-") as folder:
         session = Session(
             source, threads=threads, provider=provider, profiled=Path(folder)
         )
-        endless = chain.from_iterable(repeat(frames))
-        replayed = islice(replay(session, endless), warm_up + wanted)
-        for done, _ in enumerate(replayed, 1):
-            on_run(max(0, done - warm_up), wanted)
-        with session.end_profile().open(encoding="utf-8") as lines:
-            counted = islice(node_runs(lines), warm_up, None)
-            return _divided(list(counted), places)
+        counted = _profiled(session, frames, wanted, warm_up, on_run)
+    return _divided(counted, places)
+
+
+def _profiled(
+    session: Session,
+    frames: Frames,
+    wanted: int,
+    warm_up: int,
+    on_run: Callable[[int, int], None],
+) -> list[tuple[int, list[NodeRun]]]:
+    """Run a session that records its nodes; read what the wanted inferences took."""
+    endless = chain.from_iterable(repeat(frames))
+    replayed = islice(replay(session, endless), warm_up + wanted)
+    for done, _ in enumerate(replayed, 1):
+        on_run(max(0, done - warm_up), wanted)
+    with session.end_profile().open(encoding="utf-8") as lines:
+        return list(islice(node_runs(lines), warm_up, None))
 
 
 def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:

@@ -189,36 +189,41 @@ def compress(
     read = [file for each in passes for file in each.files()]
     named = recipe if isinstance(recipe, str | Path) else None
     inputs = (source, named, frames, options.module_map, *read)
-    start = process_time()
     with (
         writing(_written(output), inputs, force=options.force),
         collector_paused(),
     ):
-        loaded = read_graph(source, listener)
-        modules = load_map(options.module_map, loaded)
-        frames_of = _split(source, loaded, frames, passes, options)
-        seen = frames_of.calibration or frames_of.samples
-        first = partial(try_first, listener=listener, provider=options.provider)
-        first(loaded, source.name, file=source, frames=seen)
-        context = Context(
-            modules, frames_of.calibration, options.seed, options.provider
-        )
-        manager = PassManager(
-            passes,
-            options.verify_frames,
-            output.parent,
-            frames_of.samples,
-            first,
-        )
-        progress = partial(listener.on_progress, "passes")
-        report = manager.run(loaded, context, progress)
-        int8 = Int8Outcome.of(report, context)
-        _refuse_empty(int8, options, listener)
-        if report.lossy and frames_of.measured is not None:
-            first(report.model, output.name)
-        loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
-        seconds = process_time() - start
-        return _write(report, source, output, int8, loss, seconds)
+        return _compress(source, output, passes, frames, options, listener)
+
+
+def _compress(
+    source: Path,
+    output: Path,
+    passes: tuple[Pass, ...],
+    frames: str | Path | None,
+    options: CompressOptions,
+    listener: Listener,
+) -> CompressResult:
+    """Read, try, apply, measure, and write."""
+    start = process_time()
+    loaded = read_graph(source, listener)
+    modules = load_map(options.module_map, loaded)
+    frames_of = _split(source, loaded, frames, passes, options)
+    seen = frames_of.calibration or frames_of.samples
+    first = partial(try_first, listener=listener, provider=options.provider)
+    first(loaded, source.name, file=source, frames=seen)
+    context = Context(modules, frames_of.calibration, options.seed, options.provider)
+    manager = PassManager(
+        passes, options.verify_frames, output.parent, frames_of.samples, first
+    )
+    report = manager.run(loaded, context, partial(listener.on_progress, "passes"))
+    int8 = Int8Outcome.of(report, context)
+    _refuse_empty(int8, options, listener)
+    if report.lossy and frames_of.measured is not None:
+        first(report.model, output.name)
+    loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
+    seconds = process_time() - start
+    return _write(report, source, output, int8, loss, seconds)
 
 
 def _split(

@@ -119,28 +119,29 @@ def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> 
         o[3 * CAPACITY + j] = I32(next_line + following)
 
 
+@compiled
+def _to_real(a: Any, w: Any, out: int, head: int, first: int, last: int) -> None:
+    """Turn sums of whole numbers into those of what they stand for."""
+    numbers, scales = floats(out), floats(a[SCALE])
+    shares = F(0)
+    for j in range(first, last):
+        left = w[j] + w[2 * CAPACITY + j]
+        right = w[CAPACITY + j] + w[3 * CAPACITY + j]
+        shares += left + right
+    zero = F(a[ZERO]) * shares
+    if a[SCALES] == 1:
+        for d in range(a[D]):
+            numbers[d] = (numbers[d] - zero) * scales[0]
+    else:
+        for d in range(a[D]):
+            numbers[d] = (numbers[d] - zero) * scales[head * a[D] + d]
+
+
 def _block(kind: Any) -> Callable[[int, int], Word]:
     """Make the function that answers a block of queries, for rows of a kind."""
     sum_rows = weighted_rows(kind)
     bytes_each = kind.bitwidth // 8
     quantized = bytes_each == 1
-
-    @compiled
-    def to_real(a: Any, w: Any, out: int, head: int, first: int, last: int) -> None:
-        """Turn sums of whole numbers into those of what they stand for."""
-        numbers, scales = floats(out), floats(a[SCALE])
-        shares = F(0)
-        for j in range(first, last):
-            left = w[j] + w[2 * CAPACITY + j]
-            right = w[CAPACITY + j] + w[3 * CAPACITY + j]
-            shares += left + right
-        zero = F(a[ZERO]) * shares
-        if a[SCALES] == 1:
-            for d in range(a[D]):
-                numbers[d] = (numbers[d] - zero) * scales[0]
-        else:
-            for d in range(a[D]):
-                numbers[d] = (numbers[d] - zero) * scales[head * a[D] + d]
 
     def block(user: int, index: int) -> Word:
         a = words(user)
@@ -169,7 +170,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
                     begin, end, to = k * points, (k + 1) * points, out + k * a[D] * 4
                     sum_rows(rows, o, w, begin, end, to, a[D])
                     if quantized:
-                        to_real(a, w, to, m + k, begin, end)
+                        _to_real(a, w, to, m + k, begin, end)
                 m += at_once
         return 0
 
