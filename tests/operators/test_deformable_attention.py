@@ -78,7 +78,7 @@ def arrays_of(dialect: Dialect, call: dict[str, Any]) -> dict[str, npt.NDArray[A
     }
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     dialect=dialects,
     call=calls,

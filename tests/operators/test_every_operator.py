@@ -185,7 +185,7 @@ def test_maps_that_are_all_empty() -> None:
     hold(operator, operator.own, seed=1301, opset=13, known=False)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(row=rows, seed=seeds, opset=st.sampled_from([13, 17, 20]), known=st.booleans())
 def test_the_body_is_the_reference(
     row: tuple[Operator, Dialect], seed: int, opset: int, known: bool

@@ -37,7 +37,7 @@ calls = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     dialect=st.sampled_from(OPERATOR.all_dialects()),
     call=calls,
