@@ -14,6 +14,8 @@ from me2e_compress.graph import (
     opset_of,
     producer_of,
 )
+from me2e_compress.graph.validity import ORIGINAL_DOMAIN
+from me2e_compress.operators import find
 from me2e_compress.runtime.fused_nodes import known_operators
 from me2e_compress.targets.base import (
     LintFinding,
@@ -45,7 +47,17 @@ def operators(model: ir.Model) -> Iterator[LintFinding]:
         name = f"{node.domain or 'ai.onnx'}::{node.op_type}"
         if (domain, node.op_type) in known or node.op_identifier() in model.functions:
             continue
-        yield error("operator", node, f"{name} has no kernel and no local function")
+        said = f"{name} has no kernel and no local function"
+        yield error("operator", node, f"{said}{_remedy(node)}")
+
+
+def _remedy(node: ir.Node) -> str:
+    """Say which pass helps a fused operator: functions need a domain, bodies none."""
+    if find(node) is None:
+        return ""
+    if is_standard(node) or ORIGINAL_DOMAIN in node.metadata_props:
+        return ": expand-operators writes its body"
+    return ": attach-bodies writes one, expand-operators the body in its place"
 
 
 def signed_activations(model: ir.Model) -> Iterator[LintFinding]:

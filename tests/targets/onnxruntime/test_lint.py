@@ -45,14 +45,27 @@ def test_convolutions_that_run_slowly(
     assert {each.severity for each in found} <= {"warning"}
 
 
-def test_operators_without_a_kernel() -> None:
+@pytest.mark.parametrize(
+    ("operator", "remedy"),
+    [
+        ("trt.Unheard", ""),
+        (
+            "trt.InverseTRT",
+            ": attach-bodies writes one, expand-operators the body in its place",
+        ),
+        ("InverseTRT", ": expand-operators writes its body"),
+    ],
+)
+def test_operators_without_a_kernel(operator: str, remedy: str) -> None:
     model = ir.from_onnx_text(
         '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>'
-        "m (float[1,2,3,3] x) => (float[1,2,3,3] y) { y = trt.InverseTRT(x) }"
+        f"m (float[1,2,3,3] x) => (float[1,2,3,3] y) {{ y = {operator}(x) }}"
     )
     (found,) = OnnxRuntime().lint(model)
 
-    assert found.message == "trt::InverseTRT has no kernel and no local function"
+    domain, _, name = operator.rpartition(".")
+    said = f"{domain or 'ai.onnx'}::{name} has no kernel and no local function"
+    assert found.message == said + remedy
 
 
 def test_contrib_operators_are_known() -> None:
