@@ -66,6 +66,11 @@ class ScaledFeature(Dialect):
         """Drop that of the scales."""
         return shapes[:5]
 
+    def output_type(self, inputs: Values) -> ir.DataType | None:
+        """Return that of the scales, where there are any."""
+        scaled = len(inputs) > 5 and inputs[5] is not None
+        return super().output_type(inputs[5:] if scaled else inputs)
+
 
 _SPARSE_DRIVE, _OP = "SparseDrive", "DeformableAggregation"
 

@@ -163,6 +163,10 @@ class Dialect:
         """Turn the shapes of this dialect's inputs into those of the own form's."""
         return shapes
 
+    def output_type(self, inputs: Values) -> ir.DataType | None:
+        """Return the element type of this dialect's output: that of the first input."""
+        return None if inputs[0] is None else inputs[0].dtype
+
     def in_types(
         self, call: FusedCall, inputs: Mapping[str, ir.Value | None]
     ) -> Values:

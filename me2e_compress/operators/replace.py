@@ -176,9 +176,9 @@ def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
         dims = own if result.shape is None else merged
         if len(dims) == len(own) and (result.shape is None or tuple(dims) != found):
             result.shape, known = ir.Shape(list(dims)), True
-    value = node.inputs[0]
-    if result.type is None and value is not None and value.dtype is not None:
-        result.type, known = ir.TensorType(value.dtype), True
+    kind = dialect.output_type(node.inputs)
+    if result.type is None and kind is not None:
+        result.type, known = ir.TensorType(kind), True
     return known
 
 

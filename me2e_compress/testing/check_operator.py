@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError, VerificationError
 from me2e_compress.operators import (
@@ -35,9 +36,9 @@ def check_operator(
     It has the form of :func:`check_form`, and an own form that is called ``me2e`` in
     the domain of that name. For every dialect, at opsets 13 and 17, on random inputs:
     the body, run in float32, is the float64 reference within 1e-4; the output has the
-    shape that is told; calls in the own form are translated into the dialect, unless
-    that refuses them, and compute the same there; and an attribute that the dialect
-    does not have is refused.
+    shape and type that are told; calls in the own form are translated into the
+    dialect, unless that refuses them, and compute the same there; and an attribute that
+    the dialect does not have is refused.
 
     Args:
         operator: the operator; it need not be installed.
@@ -82,7 +83,7 @@ class _Case:
         self.dialect.check(node)
         want = self._reference(self.dialect, call)
         set_output(node, self.operator, self.dialect)
-        told = node.outputs[0].shape
+        told, kind = node.outputs[0].shape, node.outputs[0].dtype
         if told is not None and not _fits(tuple(told), want.shape):
             raise self._broken(
                 f"the output is said to be {list(told)}, it is {list(want.shape)}"
@@ -92,6 +93,8 @@ class _Case:
         expand(node, opset=self.opset, by="check-operator", known=known)
         import_domains(model)
         found = run_once(model, call.inputs)["result"]
+        if kind is not None and kind != ir.DataType.from_numpy(found.dtype):
+            raise self._broken(f"the output is said to be {kind}, it is {found.dtype}")
         self._compare("the body", found, want)
 
     def check_translated(self, call: DrawnCall) -> None:

@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import onnx_ir as ir
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.errors import PreconditionError
+from me2e_compress.graph.shapes import infer_shapes
 from me2e_compress.operators import (
     Dialect,
     Operator,
@@ -269,3 +271,13 @@ def test_a_value_that_an_attribute_cannot_have_is_named() -> None:
     model = graph_of(operator.own, arrays, opset=17, attributes={"interpolation": 3})
     with pytest.raises(PreconditionError, match="interpolation is 3, not 0 or 1"):
         expand(model.graph[0], opset=17, by="test")
+
+
+def test_scaled_features_give_floats_where_the_file_records_no_type() -> None:
+    operator = next(each for each in operators() if each.name in DRAWS)
+    dialect = dialect_of(operator, "sparsedrive-v2")
+    assert dialect is not None
+    arrays, _ = aggregation(dialect, np.random.default_rng(0))
+    model = graph_of(dialect, arrays, opset=17)
+    infer_shapes(model)
+    assert model.graph.outputs[0].dtype == ir.DataType.FLOAT

@@ -117,6 +117,20 @@ class OtherTranslation(Gain):
     dialects: ClassVar[tuple[Dialect, ...]] = (Forgetful(**vars(Gain.dialects[0])),)
 
 
+class Counted(Dialect):
+    """Says that it gives integers."""
+
+    def output_type(self, inputs: Values) -> ir.DataType | None:
+        return ir.DataType.INT32
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherType(Gain):
+    """A dialect that says another type."""
+
+    dialects: ClassVar[tuple[Dialect, ...]] = (Counted(**vars(Gain.dialects[0])),)
+
+
 @dataclasses.dataclass(frozen=True)
 class LaxAttributes(Gain):
     """A dialect that refuses nothing."""
@@ -138,6 +152,7 @@ class OtherOwn(Gain):
         (FlatBody(), r"me2e, opset 13: the body gives \[1, 1, 1, 1, \d+\]"),
         (OtherShape(), "me2e, opset 13: the output is said to be"),
         (OtherTranslation(), "test, opset 13: a translated call is off"),
+        (OtherType(), "test, opset 13: the output is said to be INT32, it is float32"),
         (LaxAttributes(), "test, opset 13: it takes an attribute"),
         (OtherOwn(), "gain: the own form is 'test' in the domain 'some'"),
     ],
