@@ -54,7 +54,7 @@ class Entry:
 
 
 BEFORE = "import-normalize,fold-constants,eliminate-redundant,hoist-linear"
-FUSED = f"{BEFORE},fuse-operators,fuse-basic"
+FUSED = f"{BEFORE},fuse-operators,eliminate-redundant,fuse-basic"
 INT8 = "quantize-int8{target=onnxruntime}"
 ENTRIES = {
     "PyTorch, eager": Entry("torch", STACK),
