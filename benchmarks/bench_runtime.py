@@ -1,7 +1,7 @@
 """VAD-tiny on this CPU in every runtime at hand, in one interleaved run.
 
     python -m benchmarks.bench_runtime OUT [--peer-python PYTHON] [--rounds 5]
-        [--threads 2] [--frames 2] [--only "ours, int8;PyTorch, eager"]
+        [--threads 2] [--frames 1] [--only "ours, int8;PyTorch, eager"]
 
 One frame of the stack at its published size, recurrent state at zeros: a process a row,
 in turn, round by round, so that whatever else runs on the machine falls on all rows.
@@ -261,7 +261,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--frames", type=int, default=2)
+    parser.add_argument("--frames", type=int, default=1)
     parser.add_argument("--only", default="", help="rows, joined by ;")
     given = parser.parse_args()
     subject = subjects.make(STACK, given.out, given.frames)
