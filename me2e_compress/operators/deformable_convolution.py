@@ -28,6 +28,7 @@ from me2e_compress.operators.dialect import (
     numbers,
     present,
 )
+from me2e_compress.operators.renamed_attributes import RenamedAttributes
 
 DEFORM_CONV_OPSET = 19
 """The first opset of ONNX's DeformConv."""
@@ -55,22 +56,16 @@ def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
     )
 
 
+_OWN = _options("groups", "deform_groups")
+
+
 @dataclasses.dataclass(frozen=True)
-class NamedGroups(Dialect):
+class NamedGroups(RenamedAttributes):
     """A library that names the two counts of groups as it likes, in one order."""
 
-    def options_to_own(self, attributes: Attributes) -> Attributes:
-        """Rename the counts of groups."""
-        values = [attributes[each.name] for each in self.attributes]
-        return dict(zip((each.name for each in _OWN), values, strict=True))
-
-    def options_from_own(self, attributes: Attributes) -> Attributes:
-        """Rename the counts of groups."""
-        values = [attributes[each.name] for each in _OWN]
-        return dict(zip((each.name for each in self.attributes), values, strict=True))
+    own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
 
 
-_OWN = _options("groups", "deform_groups")
 _OSS = _options("group", "deformable_group")
 _CONV, _MMCV = "ModulatedDeformConv2d", "MMCVModulatedDeformConv2d"
 _LIBRARY = ("trt.plugins", _operands(FLOATS), "TensorRT OSS")

@@ -25,6 +25,7 @@ from me2e_compress.operators.dialect import (
     present,
 )
 from me2e_compress.operators.grid_positions import grid_by_gather, grid_sample_array
+from me2e_compress.operators.renamed_attributes import RenamedAttributes
 
 _SCALE = 10.0
 """By which BEVFormer_tensorrt multiplies a grid, so that int8 holds it better."""
@@ -38,22 +39,14 @@ def _options(first: str, *, required: bool = True) -> tuple[Attribute, ...]:
     )
 
 
+_OWN = _options("interpolation_mode")
+
+
 @dataclasses.dataclass(frozen=True)
-class Sampler(Dialect):
+class Sampler(RenamedAttributes):
     """A library that names the three attributes as it likes, in one order."""
 
-    def options_to_own(self, attributes: Attributes) -> Attributes:
-        """Rename the first."""
-        values = [attributes[each.name] for each in self.attributes]
-        return dict(zip((each.name for each in _OWN), values, strict=True))
-
-    def options_from_own(self, attributes: Attributes) -> Attributes:
-        """Rename the first."""
-        values = [attributes[each.name] for each in _OWN]
-        return dict(zip((each.name for each in self.attributes), values, strict=True))
-
-
-_OWN = _options("interpolation_mode")
+    own_attributes: ClassVar[tuple[Attribute, ...]] = _OWN
 
 
 @dataclasses.dataclass(frozen=True)
