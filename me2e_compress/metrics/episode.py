@@ -14,6 +14,7 @@ __all__ = [
     "EgoFrame",
     "Ending",
     "Episode",
+    "Given",
     "InferenceRecord",
 ]
 
@@ -85,6 +86,25 @@ class InferenceRecord:
 
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
+class Given:
+    """What a simulator itself said of a route; it never mixes with what is computed.
+
+    Attributes:
+        status: How the route ended, in the simulator's words: ``Completed``,
+            ``Failed - Agent got blocked``.
+        completion_percent: How much of the route was passed.
+        penalty: The factor of all infractions.
+        composed_percent: The driving score of the route.
+    """
+
+    status: str
+    completion_percent: Number
+    penalty: Number
+    composed_percent: Number
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, slots=True)
 class Episode:
     """One route driven to its end.
 
@@ -102,6 +122,7 @@ class Episode:
         junction_m: Metres to the first junction, None if the route has none.
         speed_ratios_percent: Ego speed over traffic speed at the check points where a
             simulator reported them itself; None if they follow from the frames.
+        given: What the simulator itself scored; None where it scores nothing.
     """
 
     route: str
@@ -116,6 +137,7 @@ class Episode:
     decisions: tuple[InferenceRecord, ...]
     junction_m: Number | None = None
     speed_ratios_percent: tuple[Number, ...] | None = None
+    given: Given | None = None
 
     @property
     def collided(self) -> bool:

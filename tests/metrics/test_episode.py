@@ -11,6 +11,7 @@ from me2e_compress.metrics.episode import (
     EgoFrame,
     Ending,
     Episode,
+    Given,
     InferenceRecord,
 )
 from me2e_compress.metrics.infraction import Infraction, InfractionKind
@@ -49,6 +50,7 @@ episodes = st.builds(
     st.lists(st.builds(InferenceRecord, times, times), max_size=3).map(tuple),
     st.none() | numbers,
     st.none() | st.lists(numbers, max_size=3).map(tuple),
+    st.none() | st.builds(Given, st.text(max_size=8), numbers, numbers, numbers),
 )
 
 
@@ -57,6 +59,13 @@ def test_json_brings_back_every_bit(episode: Episode) -> None:
     text = json.dumps(episode.to_json(), allow_nan=False)
 
     assert Episode.from_json(json.loads(text)) == episode
+
+
+def test_a_file_from_before_scores_were_given_is_read() -> None:
+    record = drive().to_json()
+    del record["given"]
+
+    assert Episode.from_json(record) == drive()
 
 
 def _drop_a_field(record: dict[str, Any]) -> None:
