@@ -26,12 +26,12 @@ import onnx
 
 from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
 from me2e_compress.evaluators.highway.expert import Expert
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.measure import Estimate

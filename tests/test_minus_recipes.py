@@ -9,8 +9,8 @@ import pytest
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import FramesError
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.graph import provenance
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import detect

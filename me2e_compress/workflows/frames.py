@@ -146,8 +146,8 @@ def _recorded(
 
 def _driven(model: Path, options: FramesOptions) -> Source:
     need_closed_loop("what frames of a driver need")
+    from me2e_compress.driving.onnx_policy import OnnxPolicy
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
-    from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 
     policy, length = OnnxPolicy.open(model), options.scene_length
     return lambda begin: driven_frames(

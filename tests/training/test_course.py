@@ -13,8 +13,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import TrainingError
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.simulator.routes import load_routes
 from me2e_compress.training.checkpoint import TrainingCheckpoint
 from me2e_compress.training.course import CourseProgress, claim, frames_in, run

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.contract import Observation, Plan
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert import Expert, ceiling
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.cameras import (
     CameraRig,

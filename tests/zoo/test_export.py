@@ -10,8 +10,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from me2e_compress.driving.adapter import Adapter
 from me2e_compress.errors import GraphError, MissingExtraError
-from me2e_compress.evaluators.highway.adapter import Adapter
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.zoo import export as exporting
 from me2e_compress.zoo.export import export

@@ -6,6 +6,7 @@ from itertools import islice
 
 import numpy as np
 
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
 from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
@@ -14,7 +15,6 @@ from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.evaluators.highway.expert import Expert
 from me2e_compress.evaluators.highway.generate import propose, seed_of
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
 from me2e_compress.simulator.routes import Route, load_routes

@@ -10,8 +10,8 @@ from typing import ClassVar
 
 from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
+from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.graph import sha256_of
 
 
@@ -77,8 +77,8 @@ class OnnxDriver(Driver):
             EvaluationError: No such file, or a model that cannot drive.
             ProviderError: The provider is not there.
         """
-        from me2e_compress.evaluators.highway.adapter import Adapter
-        from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+        from me2e_compress.driving.adapter import Adapter
+        from me2e_compress.driving.onnx_policy import OnnxPolicy
         from me2e_compress.runtime.providers import PROVIDERS
 
         if not self.path.is_file():

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending

@@ -7,18 +7,18 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
-from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.adapter import (
+from me2e_compress.driving.adapter import (
     Adapter,
     Axes,
     ImageNormalization,
 )
+from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
+from me2e_compress.driving.onnx_policy import OnnxPolicy
+from me2e_compress.driving.policies import Driver, driver_named
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.cameras import CameraRig

@@ -8,7 +8,7 @@ import onnx
 import pytest
 import torch
 
-from me2e_compress.evaluators.highway.onnx_policy import OnnxPolicy
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.session import Session
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.zoo.highway.bev_encoder import RECORD, motion_of

@@ -1,4 +1,4 @@
-"""A policy that runs an ONNX file."""
+"""A policy that runs an ONNX file, in whichever world it drives."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Self
 
 import numpy as np
 
+from me2e_compress.driving.adapter import Adapter, ImageNormalization
 from me2e_compress.driving.contract import (
     CAN_BUS_SIZE,
     PLAN_SHAPE,
@@ -13,9 +14,7 @@ from me2e_compress.driving.contract import (
     Plan,
     RouteInfo,
 )
-from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.evaluators.highway.adapter import Adapter, ImageNormalization
-from me2e_compress.evaluators.highway.ports import (
+from me2e_compress.driving.ports import (
     CAMERAS,
     CONTRACT,
     DEFAULT_IMAGE_SIZE,
@@ -25,6 +24,7 @@ from me2e_compress.evaluators.highway.ports import (
     image_size,
     zeros,
 )
+from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider
