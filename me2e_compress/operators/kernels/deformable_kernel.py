@@ -84,7 +84,9 @@ def _tables(a: Any, w: Any, o: Any, heads: int) -> None:
 def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> None:
     """Write the weights and offsets of the four corners of every point.
 
-    A place that is no number is treated as one outside.
+    A place that is no number is treated as one outside. What lies outside or has no
+    weight is not read: masked cameras cost next to nothing, and a NaN there stays
+    there (in the body, 0 x NaN is NaN).
     """
     for j in range(count):
         width, height = w[4 * CAPACITY + j], w[5 * CAPACITY + j]
@@ -102,8 +104,8 @@ def _corners(w: Any, o: Any, places: Any, shares: Any, count: int, row: int) -> 
         right = right if x0 < last_x else F(0)
         above = F(1) - below if y0 >= 0 and y0 <= last_y else F(0)
         below = below if y0 < last_y else F(0)
-        inside = left + right > F(0) and above + below > F(0)
         share = shares[j]
+        inside = left + right > F(0) and above + below > F(0) and share != F(0)
         w[j] = left * (above * share)
         w[CAPACITY + j] = right * (above * share)
         w[2 * CAPACITY + j] = left * (below * share)

@@ -86,6 +86,32 @@ def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
     assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
+def test_what_has_no_weight_is_not_read() -> None:
+    random = np.random.default_rng(5)
+    inputs: dict[str, Any] = {
+        "value": random.normal(size=(2, 63, 3, 8)).astype(np.float32),
+        "spatial_shapes": np.array([[5, 11], [2, 4]], np.int32),
+        "level_start_index": np.array([0, 55], np.int32),
+        "sampling_locations": random.uniform(-0.2, 1.2, (2, 300, 3, 2, 4, 2)),
+        "attention_weights": random.uniform(0, 1, (2, 300, 3, 2, 4)),
+    }
+    arrays = {
+        name: array.astype(np.float32) if array.dtype == np.float64 else array
+        for name, array in inputs.items()
+    }
+    weights = arrays["attention_weights"]
+    weights[random.uniform(size=weights.shape) < 0.6] = 0
+    weights[:, :, :, 1] = 0  # a camera that nobody looks at
+    expected = OPERATOR.reference(list(arrays.values()), {})
+    arrays["value"][:, 55:] = np.nan
+    model = graph_of(OPERATOR.own, arrays, opset=17)
+
+    one, two = (Session(model, threads=n).run(arrays)["result"] for n in (1, 2))
+
+    assert np.allclose(one, expected, rtol=1e-4, atol=1e-4)
+    assert np.array_equal(one, two)
+
+
 STORED = """
 <ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1]>
 call (TYPE[2,63,24] stored, int32[2,2] sizes, int32[2] starts,
