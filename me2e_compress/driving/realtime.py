@@ -3,15 +3,61 @@
 Equation 4: a decision that took t costs n = max(0, int(t / dt) - 1) decisions. All
 times are integer microseconds, since 0.15 / 0.05 is 2.9999999999999996 in floating
 point and would be charged one frame too little.
+
+Beside it stands the other published model, a pipeline that delays every control and
+skips no decision: `LatencyModel`.
 """
 
+from collections import deque
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from enum import StrEnum
+from typing import Generic, Protocol, TypeVar
 
 DT_US = 50_000
 """Step of the benchmark's simulators: 20 Hz."""
 
 T = TypeVar("T")
+
+
+class LatencyModel(StrEnum):
+    """What a latency does to the controls; results under different ones are apart."""
+
+    DROP = "drop"
+    """One decision at a time: those due meanwhile are dropped (equation 4)."""
+    FIFO = "fifo"
+    """A decision every frame, each acting ceil(t / dt) frames later, in their order:
+    the "delayed control execution through FIFO action buffering" of
+    Bench2Drive-Robust."""
+
+
+class ControlClock(Protocol[T]):
+    """Says in which frames a control acts and a decision is due."""
+
+    @property
+    def decision_is_due(self) -> bool:
+        """Whether the policy looks at this frame."""
+        ...
+
+    def decide(self, control: T, latency_us: int) -> None:
+        """Take the decision that is due at this frame."""
+        ...
+
+    def advance(self) -> T:
+        """Return the control that acts in this frame, and go to the next."""
+        ...
+
+
+def control_clock(model: LatencyModel, in_force: T, dt_us: int) -> ControlClock[T]:
+    """Build the clock of a model.
+
+    Args:
+        model: Which.
+        in_force: The control before any decision acts.
+        dt_us: Step of the simulated world, microseconds.
+    """
+    if model is LatencyModel.FIFO:
+        return PipelinedControl(in_force, dt_us)
+    return HeldControl(in_force, dt_us)
 
 
 def skipped_decisions(latency_us: int, dt_us: int = DT_US) -> int:
@@ -75,5 +121,58 @@ class HeldControl(Generic[T]):
 
     def advance(self) -> T:
         """Return the control that acts in this frame, and go to the next."""
+        self._frame += 1
+        return self.in_force
+
+
+def delayed_frames(latency_us: int, dt_us: int = DT_US) -> int:
+    """Return ceil(t / dt): how many frames later a control acts in a pipeline.
+
+    Args:
+        latency_us: How long the inference took, microseconds.
+        dt_us: Step of the simulated world, microseconds.
+    """
+    return -(-latency_us // dt_us)
+
+
+@dataclass
+class PipelinedControl(Generic[T]):
+    """Delays every control; a decision is due at every frame.
+
+    The control decided at frame k acts from frame k + ceil(t / dt) on, until the next
+    one does. First in, first out: a fast decision does not overtake a slow one before
+    it. As many decisions run side by side as the delay has frames, so the model says
+    what a delay does, not what one computer that takes t can do.
+
+    Args:
+        in_force: The control before any decision acts.
+        dt_us: Step of the simulated world, microseconds.
+    """
+
+    in_force: T
+    dt_us: int = DT_US
+    _frame: int = field(default=0, init=False)
+    _coming: deque[tuple[int, T]] = field(default_factory=deque, init=False)
+
+    @property
+    def decision_is_due(self) -> bool:
+        """Whether the policy looks at this frame: at every one."""
+        return True
+
+    def decide(self, control: T, latency_us: int) -> None:
+        """Take the decision of this frame.
+
+        Args:
+            control: What follows from the plan for this frame's observation.
+            latency_us: How long it took, microseconds.
+        """
+        ready = self._frame + delayed_frames(latency_us, self.dt_us)
+        before = self._coming[-1][0] if self._coming else 0
+        self._coming.append((max(before, ready), control))
+
+    def advance(self) -> T:
+        """Return the control that acts in this frame, and go to the next."""
+        while self._coming and self._coming[0][0] <= self._frame:
+            _, self.in_force = self._coming.popleft()
         self._frame += 1
         return self.in_force

@@ -6,7 +6,11 @@ from pathlib import Path
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.evaluators.highway.conditions import Conditions, step_us
+from me2e_compress.evaluators.highway.conditions import (
+    Conditions,
+    latency_model_named,
+    step_us,
+)
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.evaluation_options import (
     engine_of,
@@ -38,6 +42,8 @@ class EvaluateOptions:
         latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE`` or
             ``measured``.
         latency_scale: of a trace or a measurement.
+        latency_model: ``drop`` (the decisions due meanwhile) or ``fifo`` (delays every
+            control).
         in_order: replay a trace in its order.
         seed: of the draws from a trace.
         workers: routes at a time.
@@ -58,6 +64,7 @@ class EvaluateOptions:
     routes: str = "all"
     latency: str = "none"
     latency_scale: float = 1.0
+    latency_model: str = "drop"
     in_order: bool = False
     seed: int = 0
     workers: int = 1
@@ -194,6 +201,7 @@ def _job(driver: Driver, options: EvaluateOptions) -> Job:
         step_us(options.dt_ms),
         image_size_of(driver.open()),
         weather_of(options.weather),
+        latency_model_named(options.latency_model),
     )
     return Job(driver, conditions, options.frame_limit_s)
 

@@ -4,7 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.driving.realtime import HeldControl, skipped_decisions
+from me2e_compress.driving.realtime import (
+    HeldControl,
+    LatencyModel,
+    PipelinedControl,
+    control_clock,
+    delayed_frames,
+    skipped_decisions,
+)
 
 latencies = st.lists(st.integers(0, 600_000), min_size=1, max_size=12)
 steps = st.sampled_from([50_000, 25_000, 10_000])
@@ -89,3 +96,51 @@ def test_every_frame_has_a_control_and_none_decides_twice(
             held.advance()
             assert not held.decision_is_due
         held.advance()
+
+
+@pytest.mark.parametrize(
+    ("latency_us", "frames"),
+    [(0, 0), (1, 1), (50_000, 1), (50_001, 2), (150_000, 3), (430_000, 9)],
+)
+def test_a_pipeline_delays_by_the_frames_begun(latency_us: int, frames: int) -> None:
+    assert delayed_frames(latency_us) == frames
+
+
+def acting(clock: PipelinedControl[int], latencies_us: list[int]) -> list[int]:
+    found = list[int]()
+    for frame, latency_us in enumerate(latencies_us):
+        assert clock.decision_is_due
+        clock.decide(frame, latency_us)
+        found.append(clock.advance())
+    return found
+
+
+def test_a_pipeline_acts_on_every_frame_some_frames_later() -> None:
+    assert acting(PipelinedControl(-1), [120_000] * 6) == [-1, -1, -1, 0, 1, 2]
+
+
+def test_a_fast_decision_does_not_overtake_a_slow_one() -> None:
+    latencies_us = [150_000, 0, 0, 0, 0]
+
+    assert acting(PipelinedControl(-1), latencies_us) == [-1, -1, -1, 3, 4]
+
+
+@given(latencies, steps)
+def test_a_pipeline_is_a_queue(latencies_us: list[int], dt_us: int) -> None:
+    """Decision k is out when it and all before it are ready; the newest out acts."""
+    found = acting(PipelinedControl(-1, dt_us), latencies_us)
+
+    for frame, acts in enumerate(found):
+        out = [
+            k
+            for k in range(frame + 1)
+            if all(j + -(-latencies_us[j] // dt_us) <= frame for j in range(k + 1))
+        ]
+        assert acts == max(out, default=-1)
+
+
+def test_without_latency_both_models_act_at_once() -> None:
+    for model in LatencyModel:
+        clock = control_clock(model, -1, 50_000)
+        clock.decide(0, 0)
+        assert clock.advance() == 0

@@ -19,6 +19,9 @@ Latency = Annotated[
     str, typer.Option(help="none, fps:F, trace:FILE, measured, or see list")
 ]
 Scale = Annotated[float, typer.Option(help="of a trace or a measurement")]
+Model = Annotated[
+    str, typer.Option(help="drop decisions meanwhile, or fifo: delay every control")
+]
 InOrder = Annotated[
     bool, typer.Option("--in-order", help="replay a trace in its order")
 ]
@@ -34,6 +37,7 @@ def evaluate(
     routes: given.Routes = "all",
     latency: Latency = "none",
     latency_scale: Scale = 1.0,
+    latency_model: Model = "drop",
     in_order: InOrder = False,
     seed: given.Seed = 0,
     workers: given.Workers = 1,
@@ -51,8 +55,9 @@ def evaluate(
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on."""
     options = workflow.EvaluateOptions(
-        routes=routes, latency=latency, latency_scale=latency_scale, in_order=in_order,
-        seed=seed, workers=workers, dt_ms=dt_ms, adapter=adapter, weather=weather,
+        routes=routes, latency=latency, latency_scale=latency_scale,
+        latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
+        dt_ms=dt_ms, adapter=adapter, weather=weather,
         frame_limit_s=frame_limit, engine=engine, address=address, render=render,
         provider=provider_named(provider, plugins or ()), force=force,
     )  # fmt: skip

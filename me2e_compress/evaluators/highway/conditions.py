@@ -6,7 +6,7 @@ Apart from the runner, so that naming the conditions does not import highway-env
 from dataclasses import dataclass, field
 
 from me2e_compress.driving.latency import FixedLatency, LatencySource
-from me2e_compress.driving.realtime import DT_US
+from me2e_compress.driving.realtime import DT_US, LatencyModel
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import FRAME_US
 from me2e_compress.simulator.cameras import CLEAR, Weather
@@ -22,6 +22,7 @@ class Conditions:
             `realtime.skipped_decisions`. Frames are recorded every 50 ms all the same.
         image_size: Rows and columns of each camera.
         weather: Weather and sensor faults.
+        latency_model: What a latency does: drop decisions, or delay every control.
 
     Raises:
         EvaluationError: 50 ms are not a multiple of the step.
@@ -31,6 +32,7 @@ class Conditions:
     dt_us: int = DT_US
     image_size: tuple[int, int] = (96, 160)
     weather: Weather = CLEAR
+    latency_model: LatencyModel = LatencyModel.DROP
 
     def __post_init__(self) -> None:
         """Check the step."""
@@ -39,6 +41,18 @@ class Conditions:
                 f"a step of {self.dt_us / 1e3:g} ms: it must divide "
                 f"{FRAME_US // 1000} ms"
             )
+
+
+def latency_model_named(name: str) -> LatencyModel:
+    """Return the latency model of a name.
+
+    Raises:
+        EvaluationError: There is none.
+    """
+    if name not in list(LatencyModel):
+        there = ", ".join(LatencyModel)
+        raise EvaluationError(f"no latency model {name!r}; there are {there}")
+    return LatencyModel(name)
 
 
 def step_us(dt_ms: float) -> int:

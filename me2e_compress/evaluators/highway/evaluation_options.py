@@ -10,7 +10,11 @@ from pydantic import TypeAdapter, ValidationError
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions, step_us
+from me2e_compress.evaluators.highway.conditions import (
+    Conditions,
+    latency_model_named,
+    step_us,
+)
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
@@ -30,6 +34,7 @@ class HighwayEvaluation:
         folder: Where the results go.
         routes: ``all``, a number, ids parted by commas, or a file of routes.
         latency: What decisions cost: ``none``, ``fps:10``, ``trace:FILE``.
+        latency_model: ``drop`` decisions meanwhile, or ``fifo``: delay controls.
         seed: Of the draws from a trace.
         adapter: TOML file that adapts a model to the policy contract.
         dt_ms: Step of the world, milliseconds.
@@ -45,6 +50,7 @@ class HighwayEvaluation:
     folder: Path
     routes: str = "all"
     latency: str = "none"
+    latency_model: str = "drop"
     seed: int = 0
     adapter: Path | None = None
     dt_ms: float = 50.0
@@ -84,6 +90,7 @@ class HighwayEvaluation:
             step_us(self.dt_ms),
             image_size_of(driver.open()),
             weather_of(self.weather),
+            latency_model_named(self.latency_model),
         )
         return HighwayEvaluator(
             Job(driver, conditions, self.frame_limit_s),

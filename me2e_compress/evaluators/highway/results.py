@@ -18,6 +18,8 @@ from me2e_compress.version import __version__
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
+BEFORE = {"latency_model": "drop"}
+"""What holds of a folder from before its manifest had the key."""
 LARGEST_SET = 1_000_000
 """Routes of a set that a manifest may claim."""
 
@@ -35,6 +37,7 @@ def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, A
         "version": __version__,
         "policy": job.driver.fingerprint(),
         "latency": job.conditions.latency.to_json(),
+        "latency_model": job.conditions.latency_model.value,
         "dt_us": job.conditions.dt_us,
         "image_size": list(job.conditions.image_size),
         "weather": json.loads(json.dumps(asdict(job.conditions.weather))),
@@ -78,8 +81,9 @@ class ResultsFolder:
         except OSError as error:
             raise _unwritable(path, error) from error
         folder = cls.open(path)
+        both = folder.made_by, made_by
         for key in sorted({*made_by, *folder.made_by}):
-            old, new = folder.made_by.get(key), made_by.get(key)
+            old, new = (each.get(key, BEFORE.get(key)) for each in both)
             if old != new:
                 raise EvaluationError(
                     f"{path}: holds the results of another evaluation: its {key} is "

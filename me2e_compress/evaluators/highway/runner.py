@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.driving.contract import PLAN_SHAPE, Observation, Policy
-from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.driving.realtime import control_clock
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.endings import EndingRules
@@ -60,11 +60,11 @@ def drive(
 ) -> Episode:
     """Drive a route to its end and return the record.
 
-    At each decision (`HeldControl`) the policy plans, and the controller turns the
-    plan and the ego's state at that same frame into a control; equation 4 says when
-    it acts and how long it is held. Before the first one acts the ego coasts straight.
-    A policy that raises, or answers anything but six finite waypoints, ends the route
-    as failed.
+    At each decision the policy plans, and the controller turns the plan and the ego's
+    state at that same frame into a control; equation 4 (or the other latency model)
+    says when it acts and how long it is held. Before the first one acts the ego coasts
+    straight. A policy that raises, or answers anything but six finite waypoints, ends
+    the route as failed.
 
     Args:
         route: What to drive.
@@ -84,7 +84,9 @@ class _Drive:
         self.route, self.policy, self.listeners = route, policy, listeners
         self.world = world = World(route, dt_us=conditions.dt_us)
         self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
-        self.held = HeldControl(Control(0.0, 0.0), conditions.dt_us)
+        self.clock = control_clock(
+            conditions.latency_model, Control(0.0, 0.0), conditions.dt_us
+        )
         self.charge = conditions.latency.on_route(route.id)
         self.controller = Controller()
         rig = CameraRig(*conditions.image_size)
@@ -105,10 +107,10 @@ class _Drive:
             self.listeners.on_answer()
             while ending is None:
                 self.recorder.record(scene)
-                if self.held.decision_is_due:
+                if self.clock.decision_is_due:
                     self.decide(scene)
                 self.show(scene)
-                world.step(self.held.advance())
+                world.step(self.clock.advance())
                 scene = world.scene()
                 ending = self.rules.ending(world, scene.ego.speed_mps)
         except PolicyFailedError as failure:
@@ -118,7 +120,7 @@ class _Drive:
         return self.recorder.episode(ending)
 
     def decide(self, scene: Scene) -> None:
-        """Query the policy at this frame; equation 4 says when its answer acts."""
+        """Query the policy at this frame; the clock says when its answer acts."""
         observation = self.observer.observe(scene)
         self.listeners.on_query(self.world)
         begun = time.perf_counter_ns()
@@ -131,7 +133,7 @@ class _Drive:
         self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
         control = self.controller.control(anchored, scene.ego, scene.time_us)
-        self.held.decide(control, latency_us)
+        self.clock.decide(control, latency_us)
 
     def show(self, scene: Scene) -> None:
         """Render this frame for the listener that draws pictures."""

@@ -6,12 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from me2e_compress.driving.contract import Evaluator
 from me2e_compress.driving.latency import FixedLatency, MeasuredLatency, TraceLatency
+from me2e_compress.driving.realtime import LatencyModel
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
@@ -124,6 +126,23 @@ def test_what_a_kill_left_at_the_beginning_does_not_matter(
     folder = ResultsFolder.create(tmp_path / "results", _made_by(evaluator(tmp_path)))
 
     assert folder.episodes() == {}
+
+
+def test_a_folder_from_before_latency_models_dropped_decisions(
+    results: Path,
+) -> None:
+    manifest = results / "evaluation.json"
+    made_by = json.loads(manifest.read_text())
+    assert made_by.pop("latency_model") == "drop"
+    manifest.write_text(json.dumps(made_by))
+
+    made_now = _made_by(evaluator(results, routes=TWO))
+    fifo = replace(BLIND.conditions, latency_model=LatencyModel.FIFO)
+    delayed = _made_by(evaluator(results, Job(BlindDriver(), fifo), TWO))
+
+    assert ResultsFolder.create(results, made_now).made_by == made_by
+    with pytest.raises(EvaluationError, match=r'latency_model is "drop", .* "fifo"'):
+        ResultsFolder.create(results, delayed)
 
 
 def test_a_corrupt_file_is_named_and_driven_again(results: Path) -> None:
