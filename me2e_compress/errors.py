@@ -8,6 +8,7 @@
   x PreconditionError    a pass was given a graph it cannot work on
   x PassError            a pass broke (the cause is chained)
   x VerificationError    the graph after a pass is not a valid successor
+  x EnergyError          a counter of energy, or a file of one, is not usable
   x EvaluationError      a route, a policy or a results folder is not usable
   x StudyError           a study is malformed, or names what it does not have
   x TrainingError        a driver cannot be trained as asked
@@ -18,6 +19,7 @@ Every message says what was found, what there is, and names the culprit, on one 
 """
 
 __all__ = [
+    "EnergyError",
     "EvaluationError",
     "FramesError",
     "GraphError",
@@ -68,6 +70,10 @@ class PassError(Me2eError):
 
 class VerificationError(Me2eError):
     """The graph after a pass is not a valid successor of the one before."""
+
+
+class EnergyError(Me2eError):
+    """A counter of energy, or a file of one, is not usable."""
 
 
 class EvaluationError(Me2eError):

@@ -1,0 +1,191 @@
+"""Joules of a model as they were measured on one machine, or why they were not."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Self, TypeAlias
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from me2e_compress import documents
+from me2e_compress.display import Displayed, Table, table
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.atomic import write_json
+
+Finite: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
+NotNegative: TypeAlias = Annotated[float, Field(allow_inf_nan=False, ge=0)]
+Positive: TypeAlias = Annotated[float, Field(allow_inf_nan=False, gt=0)]
+
+FURTHEST_APART = 0.1
+"""Share by which a counter and the integrated power may differ unremarked: known cases
+are 187 J beside 327 J (Zeus, issue 181)."""
+
+
+@dataclass(frozen=True, repr=False)
+class EnergyResult(Displayed):
+    """Energy per frame over windows of a counter; None is not measured.
+
+    One frame at a time, back to back: MLPerf's SingleStream, energy per sample.
+
+    Attributes:
+        joules: Of all windows together, idle power included.
+        frames: Inferences in all windows.
+        j_per_frame: Joules a frame, gross: idle power included.
+        net_j_per_frame: The same without what the idle device takes in that time;
+            below zero where noise is all there is.
+        low: Lower end of the 95 % interval of ``j_per_frame``: of what repeating on
+            this device and counter moves. What the counter itself is off by is not
+            in it.
+        high: Upper end.
+        windows: How many.
+        window_s: Seconds of one, on average.
+        counter: What counted: ``nvml-total``, ``rapl``, ``ina3221``, ...
+        counter_step_s: Seconds from one value of the counter to the next.
+        idle_w: Watts of the idle device, the model loaded: mean of before and after.
+        temperature: Degrees Celsius before the first window and after the last.
+        clocks: MHz by clock, lowest and highest seen.
+        throttled: Reasons for which the device slowed itself down in a window.
+        device: Its name.
+        scope: What the counter covers: a board, packages, rails.
+        reason: Why nothing was measured; empty if it was.
+        model_sha256: Of the model that ran; None: not known.
+        window_j_per_frame: Joules a frame, window by window.
+        power_j_per_frame: Joules a frame by integrated power, beside the counter.
+        warnings: What puts the figure in doubt.
+    """
+
+    joules: NotNegative | None = None
+    frames: Annotated[int, Field(ge=0)] = 0
+    j_per_frame: Positive | None = None
+    net_j_per_frame: Finite | None = None
+    low: NotNegative | None = None
+    high: Positive | None = None
+    windows: Annotated[int, Field(ge=0)] = 0
+    window_s: Positive | None = None
+    counter: str | None = None
+    counter_step_s: Positive | None = None
+    idle_w: NotNegative | None = None
+    temperature: tuple[Finite, Finite] | None = None
+    clocks: Mapping[str, tuple[Finite, Finite]] = field(default_factory=dict)
+    throttled: tuple[str, ...] = ()
+    device: str = ""
+    scope: str = ""
+    reason: str = ""
+    model_sha256: str | None = None
+    window_j_per_frame: tuple[Finite, ...] = ()
+    power_j_per_frame: NotNegative | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that there is either a figure with its interval, or a reason.
+
+        Raises:
+            ValueError: there is neither, or the interval does not hold the figure.
+        """
+        if self.j_per_frame is None:
+            if not self.reason or self.joules is not None:
+                raise ValueError("neither joules a frame nor a reason why not")
+            return
+        if self.reason:
+            raise ValueError("both joules a frame and a reason why there are none")
+        if self.low is None or self.high is None or self.joules is None:
+            raise ValueError("joules, low and high go with j_per_frame")
+        if not self.low <= self.j_per_frame <= self.high:
+            raise ValueError("low to high does not hold j_per_frame")
+
+    @property
+    def headline(self) -> str:
+        """Joules a frame with their interval, or why there are none."""
+        if self.j_per_frame is None:
+            return f"energy: not measured: {self.reason}"
+        return (
+            f"energy: {self.j_per_frame:.4g} J a frame"
+            f" ({self.low:.4g} to {self.high:.4g}), {self.counter} of {self.device}"
+        )
+
+    @property
+    def power_apart(self) -> float | None:
+        """Share by which integrated power differs from the counter."""
+        if self.j_per_frame is None or self.power_j_per_frame is None:
+            return None
+        return self.power_j_per_frame / self.j_per_frame - 1
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what puts the figure in doubt."""
+        slowed = ", ".join(self.throttled)
+        throttled = (f"energy: the device slowed itself down: {slowed}",)
+        apart = self.power_apart
+        found = self.warnings + (throttled if slowed else ())
+        if apart is None or abs(apart) <= FURTHEST_APART:
+            return found
+        line = (
+            f"energy: integrated power says {self.power_j_per_frame:.4g} J a frame,"
+            f" {apart:+.0%} from the counter: one of them is wrong"
+        )
+        return (*found, line)
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the figures; none where nothing was measured."""
+        if self.j_per_frame is None:
+            return ()
+        rows = [
+            ("gross", f"{self.j_per_frame:.4g}", f"{self.low:.4g}", f"{self.high:.4g}")
+        ]
+        if self.net_j_per_frame is not None:
+            rows.append(("net of idle", f"{self.net_j_per_frame:.4g}", "", ""))
+        if self.power_j_per_frame is not None:
+            rows.append(("by power", f"{self.power_j_per_frame:.4g}", "", ""))
+        columns = ("energy", "J/frame", "low 95 %", "high 95 %")
+        return (table("Energy", columns, rows, "\n".join(self._notes())),)
+
+    def _notes(self) -> list[str]:
+        long = f" of {self.window_s:.1f} s" if self.window_s else ""
+        notes = [
+            f"{self.counter} of {self.device} ({self.scope}):"
+            f" {self.frames} frames in {self.windows} windows{long}"
+        ]
+        if self.idle_w is not None:
+            notes.append(f"idle {self.idle_w:.4g} W")
+        if self.temperature is not None:
+            notes.append("{:.0f} to {:.0f} °C".format(*self.temperature))
+        notes += [
+            f"{name} {low:.0f} to {high:.0f} MHz"
+            for name, (low, high) in self.clocks.items()
+        ]
+        return notes
+
+    def to_json(self) -> dict[str, Any]:
+        """Return every attribute under its name."""
+        return asdict(self)
+
+    def save(self, path: Path) -> None:
+        """Write it atomically.
+
+        Raises:
+            EnergyError: The file cannot be written.
+        """
+        try:
+            write_json(path, self.to_json(), indent=2)
+        except OSError as error:
+            raise EnergyError(f"{path}: cannot be written: {error.strerror}") from error
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what :meth:`save` wrote; keys that are not known are left out.
+
+        Raises:
+            EnergyError: No such file, or not of this form.
+        """
+        try:
+            record = documents.from_json(documents.content(path))
+            return TypeAdapter(cls).validate_python(record)
+        except OSError as error:
+            raise EnergyError(f"{path}: {error.strerror}") from error
+        except documents.MalformedError as error:
+            raise EnergyError(f"{path}: not an energy file: {error}") from error
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"])) or "the file"
+            raise EnergyError(
+                f"{path}: not an energy file: {where}: {first['msg']}"
+            ) from error

@@ -1,0 +1,104 @@
+"""What was measured is written, read back and shown; what was not has a reason."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy import EnergyResult
+
+NONE = EnergyResult(reason="no energy counter: rapl: no /sys/class/powercap")
+FOUND = EnergyResult(
+    joules=2_000.0,
+    frames=800,
+    j_per_frame=2.5,
+    net_j_per_frame=2.0,
+    low=2.4,
+    high=2.6,
+    windows=8,
+    window_s=10.0,
+    counter="nvml-total",
+    counter_step_s=0.1,
+    idle_w=50.0,
+    temperature=(61.0, 64.0),
+    clocks={"sm": (1_700.0, 1_755.0)},
+    device="a GPU",
+    scope="board",
+    model_sha256="0",
+    window_j_per_frame=(2.5,) * 8,
+    power_j_per_frame=2.52,
+)
+
+
+@pytest.mark.parametrize("result", [NONE, FOUND])
+def test_what_is_saved_is_read_back(result: EnergyResult, tmp_path: Path) -> None:
+    result.save(tmp_path / "energy.json")
+
+    assert EnergyResult.load(tmp_path / "energy.json") == result
+
+
+def test_nothing_measured_is_null_and_says_why() -> None:
+    found = NONE.to_json()
+
+    assert (found["joules"], found["j_per_frame"], found["low"]) == (None, None, None)
+    assert NONE.headline == f"energy: not measured: {NONE.reason}"
+    assert NONE.tables() == ()
+
+
+def test_a_figure_stands_beside_its_interval() -> None:
+    assert FOUND.headline == "energy: 2.5 J a frame (2.4 to 2.6), nvml-total of a GPU"
+    (shown,) = FOUND.tables()
+    assert [cell.text for cell in shown.rows[0]] == ["gross", "2.5", "2.4", "2.6"]
+    assert "idle 50 W" in shown.note
+    assert FOUND.alerts() == ()
+
+
+@pytest.mark.parametrize(("power", "alerts"), [(2.74, 0), (2.76, 1), (2.24, 1)])
+def test_power_that_is_far_from_the_counter_is_flagged(
+    power: float, alerts: int
+) -> None:
+    assert len(replace(FOUND, power_j_per_frame=power).alerts()) == alerts
+
+
+def test_a_device_that_slowed_down_is_flagged() -> None:
+    (line,) = replace(FOUND, throttled=("power cap",)).alerts()
+
+    assert "slowed itself down: power cap" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"j_per_frame": None}, "neither joules a frame nor a reason"),
+        ({"reason": "none"}, "both joules a frame and a reason"),
+        ({"low": None}, "low and high go with j_per_frame"),
+        ({"low": 2.55}, "does not hold j_per_frame"),
+        ({"joules": -1.0}, "greater than or equal to 0"),
+        ({"frames": "many"}, "frames: "),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_one_line(
+    change: dict[str, object], fault: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "energy.json"
+    path.write_text(json.dumps({**FOUND.to_json(), **change}))
+
+    with pytest.raises(EnergyError, match=fault) as caught:
+        EnergyResult.load(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"joules": NaN}', '{"joules": 1'])
+def test_what_is_no_energy_file_is_one_line(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "energy.json"
+    path.write_text(text)
+
+    with pytest.raises(EnergyError, match="not an energy file"):
+        EnergyResult.load(path)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(EnergyError, match="No such file"):
+        EnergyResult.load(tmp_path / "energy.json")
