@@ -68,11 +68,16 @@ def can_replace(old: ir.Value, new: ir.Value) -> bool:
     )
 
 
-def replace_value(old: ir.Value, new: ir.Value) -> None:
+def replace_value(old: ir.Value, new: ir.Value, names: set[str] | None = None) -> None:
     """Replace a value in all its readers; a graph output keeps its name.
 
     Where ``old`` is a graph output, ``new`` takes its place and its name, so that the
     interface stays as it was.
+
+    Args:
+        old: what is read.
+        new: what is to be read.
+        names: those that are taken, as in :func:`add_constant`.
 
     Raises:
         GraphError: ``old`` is a graph output, and ``new`` cannot be it, being an
@@ -86,7 +91,8 @@ def replace_value(old: ir.Value, new: ir.Value) -> None:
         raise GraphError(f"output {old.name} cannot be made of {new.name}: add a node")
     name, shape, kind = old.name, old.shape, old.type
     old.replace_all_uses_with(new, replace_graph_outputs=True)
-    old.name = fresh_name(f"{name}_replaced", value_names(graph))
+    taken = value_names(graph) if names is None else names
+    old.name = fresh_name(f"{name}_replaced", taken)
     new.name, new.shape, new.type = name, shape, kind
 
 

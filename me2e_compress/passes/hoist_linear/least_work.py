@@ -17,6 +17,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
 from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
+from me2e_compress.passes.hoist_linear.owned_work import Amount, OwnedWork
 from me2e_compress.passes.hoist_linear.row_moves import (
     VIEWS,
     moved_rows,
@@ -32,7 +33,7 @@ from me2e_compress.passes.hoist_linear.ways import (
     Way,
     uses_weight,
 )
-from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE, work
+from me2e_compress.passes.work import MACS_PER_NODE, MOVED_BYTES_PER_NODE
 from me2e_compress.rewrite import holds_numbers, is_standard, sole_reader
 
 DEEPEST = 32
@@ -103,12 +104,12 @@ class Prices:
     def __init__(self, bytes_per_node: int) -> None:
         self.rate = max(bytes_per_node, 1e-9)
         self.known: dict[tuple[int, int, bool, bool], Price] = {}
-        self.kept: dict[int, tuple[float, int]] = {}
+        self.owned = OwnedWork(self.rate)
 
     def forget(self) -> None:
         """Forget all answers: the graph is another now."""
         self.known.clear()
-        self.kept.clear()
+        self.owned.known.clear()
 
     def saving(self, layer: LinearLayer) -> Price | None:
         """Return the cheapest other way for a layer, with the work and MACs it saves.
@@ -123,7 +124,7 @@ class Prices:
             return None
         saved = now.work - best.work
         if not uses_weight(best.way) and sole_reader(layer.weight) is not None:
-            saved += self._file(layer.weight)
+            saved += self.owned.file(layer.weight)
         if saved < 1.0 or best.macs >= now.macs:
             return None
         return Price(best.way, saved, now.macs - best.macs)
@@ -149,8 +150,8 @@ class Prices:
         if asked.fresh:
             matrix = asked.shape[-1] * asked.columns * _item(asked.value)
             cost += matrix / self.rate
-        held, more = self._held(asked.value) if asked.owned else (0.0, 0)
-        return Price(Direct(asked.value), cost + held, macs + more)
+        held = self.owned.of(asked.value) if asked.owned else Amount()
+        return Price(Direct(asked.value), cost + held.work, macs + held.macs)
 
     def indirect(self, asked: Question) -> Price | None:
         """Price the ways through the node that computes the value; None if none."""
@@ -207,50 +208,6 @@ class Prices:
         sums = len(terms) - 1
         cost += sums + sums * asked.product_bytes / MOVED_BYTES_PER_NODE
         return Price(Distributed(node, tuple(terms)), cost, macs)
-
-    def _held(self, value: ir.Value) -> tuple[float, int]:
-        """Return the work and MACs of what only this value is computed by."""
-        key = id(value)
-        if key not in self.kept:
-            self.kept[key] = (0.0, 0)  # nothing comes before itself
-            self.kept[key] = self._hold(value)
-        return self.kept[key]
-
-    def _hold(self, value: ir.Value) -> tuple[float, int]:
-        node = value.producer()
-        if node is None or node.graph is not value.graph:
-            return 0.0, 0
-        layer = layer_behind(value)
-        if layer is not None:
-            owned = all(sole_reader(each.outputs[0]) for each in layer.nodes)
-            if not owned:
-                return 0.0, 0
-            cost = sum(map(work, layer.nodes))
-            if sole_reader(layer.weight) is not None:
-                cost += self._file(layer.weight)
-            macs = (
-                _size(static_shape(layer.source) or ())
-                * ((static_shape(layer.result) or (0,))[-1])
-            )
-            sources: tuple[ir.Value, ...] = (layer.source,)
-        else:
-            inner = moved_rows(node)
-            if inner is None:
-                if node.op_type not in ("Add", "Sub", "Concat"):
-                    return 0.0, 0
-                inner = tuple(each for each in node.inputs if each is not None)
-            cost, macs, sources = work(node), 0, inner
-        for source in sources:
-            if sole_reader(source) is not None:
-                if holds_numbers(source):
-                    cost += self._file(source)
-                    continue
-                more, products = self._held(source)
-                cost, macs = cost + more, macs + products
-        return cost, macs
-
-    def _file(self, weight: ir.Value) -> float:
-        return _size(static_shape(weight) or ()) * _item(weight) / self.rate
 
 
 def terms_of(

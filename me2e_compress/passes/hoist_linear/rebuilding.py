@@ -60,7 +60,7 @@ class Rewriter:
     def swap(self, old: ir.Value, new: ir.Value) -> None:
         """Put a value in another's place, under its name; drop what nothing reads."""
         name = old.name
-        replace_value(old, new)
+        replace_value(old, new, self.names)
         self.drop(old)
         new.name = name
 

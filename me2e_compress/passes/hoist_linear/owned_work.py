@@ -1,0 +1,99 @@
+"""The work that goes with a value: of what only it is computed by."""
+
+import dataclasses
+import math
+
+import onnx_ir as ir
+
+from me2e_compress.graph import static_shape
+from me2e_compress.passes.hoist_linear.linear_layers import LinearLayer, layer_behind
+from me2e_compress.passes.hoist_linear.row_moves import moved_rows
+from me2e_compress.passes.work import work
+from me2e_compress.rewrite import holds_numbers, sole_reader
+
+
+@dataclasses.dataclass(frozen=True)
+class Amount:
+    """Work, in starts of a node, and multiply-accumulates.
+
+    Attributes:
+        work: bytes of the file included.
+        macs: multiply-accumulates.
+    """
+
+    work: float = 0.0
+    macs: int = 0
+
+    def plus(self, other: "Amount") -> "Amount":
+        """Return both together."""
+        return Amount(self.work + other.work, self.macs + other.macs)
+
+
+class OwnedWork:
+    """Adds up what would be gone with a value, and remembers it.
+
+    Args:
+        rate: bytes of the file that a node which is gone may cost.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+        self.known: dict[int, Amount] = {}
+
+    def of(self, value: ir.Value) -> Amount:
+        """Return the work and MACs of what only this value is computed by.
+
+        Without calling itself: a sum may have thousands of terms.
+        """
+        waiting = [value]
+        while waiting:
+            last = waiting[-1]
+            amount, sources = self._last_step(last)
+            unknown = [each for each in sources if id(each) not in self.known]
+            if unknown:
+                waiting.extend(unknown)
+                continue
+            for source in sources:
+                amount = amount.plus(self.known[id(source)])
+            self.known[id(last)] = amount
+            waiting.pop()
+        return self.known[id(value)]
+
+    def _last_step(self, value: ir.Value) -> tuple[Amount, list[ir.Value]]:
+        """Return what the last step to a value takes, and what only that reads."""
+        node = value.producer()
+        if id(value) in self.known:
+            return self.known[id(value)], []
+        if node is None or node.graph is not value.graph:
+            return Amount(), []
+        layer = layer_behind(value)
+        if layer is not None:
+            amount, sources = self._layer(layer), [layer.source]
+        else:
+            found = moved_rows(node)
+            if found is None:
+                if node.op_type not in ("Add", "Sub", "Concat"):
+                    return Amount(), []
+                found = tuple(each for each in node.inputs if each is not None)
+            amount, sources = Amount(work(node)), list(found)
+        if amount is None:
+            return Amount(), []
+        owned = [each for each in sources if sole_reader(each) is not None]
+        stored = [each for each in owned if holds_numbers(each)]
+        files = Amount(sum(map(self.file, stored)))
+        return amount.plus(files), [each for each in owned if each not in stored]
+
+    def _layer(self, layer: LinearLayer) -> Amount | None:
+        """Return what a layer takes; None if others read what is inside."""
+        if not all(sole_reader(each.outputs[0]) for each in layer.nodes):
+            return None
+        cost = sum(map(work, layer.nodes))
+        if sole_reader(layer.weight) is not None:
+            cost += self.file(layer.weight)
+        columns = (static_shape(layer.result) or (0,))[-1]
+        return Amount(cost, math.prod(static_shape(layer.source) or ()) * columns)
+
+    def file(self, weight: ir.Value) -> float:
+        """Return what a constant takes in the file."""
+        item = 4.0 if weight.dtype is None else weight.dtype.itemsize
+        return math.prod(static_shape(weight) or ()) * item / self.rate
