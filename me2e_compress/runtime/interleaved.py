@@ -11,6 +11,7 @@ from me2e_compress import graph
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP, TimedSession, check_work, processor
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session, replay
 
 BLOCK = 10
@@ -80,6 +81,7 @@ def record_traces(
     samples: int,
     warm_up: int = WARM_UP,
     threads: int = 1,
+    provider: Provider = CPU,
     on_sample: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, LatencyTrace]:
     """Record the latency of models, each warm and alone, block by block in turn.
@@ -93,16 +95,19 @@ def record_traces(
         samples: latencies of each model.
         warm_up: inferences of each before the first block.
         threads: of onnxruntime.
+        provider: what runs them.
         on_sample: called with samples done, samples in all and the model's name.
 
     Raises:
         EvaluationError: there is nothing to measure.
         GraphError: a model cannot be run.
+        ProviderError: the provider is not there.
         FramesError: a frame does not fit.
     """
     check_work(samples, warm_up, frames)
     sessions = {
-        name: TimedSession(path, threads=threads) for name, path in models.items()
+        name: TimedSession(path, threads=threads, provider=provider)
+        for name, path in models.items()
     }
     runs = {
         name: replay(session, chain.from_iterable(repeat(frames)))
@@ -117,16 +122,17 @@ def record_traces(
             _advance(runs[name], RE_WARM + block)
             kept[name] += session.taken_us[-block:]
             on_sample(done * len(models) + place * block, samples * len(models), name)
-    machine = describe_machine(threads)
+    machine = describe_machine(threads, provider)
     return {
         name: LatencyTrace(graph.sha256_of(path), machine, tuple(kept[name]))
         for name, path in models.items()
     }
 
 
-def describe_machine(threads: int) -> str:
-    """Return the machine of `record_traces`, in words: processor and threads."""
-    return f"{processor()}, onnxruntime on {threads or 'all'} threads, in turn"
+def describe_machine(threads: int, provider: Provider = CPU) -> str:
+    """Return the machine of `record_traces`, in words: processor, threads, provider."""
+    runs = "" if provider == CPU else f", {PROVIDERS.text(provider)}"
+    return f"{processor()}, onnxruntime on {threads or 'all'} threads{runs}, in turn"
 
 
 def _advance(runs: Iterator[object], count: int) -> None:

@@ -45,6 +45,7 @@ class Provider(abc.ABC):
         native: what onnxruntime calls it.
         advice: what to do where it is not installed.
         left_out: optimizations that onnxruntime is not to make for it.
+        target: the target whose int8 it runs.
 
     Attributes:
         plugins: libraries of onnxruntime operators that the graph needs.
@@ -54,6 +55,7 @@ class Provider(abc.ABC):
     native: ClassVar[str]
     advice: ClassVar[str]
     left_out: ClassVar[tuple[str, ...]] = WRONG_FUSIONS
+    target: ClassVar[str] = "onnxruntime"
     plugins: tuple[Path, ...] = dataclasses.field(default=(), kw_only=True)
 
     def check(self) -> None:
@@ -178,6 +180,7 @@ class TensorRtProvider(Provider):
     name: ClassVar[str] = "tensorrt"
     native: ClassVar[str] = "TensorrtExecutionProvider"
     advice: ClassVar[str] = f"{_GPU_PACKAGE}, and TensorRT 10"
+    target: ClassVar[str] = "tensorrt"
     device: int = 0
     precision: Literal["fp32", "fp16", "int8", "best"] = "fp32"
     cache: Path | None = None
@@ -226,6 +229,7 @@ class TensorRtRtxProvider(Provider):
     name: ClassVar[str] = "tensorrt-rtx"
     native: ClassVar[str] = "NvTensorRTRTXExecutionProvider"
     advice: ClassVar[str] = "pip install onnxruntime-ep-nv-tensorrt-rtx"
+    target: ClassVar[str] = "tensorrt"
     package: ClassVar[str] = "onnxruntime_ep_nv_tensorrt_rtx"
     cache: Path | None = None
 

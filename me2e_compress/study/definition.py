@@ -12,6 +12,7 @@ from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import FramesError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route
 
 TRACE = "trace"
@@ -138,6 +139,7 @@ class Study:
         held_out: Folder of other frames: fidelity and latency are measured on them.
         timing: How latencies are measured.
         seed: Of bootstraps, of passes and of draws from traces.
+        provider: What runs the models, wherever one is run.
 
     Raises:
         StudyError: Nothing to drive, a name twice, a baseline that is not a variant, a
@@ -154,6 +156,7 @@ class Study:
     held_out: Path | None = None
     timing: Timing = field(default_factory=Timing)
     seed: int = 0
+    provider: Provider = CPU
 
     def __post_init__(self) -> None:
         """Refuse what could not be finished."""
@@ -194,6 +197,7 @@ class Study:
     def inputs(self) -> Iterator[str | Path]:
         """List the files and folders that it reads."""
         yield from filter(None, (self.frames, self.held_out))
+        yield from self.provider.plugins
         for each in self.variants:
             named = (each.policy, each.module_map, each.adapter, each.trace)
             yield from filter(None, named)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from me2e_compress import recipe
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.definition import Condition, Study, Timing, Variant
 from me2e_compress.study.outcome import StudyResult
@@ -26,7 +27,7 @@ from me2e_compress.workflows.result import Result, Table
 CALIBRATION_FRAMES, CALIBRATION_SEED = 64, 0
 HELD_OUT_FRAMES, HELD_OUT_SEED = 24, 1
 LATENCY_SAMPLES = 100
-FLOAT, TARGET = "float", "onnxruntime"
+FLOAT = "float"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -75,6 +76,7 @@ class DriverDemo:
         scheme: a shipped recipe.
         routes: that both drive: a number or ``ID,ID``.
         workers: routes at a time.
+        provider: what runs the graphs.
         force: replace files that are not as we left them, too.
 
     Raises:
@@ -88,6 +90,7 @@ class DriverDemo:
     scheme: str = "feature-ext"
     routes: str = "5"
     workers: int = 2
+    provider: Provider = CPU
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -104,20 +107,26 @@ class DriverDemo:
     def compress(self, listener: Listener) -> CompressResult:
         """Copy the driver, let it see routes, make it small.
 
-        Int8 is for what drives here: placed for TensorRT it is slower than float.
+        Int8 is for what drives here: placed for TensorRT it is slower than float on
+        the CPU.
         """
         export_stack(self.name, self._source, ExportOptions(force=self.force))
         for folder, count, seed in (
             (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
             (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
         ):
-            asked = FramesOptions(count, seed, force=self.force)
+            asked = FramesOptions(count, seed, provider=self.provider, force=self.force)
             record_frames(self._source, folder, asked, listener)
         passes = recipe.load(self.scheme)
-        target = TARGET if any(each.quantizes for each in passes) else None
+        quantizes = any(each.quantizes for each in passes)
+        target = self.provider.target if quantizes else None
         # Fidelity is measured on frames of other routes, see `compare`.
         options = CompressOptions(
-            target=target, measure_frames=0, allow_empty=True, force=self.force
+            target=target,
+            measure_frames=0,
+            allow_empty=True,
+            provider=self.provider,
+            force=self.force,
         )
         return compress(
             self._source, self._small, passes, self._frames, options, listener
@@ -129,7 +138,13 @@ class DriverDemo:
 
     def compare(self, listener: Listener) -> Result:
         """Compare the small graph with the driver on other frames."""
-        return compare(self._source, self._small, self._held_out, listener)
+        return compare(
+            self._source,
+            self._small,
+            self._held_out,
+            listener,
+            provider=self.provider,
+        )
 
     def drive(self, listener: Listener) -> DriveResult:
         """Drive the routes with both, and write the report."""
@@ -146,20 +161,36 @@ class DriverDemo:
             len(everything),
             held_out=self._held_out,
             timing=Timing(LATENCY_SAMPLES),
+            provider=self.provider,
         )
         engine = LocalEngine(self.workers)
         found = run_study(study, self.out, engine, listener, force=self.force)
-        words = ("me2e-compress", "demo", "-o", str(self.out))
-        chosen = ("--routes", self.routes, "--scheme", self.scheme)
-        written = write_study(found, self.out, (*words, *chosen), force=self.force)
+        written = write_study(found, self.out, self._words(), force=self.force)
         ending = (
             *verdict(found, self.scheme),
             f"{self._small} and {written.report} are yours.",
-            f"Its int8 is for {TARGET}, which drives here. For TensorRT: me2e-compress"
+            *self._elsewhere(),
+        )
+        return DriveResult(found, written, ending)
+
+    def _words(self) -> tuple[str, ...]:
+        """Return the command that does all this."""
+        words = ("me2e-compress", "demo", "-o", str(self.out))
+        chosen = ["--routes", self.routes, "--scheme", self.scheme]
+        if self.provider != CPU:
+            chosen += ["--provider", PROVIDERS.text(self.provider)]
+        return (*words, *chosen)
+
+    def _elsewhere(self) -> tuple[str, ...]:
+        """Say what to do for TensorRT, where that does not drive here."""
+        target = self.provider.target
+        if target == "tensorrt":
+            return ()
+        return (
+            f"Its int8 is for {target}, which drives here. For TensorRT: me2e-compress"
             f" compress {self.name} -r {self.scheme} --frames {self._frames} -o"
             f" {self.name}.trt.onnx",
         )
-        return DriveResult(found, written, ending)
 
     @property
     def _source(self) -> Path:

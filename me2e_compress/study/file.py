@@ -1,5 +1,6 @@
 """A study as a TOML file."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
@@ -9,13 +10,19 @@ from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.study.definition import Condition, Study, Timing, Variant
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.zoo.shipped import SHIPPED
 
 
-def load_study(path: str | Path, routes: str | None = None) -> Study:
+def load_study(
+    path: str | Path,
+    routes: str | None = None,
+    provider: str | None = None,
+    plugins: Sequence[Path] = (),
+) -> Study:
     """Read a study.
 
     Files are looked for beside the study's own file; a policy that is not one there
@@ -24,6 +31,8 @@ def load_study(path: str | Path, routes: str | None = None) -> Study:
     Args:
         path: The TOML file.
         routes: Drive these instead of the study's.
+        provider: What runs the models, instead of the study's, as a text.
+        plugins: Libraries of operators or plugins, besides the study's.
 
     Raises:
         GraphError: A policy is neither a file nor a model that ships.
@@ -31,6 +40,7 @@ def load_study(path: str | Path, routes: str | None = None) -> Study:
             another type, frames that are none, or a study that could not be finished.
         RecipeError: An unknown recipe or pass.
         EvaluationError: Unknown routes or latency.
+        ProviderError: A provider or library that is not there.
     """
     path = Path(path)
     try:
@@ -43,7 +53,9 @@ def load_study(path: str | Path, routes: str | None = None) -> Study:
         table = _Study.model_validate(content)
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
-    study = _Reader(path).study(table, routes)
+    if provider is not None:
+        table.provider = provider
+    study = _Reader(path).study(table, routes, plugins)
     study.check_recordings()
     return study
 
@@ -80,6 +92,8 @@ class _Study(_Table):
     seed: int = 0
     frames: str | None = None
     held_out: str | None = None
+    provider: str = "cpu"
+    plugins: list[str] = Field(default_factory=list)
     latency: _Latency = Field(default_factory=_Latency)
     variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
     """Files written before variants had their name say ``[[scheme]]``."""
@@ -112,8 +126,11 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def study(self, table: _Study, routes: str | None) -> Study:
+    def study(
+        self, table: _Study, routes: str | None, plugins: Sequence[Path]
+    ) -> Study:
         timing = table.latency
+        libraries = (*map(self._beside, table.plugins), *plugins)
         driven, set_size = self._routes(routes or str(table.routes))
         return Study(
             title=table.title,
@@ -128,6 +145,7 @@ class _Reader:
             held_out=self._file(table.held_out),
             timing=Timing(timing.samples, timing.threads, timing.baseline_median_s),
             seed=table.seed,
+            provider=provider_named(table.provider, libraries),
         )
 
     def _variant(self, table: _Variant) -> Variant:

@@ -7,6 +7,7 @@ from typing import Any
 
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.profile import processor
+from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.study.definition import Condition, Study
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.plan_fidelity import PlanFidelity, measure_json
@@ -163,6 +164,7 @@ class StudyResult(Result):
             "title": study.title,
             "baseline": study.baseline,
             "seed": study.seed,
+            "provider": PROVIDERS.text(study.provider),
             "routes": {"driven": len(study.routes), "set": study.set_size},
             "conditions": [
                 {"name": each.name, "charged": each.latency}

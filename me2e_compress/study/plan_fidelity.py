@@ -75,7 +75,10 @@ def judge(
         return PlanFidelity.unknown("the baseline itself")
     recording = CalibrationSet(study.held_out)
     stage = f"fidelity of {prepared.variant.name}"
-    left, right = Session(baseline.model), Session(prepared.model)
+    left, right = (
+        Session(path, provider=study.provider)
+        for path in (baseline.model, prepared.model)
+    )
 
     def reported() -> Iterator[Frame]:
         for frame in recording:

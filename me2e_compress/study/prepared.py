@@ -14,6 +14,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.modules import ModuleMap
 from me2e_compress.recipe import to_text
+from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
@@ -65,8 +66,8 @@ def prepare_variant(
         raise StudyError(f"variant {variant.name}: {source}: no such model")
     if variant.passes:
         model = _compressed(study, variant, workspace, listener)
-    driver = replace(driver, path=model)
-    try_file(model, listener)
+    driver = replace(driver, path=model, provider=PROVIDERS.text(study.provider))
+    try_file(model, listener, study.provider)
     driver.open()
     sha256 = graph.sha256_of(model)
     origin = source.name, to_text(variant.passes)
@@ -120,7 +121,7 @@ def _compressed(
     """
     source = Path(variant.policy)
     frames = None if study.frames is None else CalibrationSet(study.frames)
-    path = workspace.model(variant, _key(variant, source, frames, study.seed))
+    path = workspace.model(variant, _key(study, variant, source, frames))
     if path.is_file() and beside(path, "report").is_file():
         if _unaltered(path):
             return path
@@ -135,6 +136,7 @@ def _compressed(
         force=True,  # what is in the workspace is its own affair
         module_map=variant.module_map,
         seed=study.seed,
+        provider=study.provider,
         measure_frames=0,
         allow_empty=True,
     )
@@ -144,7 +146,7 @@ def _compressed(
 
 
 def _key(
-    variant: Variant, source: Path, frames: CalibrationSet | None, seed: int
+    study: Study, variant: Variant, source: Path, frames: CalibrationSet | None
 ) -> str:
     """Hash everything that decides what the passes make."""
     modules = variant.module_map
@@ -154,7 +156,9 @@ def _key(
         to_text(variant.passes),
         "" if frames is None else frames.fingerprint,
         "" if modules is None else repr(ModuleMap.load(modules)),
-        str(seed),
+        str(study.seed),
+        # as before there was a choice, so that what was made then is still found
+        *(() if study.provider == CPU else (PROVIDERS.text(study.provider),)),
         *(_content(variant, file) for each in variant.passes for file in each.files()),
     )
     return hashlib.sha256("\n".join(decisive).encode()).hexdigest()

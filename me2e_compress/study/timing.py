@@ -133,6 +133,7 @@ def _measured(
         frames,
         samples=study.timing.samples,
         threads=study.timing.threads,
+        provider=study.provider,
         on_sample=lambda done, total, words: listener.on_progress(
             "latency", done, total, words
         ),
@@ -173,7 +174,8 @@ def _other(
     trace: LatencyTrace, each: PreparedVariant, frames: str | None, study: Study
 ) -> str | None:
     """Return what a trace is of, if this study measures something else; else None."""
-    wanted, machine = study.timing.samples, describe_machine(study.timing.threads)
+    wanted = study.timing.samples
+    machine = describe_machine(study.timing.threads, study.provider)
     if trace.model_sha256 != each.sha256:
         return "another model"
     if len(trace.samples_us) != wanted:

@@ -15,6 +15,7 @@ from me2e_compress.graph import is_standard, opset_of
 from me2e_compress.graph.validity import refusal
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import KeptFloat, QuantPlan
+from me2e_compress.runtime.providers import CPU, Provider
 
 Severity = Literal["error", "warning"]
 
@@ -167,12 +168,15 @@ class Target(abc.ABC):
         found = [finding for rule in self.lint_rules() for finding in rule(copy)]
         return tuple(sorted(found, key=lambda each: each.severity))
 
-    def read_back(self, model: ir.Model) -> tuple[LintFinding, ...]:
+    def read_back(
+        self, model: ir.Model, provider: Provider = CPU
+    ) -> tuple[LintFinding, ...]:
         """Open a graph, and list what runs otherwise than it says; errors first.
 
         A target whose program is not at hand finds nothing.
 
         Args:
             model: a graph in which :meth:`lint` found no error; it stays as it is.
+            provider: what is to run it, of the program's.
         """
         return ()

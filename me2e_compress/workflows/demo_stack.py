@@ -8,6 +8,7 @@ from pathlib import Path
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.interleaved import RunTimes, time_interleaved
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.checks import MOST_THREADS, check_count, check_folder
 from me2e_compress.workflows.compare import CompareResult, compare
@@ -34,6 +35,7 @@ class FilesResult(Result):
         rounds: how often each was run.
         ending: what the user has now, in words.
         plan: how far it moved, in words.
+        provider: what ran them.
     """
 
     times: dict[Path, RunTimes]
@@ -41,6 +43,7 @@ class FilesResult(Result):
     rounds: int
     ending: str
     plan: str
+    provider: Provider = CPU
 
     @property
     def headline(self) -> str:
@@ -76,13 +79,15 @@ class FilesResult(Result):
             for path, each in self.times.items()
         ]
         how = f"{self.threads} threads, {self.rounds} rounds in turn"
+        on = "this CPU" if self.provider == CPU else PROVIDERS.text(self.provider)
+        slower = "; onnxruntime's CPU runs such graphs slower"
         return (
             table(
-                f"Files, and latency on this CPU ({how})",
+                f"Files, and latency on {on} ({how})",
                 ("file", "MB", "median s", "best s", "CPU s", "ratio to the first"),
                 rows,
-                "int8 here is placed for TensorRT; onnxruntime's CPU runs such graphs"
-                " slower",
+                "int8 here is placed for TensorRT"
+                + (slower if self.provider == CPU else ""),
             ),
         )
 
@@ -114,6 +119,7 @@ class StackDemo:
         scheme: a shipped recipe.
         rounds: of the latency.
         threads: of onnxruntime.
+        provider: what runs the graphs.
         force: replace files that are not as we left them, too.
 
     Raises:
@@ -126,6 +132,7 @@ class StackDemo:
     scheme: str = "feature-ext"
     rounds: int = 4
     threads: int = 2
+    provider: Provider = CPU
     force: bool = False
     _compared: list[CompareResult] = dataclasses.field(default_factory=list, init=False)
 
@@ -147,10 +154,12 @@ class StackDemo:
             (self._frames, CALIBRATION_FRAMES, CALIBRATION_SEED),
             (self._held_out, HELD_OUT_FRAMES, HELD_OUT_SEED),
         ):
-            options = FramesOptions(count, seed, SCENE_LENGTH, self.force)
+            options = FramesOptions(count, seed, SCENE_LENGTH, force=self.force)
             record_frames(self.stack, folder, options, listener)
         # Fidelity is measured on frames of another seed, see `compare`.
-        unmeasured = CompressOptions(measure_frames=0, force=self.force)
+        unmeasured = CompressOptions(
+            measure_frames=0, provider=self.provider, force=self.force
+        )
         return compress(
             self._source, self._small, self.scheme, self._frames, unmeasured, listener
         )
@@ -161,18 +170,28 @@ class StackDemo:
 
     def compare(self, listener: Listener) -> Result:
         """Compare the small graph with the stack on other frames."""
-        found = compare(self._source, self._small, self._held_out, listener)
+        found = compare(
+            self._source,
+            self._small,
+            self._held_out,
+            listener,
+            provider=self.provider,
+        )
         self._compared.append(found)
         return found
 
     def time(self, listener: Listener) -> FilesResult:
         """Time the stack, its exact form and the small graph in turn."""
         exact = self.out / f"{self.stack}.exact.onnx"
-        unchecked = CompressOptions(verify_frames=0, force=self.force)
+        unchecked = CompressOptions(
+            verify_frames=0, provider=self.provider, force=self.force
+        )
         compress(self._source, exact, "exact", options=unchecked, listener=listener)
         paths = {path.name: path for path in (self._source, exact, self._small)}
         sessions = {
-            name: Session(path, threads=self.threads, release=True)
+            name: Session(
+                path, threads=self.threads, release=True, provider=self.provider
+            )
             for name, path in paths.items()
         }
         frame = CalibrationSet(self._held_out)[0]
@@ -185,6 +204,7 @@ class StackDemo:
             self.rounds,
             f"{self._small} and {report} are yours.",
             self._compared[-1].headline if self._compared else "plan: not measured",
+            self.provider,
         )
 
     @property

@@ -156,11 +156,9 @@ def _evaluated(
 ) -> EvaluateResult:
     picked, set_size = routes_named(options.routes)
     shown = () if options.render is None else pick_routes(picked, options.render)
-    driver = driver_of(policy, options.adapter)
-    if isinstance(driver, OnnxDriver) and options.provider != CPU:
-        driver = dataclasses.replace(driver, provider=PROVIDERS.text(options.provider))
-    elif isinstance(driver, OnnxDriver):
-        try_file(driver.path, listener)
+    driver = driver_of(policy, options.adapter, options.provider)
+    if isinstance(driver, OnnxDriver):
+        try_file(driver.path, listener, options.provider)
     job = _job(driver, options)
 
     def on_progress(now: DrivingProgress) -> None:
@@ -206,12 +204,15 @@ def _job(driver: Driver, options: EvaluateOptions) -> Job:
     return Job(driver, conditions, options.frame_limit_s)
 
 
-def driver_of(text: str, adapter: str | Path | None = None) -> Driver:
+def driver_of(
+    text: str, adapter: str | Path | None = None, provider: Provider = CPU
+) -> Driver:
     """Find the driver that a word means, and its model.
 
     Args:
         text: a policy by name, a path, or a shipped model's name.
         adapter: TOML file that adapts the model to the policy contract.
+        provider: what runs the model; one of other policies is not asked.
 
     Raises:
         EvaluationError: none of them.
@@ -222,7 +223,8 @@ def driver_of(text: str, adapter: str | Path | None = None) -> Driver:
     if not isinstance(driver, OnnxDriver):
         return driver
     try:
-        return dataclasses.replace(driver, path=model_path(driver.path))
+        path, runs = model_path(driver.path), PROVIDERS.text(provider)
+        return dataclasses.replace(driver, path=path, provider=runs)
     except GraphError as error:
         policies = ", ".join(POLICIES.names())
         raise EvaluationError(f"{error}; policies: {policies}") from error

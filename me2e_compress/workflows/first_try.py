@@ -52,12 +52,19 @@ def try_first(
         listener.on_progress(STAGE, 1, 1, f"{name}: {seconds:.1f} s")
 
 
-def try_file(file: Path, listener: Listener) -> None:
+def try_file(file: Path, listener: Listener, provider: Provider = CPU) -> None:
     """Open the graph of a file apart, if this machine has not seen it.
+
+    Args:
+        file: that holds the graph.
+        listener: is told how long it took.
+        provider: what runs it; another than the CPU is not tried.
 
     Raises:
         GraphError: onnxruntime dies of the graph.
     """
+    if provider != CPU:
+        return
     try:
         model = graph.load(file)
     except GraphError:

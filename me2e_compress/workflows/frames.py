@@ -7,6 +7,7 @@ from pathlib import Path
 from me2e_compress import graph
 from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
@@ -33,6 +34,7 @@ class FramesOptions:
         scene_length: frames a scene; None is `SCENE_LENGTH` of a synthetic world,
             `DRIVEN_SCENE_LENGTH` of a driven route.
         force: replace outputs that are not as we left them, too.
+        provider: what opens the model whose frames they are.
 
     Raises:
         RecipeError: a seed below 0.
@@ -42,6 +44,7 @@ class FramesOptions:
     seed: int = 0
     scene_length: int | None = None
     force: bool = False
+    provider: Provider = CPU
 
     def __post_init__(self) -> None:
         """Check the seed."""
@@ -115,6 +118,7 @@ def record_frames(
             is the input.
         FramesError: a count below 1, or the folder holds something else.
         EvaluationError: the file does not keep the policy contract.
+        ProviderError: the provider is not there.
         MissingExtraError: driving needs the extra ``highway``.
     """
     options, folder = options or FramesOptions(), Path(folder)
@@ -128,7 +132,7 @@ def _recorded(
 ) -> Path:
     if Path(source).is_file() or find(str(source)).trained:
         model = model_path(source)
-        try_file(model, listener)
+        try_file(model, listener, options.provider)
         make, of = _driven(model, options), graph.sha256_of(model)
     else:
         make, of = _synthetic(str(source), options), str(source)
@@ -149,7 +153,8 @@ def _driven(model: Path, options: FramesOptions) -> Source:
     from me2e_compress.driving.onnx_policy import OnnxPolicy
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 
-    policy, length = OnnxPolicy.open(model), options.scene_length
+    policy = OnnxPolicy.open(model, provider=options.provider)
+    length = options.scene_length
     return lambda begin: driven_frames(
         policy,
         options.count,

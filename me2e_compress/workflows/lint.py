@@ -11,6 +11,7 @@ from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import load_map, model_path
@@ -28,20 +29,28 @@ class LintOptions:
         trt_check: also parse and build the graph by TensorRT-RTX.
         sm: GPU generation that is built for.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        provider: what opens a graph for onnxruntime.
 
     Raises:
-        RecipeError: TensorRT-RTX is asked about a graph for another target.
+        RecipeError: TensorRT-RTX is asked about a graph for another target, or a
+            provider is named for a target that opens nothing.
     """
 
     target: str = "tensorrt"
     trt_check: bool = False
     sm: int = 86
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    provider: Provider = CPU
 
     def __post_init__(self) -> None:
-        """Check that TensorRT-RTX is asked about its own."""
+        """Check that TensorRT-RTX and providers are asked about their own."""
         if self.trt_check and self.target != "tensorrt":
             raise RecipeError(f"--trt-check is for tensorrt, not for {self.target}")
+        if self.provider != CPU and not TARGETS.parse(self.target).opens:
+            raise RecipeError(
+                f"--provider and --plugins are onnxruntime's: lint for {self.target}"
+                " opens no session"
+            )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -152,6 +161,7 @@ def lint(
 
     Raises:
         GraphError: no such model, or onnxruntime dies of it.
+        ProviderError: the provider is not there.
         RecipeError: no such target.
         PreconditionError: no input has such an open dimension.
         MissingExtraError: TensorRT-RTX is not installed and was asked.
@@ -161,26 +171,28 @@ def lint(
     if options.dims:
         modules = load_map(None, loaded)
         loaded = FixShapes(options.dims).run(loaded, Context(modules)).model
-    found = _found(loaded, path.name, options.target, listener)
+    found = _found(loaded, path.name, options, listener)
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, found, build)
 
 
 def _found(
-    model: ir.Model, name: str, target: str, listener: Listener
+    model: ir.Model, name: str, options: LintOptions, listener: Listener
 ) -> tuple[LintFinding, ...]:
     """List what rules find and, where they find no error, what opening the graph does.
 
     A node of which a rule has said already that it runs in float is named once.
     """
-    judge = TARGETS.parse(target)
+    judge, provider = TARGETS.parse(options.target), options.provider
     found = judge.lint(model)
     if any(each.severity == "error" for each in found):
         return found
     if judge.opens:
-        try_first(model, name, listener)
+        try_first(model, name, listener, provider=provider)
     known = {each.node for each in found if each.rule == "float-answer"}
-    opened = [each for each in judge.read_back(model) if each.node not in known]
+    opened = [
+        each for each in judge.read_back(model, provider) if each.node not in known
+    ]
     return tuple(sorted((*found, *opened), key=lambda each: each.severity))
 
 

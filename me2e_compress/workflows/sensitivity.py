@@ -237,14 +237,15 @@ def _on_routes(
     from me2e_compress.workflows.evaluate import driver_of
 
     picked, set_size = routes_named(routes)
-    size = image_size_of(driver_of(str(model), options.adapter).open())
+    adapter, provider = options.adapter, options.provider
+    size = image_size_of(driver_of(str(model), adapter, provider).open())
 
     def drive(choice: Int8Choice, variant: ir.Model) -> float:
         results = folder / _name_of(choice, variant)
         with TemporaryDirectory() as scratch:
             path = Path(scratch) / "variant.onnx"
             graph.save(variant, path)
-            driver = driver_of(str(path), options.adapter)
+            driver = driver_of(str(path), adapter, provider)
             job = Job(driver, Conditions(image_size=size))
             engine = LocalEngine(options.workers)
             evaluator = HighwayEvaluator(job, picked, results, set_size, engine)

@@ -11,12 +11,13 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import ModuleMapError, PreconditionError
+from me2e_compress.errors import ModuleMapError, PreconditionError, ProviderError
 from me2e_compress.manager.equivalence import relative
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32
+from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.session import run_once
 from me2e_compress.testing import check_pass
 from tests.frames import record
@@ -225,6 +226,18 @@ def test_numbers_that_the_frames_show_to_be_too_large(tmp_path: Path) -> None:
 
     assert types_of(found.model) == {"Relu": "FLOAT16", "Mul": "FLOAT"}
     assert "numbers up to 9e+04 1" in found.notes[1]
+
+
+def test_the_frames_run_on_the_provider(tmp_path: Path) -> None:
+    model = bare(OPSET + "b (float[4] x) => (float[4] y) { y = Relu(x) }", {})
+    frames = CalibrationSet(record(tmp_path / "f", [{"x": np.ones(4, np.float32)}]))
+    library = tmp_path / "gone.so"
+    context = Context(
+        ModuleMap.whole(), frames, provider=CpuProvider(plugins=(library,))
+    )
+
+    with pytest.raises(ProviderError, match=f"plugins library {library}: no such"):
+        ConvertFloat16().run(model, context)
 
 
 def test_without_frames_the_report_says_what_was_not_measured() -> None:

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from me2e_compress import recipe
-from me2e_compress.errors import EvaluationError, GraphError, RecipeError, StudyError
+from me2e_compress.errors import (
+    EvaluationError,
+    GraphError,
+    ProviderError,
+    RecipeError,
+    StudyError,
+)
+from me2e_compress.runtime.providers import CPU, CpuProvider
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
 from me2e_compress.zoo.shipped import shipped
@@ -98,6 +105,26 @@ def test_a_file_where_you_are_is_not_beside_the_study(
     monkeypatch.chdir(tmp_path)
 
     with pytest.raises(GraphError, match=r"^other\.onnx: no such file; models"):
+        load_study(path)
+
+
+def test_libraries_of_the_study_and_of_the_command_line(models: Path) -> None:
+    for name in ("beside.so", "other.so"):
+        (models / name).touch()
+    keys = 'provider = "cpu"\nplugins = ["beside.so"]\n'
+
+    study = load_study(write(models, keys + GOOD), plugins=[models / "other.so"])
+
+    libraries = (models / "beside.so", models / "other.so")
+    assert study.provider == CpuProvider(plugins=libraries)
+    assert set(libraries) <= set(study.inputs())
+
+
+def test_the_provider_of_the_command_line_wins(models: Path) -> None:
+    path = write(models, 'provider = "npu"\n' + GOOD)
+
+    assert load_study(path, provider="cpu").provider == CPU
+    with pytest.raises(ProviderError, match="no provider 'npu'; there are cpu, cuda"):
         load_study(path)
 
 

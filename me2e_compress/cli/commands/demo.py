@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import console, listening, show
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.demo_stack import StackDemo
 from me2e_compress.workflows.extras import need_closed_loop
@@ -36,6 +37,8 @@ def demo(
     workers: given.Workers = 2,
     rounds: Rounds = 4,
     threads: Threads = 2,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
@@ -43,13 +46,14 @@ def demo(
     The trained driver is compressed and drives before and after; vad-tiny, at its
     published size and with random weights, is compressed, compared and timed.
     """
+    runs = provider_named(provider, plugins or ())
     if stack in SHIPPED:
         need_closed_loop("what the demo drives with")
         from me2e_compress.study.demo import DriverDemo
 
-        steps = DriverDemo(stack, output, scheme, routes, workers, force).steps
+        steps = DriverDemo(stack, output, scheme, routes, workers, runs, force).steps
     else:
-        steps = StackDemo(stack, output, scheme, rounds, threads, force).steps
+        steps = StackDemo(stack, output, scheme, rounds, threads, runs, force).steps
     output.mkdir(parents=True, exist_ok=True)
     check_ours([output / PICTURE], force=force)
     for step in steps:

@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import frames as workflow
 
 Length = Annotated[
@@ -24,6 +25,8 @@ def frames(
     count: given.Count = 256,
     scene_length: Length = None,
     seed: given.Seed = 0,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
@@ -32,7 +35,9 @@ def frames(
     For vad-tiny a synthetic world is drawn; for highway, or any ONNX file that
     keeps the policy contract, the expert drives fresh routes of highway-env.
     """
-    options = workflow.FramesOptions(count, seed, scene_length, force)
+    options = workflow.FramesOptions(
+        count, seed, scene_length, force, provider_named(provider, plugins or ())
+    )
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)
     show(workflow.FramesResult(stack, output, options), as_json)

@@ -7,6 +7,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.cli.verbosity import is_verbose
+from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import lint as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -23,11 +24,14 @@ def lint(
     trt_check: TrtCheck = False,
     sm: Annotated[int, typer.Option(help="GPU generation that is built for")] = 86,
     set_dim: given.SetDim = None,
+    provider: given.Provider = "cpu",
+    plugins: given.Plugins = None,
     shown: Annotated[int, typer.Option(min=0, help="nodes shown of each rule")] = 3,
     as_json: given.Json = False,
 ) -> None:
     """Check a graph for the program that will run it; 1 if it would be refused."""
-    options = workflow.LintOptions(target, trt_check, sm, sizes(set_dim or ()))
+    runs = provider_named(provider, plugins or ())
+    options = workflow.LintOptions(target, trt_check, sm, sizes(set_dim or ()), runs)
     with listening() as listener:
         found = workflow.lint(model, options, listener)
     most = len(found.findings) if is_verbose() else shown

@@ -81,7 +81,8 @@ class ConvertFloat16(Pass):
         types = ElementTypes(model, FLOAT, HALF)
         wide = matching(model, self.keep_ops, self.keep_modules, self.keep_nodes)
         frames, io = context.frames, self.keep_io
-        wide = wide_nodes(model, types, frames, keep_io=io) | wide
+        found = wide_nodes(model, types, frames, keep_io=io, provider=context.provider)
+        wide = found | wide
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
         retyping = Retyping(model, types, self.name)
         retyping.run(narrow, keep_io=self.keep_io)

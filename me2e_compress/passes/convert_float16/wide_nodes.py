@@ -14,6 +14,7 @@ from me2e_compress.graph import is_standard, provenance, static_shape
 from me2e_compress.graph.nodes import Numbers, constant_values, numbers_of
 from me2e_compress.passes.convert_float16.element_types import ElementTypes
 from me2e_compress.quantization.coordinates import position_arithmetic
+from me2e_compress.runtime.providers import CPU, Provider
 
 LARGEST = float(np.finfo(np.float16).max)
 """65504."""
@@ -59,7 +60,12 @@ _MOVES = frozenset(
 
 
 def wide_nodes(
-    model: ir.Model, types: ElementTypes, frames: Recording | None, *, keep_io: bool
+    model: ir.Model,
+    types: ElementTypes,
+    frames: Recording | None,
+    *,
+    keep_io: bool,
+    provider: Provider = CPU,
 ) -> dict[ir.Node, str]:
     """Map the nodes of the main graph that must stay in float32 to the reason.
 
@@ -68,6 +74,7 @@ def wide_nodes(
         types: which inputs of a node can be float16 at all.
         frames: measured for values that float16 does not hold; None measures none.
         keep_io: whether inputs and outputs of the graph stay in float32.
+        provider: what runs the graph over the frames.
     """
     places = position_arithmetic(model, constant_values(model))
     found: dict[ir.Node, str] = {}
@@ -78,7 +85,7 @@ def wide_nodes(
         if reason is not None:
             found[node] = reason
     if frames is not None:
-        found |= _by_ranges(model, types, found, frames)
+        found |= _by_ranges(model, types, found, frames, provider)
     return found | _between(model, found, keep_io=keep_io)
 
 
@@ -147,6 +154,7 @@ def _by_ranges(
     types: ElementTypes,
     known: Collection[ir.Node],
     frames: Recording,
+    provider: Provider,
 ) -> dict[ir.Node, str]:
     """Find the nodes that read or make numbers that float16 does not hold."""
     touched: dict[str, list[ir.Node]] = {}
@@ -161,7 +169,8 @@ def _by_ranges(
                 touched.setdefault(str(value.name), []).append(node)
     if not touched:
         return {}
-    ranges = Calibrator().run(model, tuple(touched), frames).tensors
+    calibrator = Calibrator(provider=provider)
+    ranges = calibrator.run(model, tuple(touched), frames).tensors
     large = {
         name: max(-low, high)
         for name, (low, high) in ranges.items()

@@ -9,6 +9,7 @@ import onnx_ir as ir
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.base import LintFinding, LintRule, Target
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.kernels import objection
@@ -69,9 +70,11 @@ class OnnxRuntime(Target):
         """Return the rules of its kernels."""
         return RULES
 
-    def read_back(self, model: ir.Model) -> tuple[LintFinding, ...]:
+    def read_back(
+        self, model: ir.Model, provider: Provider = CPU
+    ) -> tuple[LintFinding, ...]:
         """Open a graph, and list the layers that are int8 in it and run in float."""
-        return tuple(read_back(model))
+        return tuple(read_back(model, provider))
 
 
 def _layers_of(plan: QuantPlan) -> tuple[Decision, ...]:

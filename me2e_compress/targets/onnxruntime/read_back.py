@@ -8,6 +8,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.onnxruntime.convert import int8_layers
 
@@ -20,7 +21,7 @@ _FLOAT_KERNELS = frozenset(
 """Layers as onnxruntime's optimizer leaves them where they compute in float."""
 
 
-def read_back(model: ir.Model) -> Iterator[LintFinding]:
+def read_back(model: ir.Model, provider: Provider = CPU) -> Iterator[LintFinding]:
     """Find layers that are int8 in a graph, and in float in the session that runs it.
 
     onnxruntime looks for int8 after its first fusions, and for whole patterns: a bias,
@@ -28,10 +29,11 @@ def read_back(model: ir.Model) -> Iterator[LintFinding]:
 
     Args:
         model: the graph; it stays as it is.
+        provider: what runs it.
     """
     source = with_unique_names(model)
     try:
-        found = optimized(source)
+        found = optimized(source, provider)
     except GraphError as refusal:
         yield error("refused", None, str(refusal))
         return
