@@ -1,12 +1,13 @@
 """Driving comfort: the share of seconds with every variable in its range."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.metrics.episode import FRAME_US, Episode
+from me2e_compress.metrics.episode import FRAME_US, EgoFrame, Episode
 from me2e_compress.metrics.measure import Measure
 
 SEGMENT_FRAMES = 20
@@ -40,7 +41,8 @@ BOUNDS = Bounds()
 def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
     """Return the share of segments of 20 frames in which every frame is smooth.
 
-    Equation 7 with all six variables in SI units and the frames' own 0.05 s:
+    Equation 7 with all six variables in SI units and the frames' own interval, which
+    is 0.05 s unless a real run recorded fewer:
 
     * accelerations and yaw rate are smoothed (Savitzky-Golay, 7 frames, order 2) over
       the whole route before it is cut;
@@ -55,10 +57,50 @@ def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
     if len(episode.frames) < SEGMENT_FRAMES:
         frames = len(episode.frames)
         return Measure(None, "ratio", f"{frames} frames, {SEGMENT_FRAMES} are needed")
-    smooth = smooth_frames(episode, bounds)
+    return Measure(float(_segments(smooth_frames(episode, bounds)).mean()), "ratio")
+
+
+def comfort_in_motion(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
+    """Return the same share over the segments in which the ego moved.
+
+    Who stands is comfortable: a driver that is stuck for most of a route scores well
+    by `comfort`. Here a segment counts if the ego was faster than 0.1 m/s in any of
+    its frames.
+    """
+    if len(episode.frames) < SEGMENT_FRAMES:
+        return comfort(episode, bounds)
+    moved = ~_segments(~_moving(episode.frames))
+    if not moved.any():
+        return Measure(None, "ratio", "the ego never moved")
+    return Measure(
+        float(_segments(smooth_frames(episode, bounds))[moved].mean()), "ratio"
+    )
+
+
+def standing_share(episode: Episode) -> float | None:
+    """Return the share of frames in which the ego stood; None without frames."""
+    if not episode.frames:
+        return None
+    return float(1.0 - _moving(episode.frames).mean())
+
+
+def frame_interval_us(frames: Sequence[EgoFrame]) -> int:
+    """Return the microseconds from one frame to the next, which mostly are the same."""
+    if len(frames) < 2:
+        return FRAME_US
+    times_us = np.array([frame.time_us for frame in frames])
+    return int(np.median(np.diff(times_us))) or FRAME_US
+
+
+def _segments(smooth: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Return for each whole segment whether all of its frames are."""
     segments = len(smooth) // SEGMENT_FRAMES
     cut = smooth[: segments * SEGMENT_FRAMES].reshape(segments, SEGMENT_FRAMES)
-    return Measure(float(cut.all(axis=1).mean()), "ratio")
+    return np.asarray(cut.all(axis=1))
+
+
+def _moving(frames: Sequence[EgoFrame]) -> npt.NDArray[np.bool_]:
+    return np.array([frame.speed_mps > BLOCKED_SPEED_MPS for frame in frames])
 
 
 def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.bool_]:
@@ -70,23 +112,25 @@ def smooth_frames(episode: Episode, bounds: Bounds = BOUNDS) -> npt.NDArray[np.b
     yaw_rate = np.array([frame.yaw_rate_radps for frame in frames])
     east = along * np.cos(heading) - left * np.sin(heading)
     north = along * np.sin(heading) + left * np.cos(heading)
+    delta_s = frame_interval_us(frames) / 1e6
     acceleration = _filtered(along)
+    jerk_east, jerk_north = (_filtered(each, delta_s, 1) for each in (east, north))
     return (
         (acceleration >= bounds.lowest_acceleration_mps2)
         & (acceleration <= bounds.highest_acceleration_mps2)
         & (np.abs(_filtered(left)) <= bounds.lateral_acceleration_mps2)
         & (np.abs(_filtered(yaw_rate)) <= bounds.yaw_rate_radps)
-        & (np.abs(_filtered(yaw_rate, 1)) <= bounds.yaw_acceleration_radps2)
-        & (np.abs(_filtered(along, 1)) <= bounds.longitudinal_jerk_mps3)
-        & (np.hypot(_filtered(east, 1), _filtered(north, 1)) <= bounds.jerk_mps3)
+        & (np.abs(_filtered(yaw_rate, delta_s, 1)) <= bounds.yaw_acceleration_radps2)
+        & (np.abs(_filtered(along, delta_s, 1)) <= bounds.longitudinal_jerk_mps3)
+        & (np.hypot(jerk_east, jerk_north) <= bounds.jerk_mps3)
     ) | _blocked_frames(episode)
 
 
-def _filtered(values: Floats, derivative: int = 0) -> Floats:
+def _filtered(values: Floats, delta_s: float = 1.0, derivative: int = 0) -> Floats:
     from scipy.signal import savgol_filter  # takes half a second to import
 
     smoothed: Any = savgol_filter(
-        values, WINDOW, ORDER, deriv=derivative, delta=FRAME_US / 1e6
+        values, WINDOW, ORDER, deriv=derivative, delta=delta_s
     )
     return np.asarray(smoothed, np.float64)
 

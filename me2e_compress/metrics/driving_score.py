@@ -24,8 +24,12 @@ def route_score(episode: Episode) -> RouteScore:
     The formula is the leaderboard's (statistics_manager.py of Bench2Drive 0.0.3):
     every infraction multiplies the completed percentage by its factor.
     """
-    route = episode.completion_percent
     penalty = math.prod(infraction.factor for infraction in episode.infractions)
+    return composed_of(episode.completion_percent, penalty)
+
+
+def composed_of(route: float, penalty: float) -> RouteScore:
+    """Multiply a completion in percent by the factor of all infractions."""
     return RouteScore(
         round(route, DIGITS),
         round(penalty, DIGITS),

@@ -38,6 +38,7 @@ class Ending(StrEnum):
     BLOCKED = "blocked"
     TIMEOUT = "timed out"
     POLICY_FAILED = "policy failed"
+    SIMULATOR_FAILED = "simulator failed"
 
 
 @with_config(_STRICT)
@@ -54,7 +55,8 @@ class EgoFrame:
         acceleration_mps2: Along the ego's heading.
         lateral_acceleration_mps2: To the ego's left.
         yaw_rate_radps: Radians per second, counter-clockwise.
-        steering_rad: Angle of the front wheels, left positive.
+        steering_rad: Angle of the front wheels, left positive; None where a simulator
+            does not tell.
         route_m: Metres of the route passed; never decreases.
         traffic_speed_mps: Mean speed of the vehicles near by, None if there are none.
         acceleration_norm_mps2: Length of the acceleration vector in the plane where a
@@ -69,7 +71,7 @@ class EgoFrame:
     acceleration_mps2: Number
     lateral_acceleration_mps2: Number
     yaw_rate_radps: Number
-    steering_rad: Number
+    steering_rad: Number | None
     route_m: Number
     traffic_speed_mps: Number | None
     acceleration_norm_mps2: Number | None = None

@@ -64,20 +64,21 @@ class Infraction:
 
     Attributes:
         kind: Which rule was broken.
-        time_us: When, in simulated microseconds since the route began.
-        x: Where the ego was, metres east.
+        time_us: When, in simulated microseconds since the route began; None where a
+            simulator does not tell.
+        x: Where the ego was, metres east; None where a simulator does not tell.
         y: Metres north.
         detail: With whom or against what, in a few words.
-        percent: Share of the driven way spent outside the lanes, 0 to 100; only
-            OUTSIDE_ROUTE_LANES has one.
+        percent: Of OUTSIDE_ROUTE_LANES the share of the driven way spent outside; of
+            MIN_SPEED the ego's speed over the traffic's, where the simulator told it.
     """
 
     kind: InfractionKind
-    time_us: int
-    x: float
-    y: float
+    time_us: int | None
+    x: float | None
+    y: float | None
     detail: str
-    percent: Annotated[float, Field(ge=0.0, le=100.0)] | None = None
+    percent: Annotated[float, Field(ge=0.0)] | None = None
 
     @property
     def factor(self) -> float:

@@ -32,6 +32,7 @@ class Scores:
         success_rate: Percent of routes completed without an infraction.
         efficiency: Percent (equation 6).
         comfort: Share of smooth segments (equation 7), SI units.
+        comfort_in_motion: The same, of the segments in which the ego moved.
         abilities: Mean of the five success rates, percent.
         each_ability: Success rate of each of the five, percent.
         bench2drive_efficiency: The same name, Bench2Drive's own arithmetic.
@@ -44,6 +45,7 @@ class Scores:
     success_rate: Estimate
     efficiency: Estimate
     comfort: Estimate
+    comfort_in_motion: Estimate
     abilities: Estimate
     each_ability: dict[str, Estimate]
     bench2drive_efficiency: Estimate
@@ -64,6 +66,7 @@ class Scores:
             "success_rate": self.success_rate.to_json(),
             "efficiency": self.efficiency.to_json(),
             "comfort": self.comfort.to_json(),
+            "comfort_in_motion": self.comfort_in_motion.to_json(),
             "abilities": {**self.abilities.to_json(), "each": abilities},
             "bench2drive": {
                 "efficiency": self.bench2drive_efficiency.to_json(),
@@ -93,6 +96,7 @@ def score(
         success_rate=_rate([episode.succeeded for episode in episodes]),
         efficiency=_over(episodes, efficiency.efficiency, "%", seed),
         comfort=_over(episodes, comfort.comfort, "ratio", seed),
+        comfort_in_motion=_over(episodes, comfort.comfort_in_motion, "ratio", seed),
         abilities=_abilities(episodes, seed),
         each_ability={
             name: _rate(mastered) for name, mastered in successes(episodes).items()

@@ -21,7 +21,8 @@ class RouteOutcome:
         driving_score: Percent.
         succeeded: The whole route without an infraction.
         ending: Why it was over, in words.
-        infractions: Kind and time in microseconds, in order of time.
+        infractions: Kind and time in microseconds, in order of time; the time is None
+            where the evaluator does not tell.
         duration_us: Until the last frame.
         apart_m: Greatest distance to the baseline's ego at the same time; None for the
             baseline itself and for a route without frames.
@@ -33,7 +34,7 @@ class RouteOutcome:
     driving_score: float
     succeeded: bool
     ending: str
-    infractions: tuple[tuple[str, int], ...]
+    infractions: tuple[tuple[str, int | None], ...]
     duration_us: int
     apart_m: float | None = None
     apart_us: int | None = None

@@ -76,8 +76,9 @@ class _Pair:
         if worse.driving_score > better.driving_score:
             worse, better = better, worse
         kinds = [kind for kind, _ in better.infractions]
-        alone = [us for kind, us in worse.infractions if kind not in kinds]
-        times = alone or [us for _, us in worse.infractions]
+        timed = [(kind, us) for kind, us in worse.infractions if us is not None]
+        alone = [us for kind, us in timed if kind not in kinds]
+        times = alone or [us for _, us in timed]
         return times[0] if times else min(worse.duration_us, better.duration_us)
 
 

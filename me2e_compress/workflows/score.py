@@ -107,6 +107,7 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "success rate", scores.success_rate
     yield "efficiency", scores.efficiency
     yield "comfort", scores.comfort
+    yield "comfort in motion", scores.comfort_in_motion
     yield "abilities, mean", scores.abilities
     yield from ((f"  {name}", rate) for name, rate in scores.each_ability.items())
     yield "Bench2Drive's efficiency", scores.bench2drive_efficiency

@@ -1,9 +1,16 @@
+import dataclasses
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from me2e_compress.metrics import bench2drive
-from me2e_compress.metrics.comfort import comfort, smooth_frames
+from me2e_compress.metrics.comfort import (
+    comfort,
+    comfort_in_motion,
+    smooth_frames,
+    standing_share,
+)
 from me2e_compress.metrics.episode import EgoFrame, Episode
 from tests.metrics.drives import drive, frames
 
@@ -127,6 +134,40 @@ def test_standing_blocked_is_not_uncomfortable(seconds: int, value: float) -> No
     shaken = held(20 * seconds, speed_mps=0.05, lateral_acceleration_mps2=6.0)
 
     assert comfort(shaken).value == value
+
+
+def test_the_interval_is_that_of_the_frames() -> None:
+    def ramp(slope: float) -> Episode:
+        slow = frames(20, lambda k: {"acceleration_mps2": slope * 0.1 * (k - 9.5)})
+        return drive(
+            driven=tuple(dataclasses.replace(f, time_us=2 * f.time_us) for f in slow)
+        )
+
+    # 4.13 m/s3 is the bound; at 10 Hz the level stays in range up to 2.4 / 0.95.
+    assert comfort(ramp(2.4)).value == 1.0
+    assert comfort(ramp(4.2)).value == 0.0
+
+
+def test_segments_without_motion_are_left_out_of_comfort_in_motion() -> None:
+    # two seconds in motion, of which one is shaken, then six at rest
+    mostly_still = drive(
+        driven=frames(
+            160,
+            lambda k: {
+                "speed_mps": 5.0 if k < 40 else 0.0,
+                "lateral_acceleration_mps2": 6.0 if k < 14 else 0.0,
+            },
+        )
+    )
+
+    assert comfort(mostly_still).value == 7 / 8
+    assert comfort_in_motion(mostly_still).value == 1 / 2
+    assert standing_share(mostly_still) == 0.75
+
+
+def test_who_never_moves_has_no_comfort_in_motion() -> None:
+    assert comfort_in_motion(held(40)).reason == "the ego never moved"
+    assert standing_share(drive()) is None
 
 
 def test_bench2drive_takes_degrees_for_radians() -> None:

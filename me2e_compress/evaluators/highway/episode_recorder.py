@@ -156,7 +156,7 @@ def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
         found.append(
             Infraction(ENDINGS[ending], world.time_us, ego.x, ego.y, ending.value)
         )
-    return tuple(sorted(found, key=lambda infraction: infraction.time_us))
+    return tuple(sorted(found, key=lambda infraction: infraction.time_us or 0))
 
 
 def _kind(event: Event) -> InfractionKind | None:
