@@ -29,7 +29,7 @@ what a decision costs, `me2e_compress.driving.latency`; how a policy gets a name
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,7 @@ __all__ = [
     "PLAN_SHAPE",
     "PLAN_STEP_US",
     "Evaluator",
+    "HostedPolicy",
     "Observation",
     "Plan",
     "Policy",
@@ -182,6 +183,25 @@ class Policy(Protocol):
             Six waypoints [6, 2], metres in the ego frame, every 0.5 s; floating point,
             finite.
         """
+        ...
+
+
+@runtime_checkable
+class HostedPolicy(Policy, Protocol):
+    """A policy with a stage beside its network, on the host, that tells its work.
+
+    Both are of the latest plan: a latency may be charged for them
+    (`me2e_compress.driving.layered_latency.HostStageLatency`).
+    """
+
+    @property
+    def host_iterations(self) -> int:
+        """Return the iterations of its solver; 0 where it had nothing to do."""
+        ...
+
+    @property
+    def host_cells(self) -> int:
+        """Return the occupied cells that it took into account."""
         ...
 
 

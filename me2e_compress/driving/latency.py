@@ -1,27 +1,29 @@
-"""How long a decision takes on the vehicle, and who says so.
+"""How long a decision takes on the vehicle, and who says so."""
 
-To add a latency source: write its class, then add it to this table.
-"""
-
-import abc
 import functools
 import hashlib
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from me2e_compress.driving.latency_source import (
+    LATENCY_SOURCES,
+    Charge,
+    DecisionFacts,
+    LatencySource,
+    check_positive,
+)
 from me2e_compress.errors import EvaluationError
-from me2e_compress.registry import Registry
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
 __all__ = [
     "LATENCY_SOURCES",
     "Charge",
+    "DecisionFacts",
     "FixedLatency",
     "FrameRate",
     "LatencySource",
@@ -30,46 +32,6 @@ __all__ = [
     "TraceLatency",
     "parse_latency",
 ]
-
-Charge = Callable[[int], int]
-"""From the microseconds a decision took here to those it takes on the vehicle."""
-
-
-@dataclass(frozen=True)
-class LatencySource(abc.ABC):
-    """Says what each decision of a route costs; its fields are its options.
-
-    Class attributes:
-        name: What the command line and studies call it.
-        measures: True if it depends on this machine, now: such routes must run alone.
-    """
-
-    name: ClassVar[str]
-    measures: ClassVar[bool] = False
-
-    @abc.abstractmethod
-    def on_route(self, route: str) -> Charge:
-        """Return the clock of one route; it depends on nothing but its identity."""
-
-    @abc.abstractmethod
-    def to_json(self) -> dict[str, Any]:
-        """Return what decides the latencies, for the fingerprint of the results."""
-
-
-_HERE = "me2e_compress.driving.latency"
-
-LATENCY_SOURCES: Registry[LatencySource] = Registry(
-    "latency source",
-    "me2e_compress.latency_sources",
-    EvaluationError,
-    {
-        "none": f"{_HERE}:NoLatency",
-        "fps": f"{_HERE}:FrameRate",
-        "fixed": f"{_HERE}:FixedLatency",
-        "trace": f"{_HERE}:TraceLatency",
-        "measured": f"{_HERE}:MeasuredLatency",
-    },
-)
 
 
 @dataclass(frozen=True)
@@ -133,7 +95,7 @@ class FrameRate(LatencySource):
 
     def __post_init__(self) -> None:
         """Check the rate."""
-        _check_positive("fps", self.fps)
+        check_positive("fps", self.fps)
 
     def on_route(self, route: str) -> Charge:
         """Charge the period on every route."""
@@ -151,7 +113,7 @@ class TraceLatency(LatencySource):
 
     Attributes:
         trace: File that `profile` wrote; or the samples themselves, microseconds in
-            the order of the recording.
+            the order of the recording. Without it, in a study, each model's own.
         in_order: Replay them in order from the first on every route, which keeps the
             bursts, and start over at the end; else draw them with replacement.
         scale: Speed ratio between the recording device and the one imagined.
@@ -163,17 +125,17 @@ class TraceLatency(LatencySource):
     """
 
     name: ClassVar[str] = "trace"
-    trace: Path | tuple[int, ...]
+    trace: Path | tuple[int, ...] | None = None
     in_order: bool = False
     scale: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Refuse what nothing can be drawn from, before anything drives."""
-        _check_positive("trace: scale", self.scale)
+        check_positive("trace: scale", self.scale)
         if self.seed < 0:
             raise EvaluationError(f"latency: seed {self.seed}: must be 0 or more")
-        if not self.samples_us:
+        if not self.lacks_trace and not self.samples_us:
             raise EvaluationError("latency trace: there are no samples")
 
     @functools.cached_property
@@ -181,7 +143,20 @@ class TraceLatency(LatencySource):
         """Microseconds, read once: other processes are sent them with the source."""
         if isinstance(self.trace, Path):
             return LatencyTrace.load(self.trace).samples_us
+        if self.trace is None:
+            raise EvaluationError("latency trace: it names no file (trace:FILE)")
         return self.trace
+
+    @property
+    def lacks_trace(self) -> bool:
+        """Whether it stands for each model's own latencies."""
+        return self.trace is None
+
+    def with_trace(self, samples_us: tuple[int, ...], scale: float) -> LatencySource:
+        """Return it with a model's own latencies, if it stands for them."""
+        if not self.lacks_trace:
+            return self
+        return replace(self, trace=samples_us, scale=scale * self.scale)
 
     def on_route(self, route: str) -> Charge:
         """Charge what the trace says next."""
@@ -220,11 +195,11 @@ class MeasuredLatency(LatencySource):
 
     def __post_init__(self) -> None:
         """Check the scale."""
-        _check_positive("measured: scale", self.scale)
+        check_positive("measured: scale", self.scale)
 
     def on_route(self, route: str) -> Charge:
         """Charge what was measured."""
-        return lambda measured_us: round(measured_us * self.scale)
+        return lambda facts: round(facts.measured_us * self.scale)
 
     def to_json(self) -> dict[str, Any]:
         """Return the scale."""
@@ -238,25 +213,34 @@ def parse_latency(
 
     Args:
         text: Name and options, see `LATENCY_SOURCES`.
-        in_order: One of these three at its default leaves what the text says.
+        in_order: One of these three at its default leaves what the text says; of a
+            source that is made of another they are the other's.
         scale: Positive, whatever the source.
         seed: 0 or more; a source that draws nothing has no use for it.
 
     Raises:
         EvaluationError: No such source, or an option that it refuses or has not.
     """
-    _check_positive("scale", scale)
-    source = LATENCY_SOURCES.parse(text)
+    check_positive("scale", scale)
     given = {"in_order": in_order, "scale": scale, "seed": seed}
     default = {"in_order": False, "scale": 1.0, "seed": 0}
     options: dict[str, object] = {
         option: value for option, value in given.items() if value != default[option]
     }
-    if "seed" not in type(source).__dataclass_fields__:
-        options.pop("seed", None)
-    return LATENCY_SOURCES.with_options(source, options) if options else source
+    return _with_options(LATENCY_SOURCES.parse(text), options)
 
 
-def _check_positive(what: str, value: float) -> None:
-    if not 0.0 < value < float("inf"):
-        raise EvaluationError(f"latency {what} {value:g} is not a positive number")
+def _with_options(source: LatencySource, options: dict[str, object]) -> LatencySource:
+    """Give options to the source, or to the one that it is made of."""
+    fields = type(source).__dataclass_fields__
+    inner = getattr(source, "source", None)
+    if isinstance(inner, LatencySource):
+        return LATENCY_SOURCES.with_options(
+            source, {"source": _with_options(inner, options)}
+        )
+    kept = {
+        option: value
+        for option, value in options.items()
+        if option != "seed" or option in fields
+    }
+    return LATENCY_SOURCES.with_options(source, kept) if kept else source

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from me2e_compress.driving.latency import (
+    DecisionFacts,
     FrameRate,
     LatencySource,
     MeasuredLatency,
@@ -16,6 +17,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
 SAMPLES = (10_000, 20_000, 70_000)
+NOTHING = DecisionFacts(0)
 
 
 @pytest.fixture
@@ -27,7 +29,7 @@ def trace(tmp_path: Path) -> Path:
 
 def charges(source: LatencySource, route: str, count: int = 60) -> list[int]:
     charge = source.on_route(route)
-    return [charge(123) for _ in range(count)]
+    return [charge(DecisionFacts(123)) for _ in range(count)]
 
 
 def test_a_frame_rate_charges_its_period() -> None:
@@ -69,7 +71,7 @@ def test_a_route_does_not_depend_on_what_drove_before() -> None:
     alone = charges(source, "a")
     one, other = source.on_route("b"), source.on_route("a")
 
-    mixed = [(one(0), other(0))[1] for _ in range(60)]
+    mixed = [(one(NOTHING), other(NOTHING))[1] for _ in range(60)]
 
     assert mixed == alone
 

@@ -4,7 +4,7 @@ import itertools
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from me2e_compress.driving.latency import Charge, LatencySource
+from me2e_compress.driving.latency import Charge, DecisionFacts, LatencySource
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Spikes(LatencySource):
         """Count the decisions of one route from its first."""
         count = itertools.count(1)
 
-        def charge(measured_us: int) -> int:
+        def charge(facts: DecisionFacts) -> int:
             spike = next(count) % self.every == 0
             return round(1e3 * (self.spike_ms if spike else self.usual_ms))
 

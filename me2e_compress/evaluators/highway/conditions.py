@@ -25,7 +25,8 @@ class Conditions:
         latency_model: What a latency does: drop decisions, or delay every control.
 
     Raises:
-        EvaluationError: 50 ms are not a multiple of the step.
+        EvaluationError: 50 ms are not a multiple of the step, or a latency that names
+            no trace.
     """
 
     latency: LatencySource = field(default_factory=FixedLatency)
@@ -35,7 +36,12 @@ class Conditions:
     latency_model: LatencyModel = LatencyModel.DROP
 
     def __post_init__(self) -> None:
-        """Check the step."""
+        """Check step and latency."""
+        if self.latency.lacks_trace:
+            raise EvaluationError(
+                f"latency {self.latency}: its trace names no file (trace:FILE), and "
+                "only a study knows each model's own latencies"
+            )
         if self.dt_us <= 0 or FRAME_US % self.dt_us:
             raise EvaluationError(
                 f"a step of {self.dt_us / 1e3:g} ms: it must divide "

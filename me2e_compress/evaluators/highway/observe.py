@@ -9,7 +9,7 @@ import numpy.typing as npt
 from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation, Policy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CameraRig, Cameras
-from me2e_compress.simulator.scene import Ego, Scene
+from me2e_compress.simulator.scene import ActorKind, Ego, Scene
 from me2e_compress.simulator.world import World
 
 
@@ -48,6 +48,27 @@ class ObservationBuilder:
             scene if self.policy.privileged else None,
             self.world if self.policy.privileged else None,
         )
+
+
+ROAD_USERS = (
+    ActorKind.CAR,
+    ActorKind.VAN,
+    ActorKind.TRUCK,
+    ActorKind.EMERGENCY,
+    ActorKind.BICYCLE,
+    ActorKind.PEDESTRIAN,
+    ActorKind.PARKED,
+)
+"""What a tracker would follow: all but doors, cones and barriers."""
+
+
+def road_users(scene: Scene) -> npt.NDArray[np.float64]:
+    """Return [N, 2], where road users are: metres in the ego frame."""
+    ego = scene.ego
+    found = [each for each in scene.actors if each.kind in ROAD_USERS]
+    away = np.array([(each.x - ego.x, each.y - ego.y) for each in found], np.float64)
+    cos, sin = math.cos(ego.heading), math.sin(ego.heading)
+    return np.asarray(away.reshape(-1, 2) @ np.array([[cos, -sin], [sin, cos]]))
 
 
 def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:

@@ -8,13 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.contract import PLAN_SHAPE, Observation, Policy
+from me2e_compress.driving.contract import (
+    PLAN_SHAPE,
+    HostedPolicy,
+    Observation,
+    Policy,
+)
+from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import control_clock
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
-from me2e_compress.evaluators.highway.observe import ObservationBuilder
+from me2e_compress.evaluators.highway.observe import ObservationBuilder, road_users
 from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
 from me2e_compress.simulator.cameras import (
     CameraRig,
@@ -129,7 +135,8 @@ class _Drive:
         self.listeners.on_answer()
         plan = _checked(answer)
         self.plan = scene.ego, plan
-        latency_us = self.charge(took_us)
+        facts = DecisionFacts(took_us, road_users(scene), *_host_work(self.policy))
+        latency_us = self.charge(facts)
         self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
         control = self.controller.control(anchored, scene.ego, scene.time_us)
@@ -164,6 +171,13 @@ def _ask(policy: Policy, observation: Observation) -> object:
         return policy.plan(observation)
     except Exception as error:
         raise _failure(error) from error
+
+
+def _host_work(policy: Policy) -> tuple[int, int]:
+    """Return iterations and cells of the policy's host stage; zeros without one."""
+    if not isinstance(policy, HostedPolicy):
+        return 0, 0
+    return policy.host_iterations, policy.host_cells
 
 
 def _failure(error: Exception) -> PolicyFailedError:

@@ -1,24 +1,25 @@
 import dataclasses
+import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from me2e_compress.driving.contract import Observation, RouteInfo
-from me2e_compress.driving.latency import FixedLatency
+from me2e_compress.driving.latency import FixedLatency, parse_latency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.episode_recorder import junction_m
 from me2e_compress.evaluators.highway.expert import Expert
-from me2e_compress.evaluators.highway.observe import can_bus_of
+from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.pictures import Moment
-from me2e_compress.simulator.scene import Ego
+from me2e_compress.simulator.scene import ActorKind, Ego
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.drivers import (
     CROSSING,
@@ -246,3 +247,25 @@ def test_a_held_plan_stays_where_it_was_made() -> None:
         in_world(first, first.plan[3])
     )
     assert later.plan[3, 0] < first.plan[3, 0] - 1.0
+
+
+def test_a_latency_may_depend_on_who_is_in_view() -> None:
+    source = parse_latency("agents{source=fps:20, per_agent_us=1, range_m=20}")
+    one, other = (drive(PARKED, Blind(), Conditions(source)) for _ in range(2))
+
+    taken = {decision.latency_us for decision in one.decisions}
+    assert 50_000 in taken
+    assert 50_001 in taken
+    assert one == other
+
+
+def test_road_users_stand_in_the_ego_frame() -> None:
+    scene = World(PARKED).scene()
+    north = replace(scene.ego, x=0.0, y=0.0, heading=math.pi / 2)
+    car = replace(scene.actors[0], kind=ActorKind.CAR, x=-3.0, y=20.0)
+    cone = replace(car, kind=ActorKind.CONE)
+
+    found = road_users(replace(scene, ego=north, actors=(car, cone)))
+
+    assert found == pytest.approx(np.array([(20.0, 3.0)]))
+    assert road_users(replace(scene, actors=())).shape == (0, 2)
