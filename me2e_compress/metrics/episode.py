@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
+from me2e_compress.metrics.conflict_record import ConflictRecord
 from me2e_compress.metrics.infraction import COLLISIONS, Infraction, InfractionKind
 
 __all__ = [
@@ -125,6 +126,7 @@ class Episode:
         speed_ratios_percent: Ego speed over traffic speed at the check points where a
             simulator reported them itself; None if they follow from the frames.
         given: What the simulator itself scored; None where it scores nothing.
+        conflicts: How close the ego came to others; None where nobody looked.
     """
 
     route: str
@@ -140,6 +142,7 @@ class Episode:
     junction_m: Number | None = None
     speed_ratios_percent: tuple[Number, ...] | None = None
     given: Given | None = None
+    conflicts: ConflictRecord | None = None
 
     @property
     def collided(self) -> bool:
@@ -148,8 +151,13 @@ class Episode:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the whole route was driven without infraction (low speed is none)."""
-        return self.completion_percent >= 100.0 and all(
+        """Whether the whole route was driven without infraction (low speed is none).
+
+        A route that ended otherwise than by its goal is none, whatever its completion:
+        Bench2Drive asks for status Completed or Perfect (merge_route_json.py).
+        """
+        whole = self.ending is Ending.COMPLETED and self.completion_percent >= 100.0
+        return whole and all(
             infraction.kind is InfractionKind.MIN_SPEED
             for infraction in self.infractions
         )

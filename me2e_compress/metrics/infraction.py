@@ -28,6 +28,16 @@ class InfractionKind(StrEnum):
     ROUTE_TIMEOUT = "route_timeout"
 
 
+class Contact(StrEnum):
+    """How the ego and another came together: nuPlan's five types of collision."""
+
+    STANDING_EGO = "the ego stood"
+    STANDING_PARTNER = "the other stood"
+    REAR = "struck from behind"
+    FRONT = "with the ego's front"
+    SIDE = "at the ego's side"
+
+
 COLLISIONS = (
     InfractionKind.COLLISION_PEDESTRIAN,
     InfractionKind.COLLISION_VEHICLE,
@@ -71,6 +81,10 @@ class Infraction:
         detail: With whom or against what, in a few words.
         percent: Of OUTSIDE_ROUTE_LANES the share of the driven way spent outside; of
             MIN_SPEED the ego's speed over the traffic's, where the simulator told it.
+        contact: How the two came together; only of a collision, None if unknown.
+        at_fault: Whether the ego could have prevented it, as nuPlan judges it; only of
+            a collision, None if unknown.
+        ego_speed_mps: The ego's speed then, None if unknown.
     """
 
     kind: InfractionKind
@@ -79,6 +93,9 @@ class Infraction:
     y: float | None
     detail: str
     percent: Annotated[float, Field(ge=0.0)] | None = None
+    contact: Contact | None = None
+    at_fault: bool | None = None
+    ego_speed_mps: Annotated[float, Field(ge=0.0, le=1e9)] | None = None
 
     @property
     def factor(self) -> float:

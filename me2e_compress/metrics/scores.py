@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.metrics import bench2drive, comfort, efficiency
+from me2e_compress.metrics import bench2drive, comfort, efficiency, surrogate_safety
 from me2e_compress.metrics.abilities import ABILITIES, successes
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
@@ -21,6 +21,35 @@ from me2e_compress.metrics.measure import Estimate, Measure
 
 FULL_SET = 220
 """Routes of a whole benchmark: 44 scenario types with 5 variants each."""
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyScores:
+    """How near the routes came to collisions; None where nobody recorded it.
+
+    Attributes:
+        ttc_exposure: Percent of the frames with a time to collision below 1.5 s.
+        smallest_ttc: Seconds, over routes on which a contact was ever within 10 s.
+        smallest_pet: Post-encroachment time, seconds, over routes with crossing paths.
+        smallest_distance: Metres between outlines.
+        at_fault_collisions: Percent of the routes.
+    """
+
+    ttc_exposure: Estimate
+    smallest_ttc: Estimate
+    smallest_pet: Estimate
+    smallest_distance: Estimate
+    at_fault_collisions: Estimate
+
+    def to_json(self) -> dict[str, Any]:
+        """Return one object a score."""
+        return {
+            "ttc_exposure": self.ttc_exposure.to_json(),
+            "smallest_ttc": self.smallest_ttc.to_json(),
+            "smallest_pet": self.smallest_pet.to_json(),
+            "smallest_distance": self.smallest_distance.to_json(),
+            "at_fault_collisions": self.at_fault_collisions.to_json(),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +66,7 @@ class Scores:
         each_ability: Success rate of each of the five, percent.
         bench2drive_efficiency: The same name, Bench2Drive's own arithmetic.
         bench2drive_smoothness: Its smoothness, which it also calls comfort.
+        safety: How near the routes came to collisions.
         routes: How many routes were driven.
         expected: How many the whole set has; fewer driven means a partial result.
     """
@@ -50,6 +80,7 @@ class Scores:
     each_ability: dict[str, Estimate]
     bench2drive_efficiency: Estimate
     bench2drive_smoothness: Estimate
+    safety: SafetyScores
     routes: int
     expected: int
 
@@ -72,6 +103,7 @@ class Scores:
                 "efficiency": self.bench2drive_efficiency.to_json(),
                 "smoothness": self.bench2drive_smoothness.to_json(),
             },
+            "safety": self.safety.to_json(),
             "routes": {
                 "driven": self.routes,
                 "expected": self.expected,
@@ -103,8 +135,26 @@ def score(
         },
         bench2drive_efficiency=_over(episodes, bench2drive.efficiency, "%", seed),
         bench2drive_smoothness=_over(episodes, bench2drive.smoothness, "ratio", seed),
+        safety=_safety(episodes, seed),
         routes=len(episodes),
         expected=expected,
+    )
+
+
+def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
+    faults = [surrogate_safety.at_fault_collision(episode) for episode in episodes]
+    known = [fault for fault in faults if fault is not None]
+    at_fault = _rate(known)
+    if len(known) < len(faults):
+        # routes without a collision alone would make a rate of nothing but zeros
+        reason = f"whose fault {len(faults) - len(known)} collisions were is not known"
+        at_fault = Estimate(Measure(None, "%", reason), None, None, 0)
+    return SafetyScores(
+        _over(episodes, surrogate_safety.ttc_exposure, "%", seed),
+        _over(episodes, surrogate_safety.smallest_ttc, "s", seed),
+        _over(episodes, surrogate_safety.smallest_pet, "s", seed),
+        _over(episodes, surrogate_safety.smallest_distance, "m", seed),
+        at_fault,
     )
 
 

@@ -110,6 +110,11 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "comfort in motion", scores.comfort_in_motion
     yield "abilities, mean", scores.abilities
     yield from ((f"  {name}", rate) for name, rate in scores.each_ability.items())
+    yield "frames with TTC below 1.5 s", scores.safety.ttc_exposure
+    yield "smallest TTC", scores.safety.smallest_ttc
+    yield "smallest PET", scores.safety.smallest_pet
+    yield "smallest distance", scores.safety.smallest_distance
+    yield "at-fault collisions", scores.safety.at_fault_collisions
     yield "Bench2Drive's efficiency", scores.bench2drive_efficiency
     yield "Bench2Drive's smoothness", scores.bench2drive_smoothness
 

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 
+from me2e_compress.metrics.conflict_record import ConflictRecord
 from me2e_compress.metrics.episode import (
     FRAME_US,
     EgoFrame,
@@ -55,6 +56,7 @@ def drive(
     junction_m: float | None = None,
     ratios: tuple[float, ...] | None = None,
     route: str = "r1",
+    conflicts: ConflictRecord | None = None,
 ) -> Episode:
     return Episode(
         route,
@@ -69,4 +71,5 @@ def drive(
         (InferenceRecord(0, 100_000),),
         junction_m,
         ratios,
+        conflicts=conflicts,
     )

@@ -3,6 +3,7 @@ import math
 import pytest
 
 from me2e_compress.metrics.driving_score import RouteScore, route_score
+from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.infraction import PENALTY, InfractionKind
 from tests.metrics.drives import drive, infraction
 
@@ -61,6 +62,11 @@ def test_any_infraction_but_a_low_speed_spoils_success(kind: InfractionKind) -> 
 
 def test_an_unfinished_route_is_no_success() -> None:
     assert not drive(completion=math.nextafter(100.0, 0.0)).succeeded
+
+
+@pytest.mark.parametrize("ending", [e for e in Ending if e is not Ending.COMPLETED])
+def test_a_whole_route_that_ended_otherwise_is_no_success(ending: Ending) -> None:
+    assert not drive(ending=ending).succeeded
 
 
 def test_a_collision_is_remembered() -> None:

@@ -1,4 +1,5 @@
 import json
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -6,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from me2e_compress.metrics.conflict_record import ConflictRecord, Encounter
 from me2e_compress.metrics.episode import (
     LARGEST,
     EgoFrame,
@@ -14,11 +16,12 @@ from me2e_compress.metrics.episode import (
     Given,
     InferenceRecord,
 )
-from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.metrics.infraction import Contact, Infraction, InfractionKind
 from tests.metrics.drives import cruise, drive, infraction
 
 numbers = st.floats(-LARGEST, LARGEST)
 percents = st.floats(0.0, 100.0)
+lengths = st.floats(0.0, LARGEST)
 times = st.integers(0, 10**10)
 frame_rows = st.builds(
     EgoFrame,
@@ -35,6 +38,14 @@ infractions = st.builds(
     numbers,
     st.text(max_size=8),
     st.none() | percents,
+    st.none() | st.sampled_from(Contact),
+    st.none() | st.booleans(),
+    st.none() | st.floats(0.0, LARGEST),
+)
+encounters = st.builds(
+    Encounter,
+    *(st.integers(0, 99), st.text(max_size=4), times, lengths),
+    *(st.floats(0.0, math.pi), st.booleans()),
 )
 episodes = st.builds(
     Episode,
@@ -51,6 +62,12 @@ episodes = st.builds(
     st.none() | numbers,
     st.none() | st.lists(numbers, max_size=3).map(tuple),
     st.none() | st.builds(Given, st.text(max_size=8), numbers, numbers, numbers),
+    st.none()
+    | st.builds(
+        ConflictRecord,
+        *[st.lists(st.none() | lengths, max_size=3).map(tuple)] * 2,
+        st.lists(encounters, max_size=2).map(tuple),
+    ),
 )
 
 
@@ -61,9 +78,9 @@ def test_json_brings_back_every_bit(episode: Episode) -> None:
     assert Episode.from_json(json.loads(text)) == episode
 
 
-def test_a_file_from_before_scores_were_given_is_read() -> None:
+def test_a_file_of_an_earlier_version_is_read() -> None:
     record = drive().to_json()
-    del record["given"]
+    del record["given"], record["conflicts"]
 
     assert Episode.from_json(record) == drive()
 

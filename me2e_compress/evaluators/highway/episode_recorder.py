@@ -1,9 +1,14 @@
 """Records what happens in a world as the episode that is scored."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 
+from me2e_compress.evaluators.highway.conflict_recorder import (
+    ConflictRecorder,
+    at_fault,
+    contact_of,
+)
 from me2e_compress.metrics.episode import (
     FRAME_US,
     EgoFrame,
@@ -11,7 +16,11 @@ from me2e_compress.metrics.episode import (
     Episode,
     InferenceRecord,
 )
-from me2e_compress.metrics.infraction import Infraction, InfractionKind
+from me2e_compress.metrics.infraction import (
+    COLLISIONS,
+    Infraction,
+    InfractionKind,
+)
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import (
     ActorKind,
@@ -54,11 +63,13 @@ class EpisodeRecorder:
     world: World
     frames: list[EgoFrame] = field(default_factory=list)
     decisions: list[InferenceRecord] = field(default_factory=list)
+    conflicts: ConflictRecorder = field(default_factory=ConflictRecorder)
 
     def record(self, scene: Scene) -> None:
         """Record a frame if one is due."""
         if scene.time_us >= len(self.frames) * FRAME_US:
             self.frames.append(_frame(scene, self.world.progress_m))
+            self.conflicts.record(scene)
 
     def episode(self, ending: Ending, failure: str | None = None) -> Episode:
         """Close the record of the world's route."""
@@ -77,6 +88,7 @@ class EpisodeRecorder:
             frames=tuple(self.frames),
             decisions=tuple(self.decisions),
             junction_m=junction_m(world.path),
+            conflicts=self.conflicts.result(),
         )
 
 
@@ -144,7 +156,7 @@ def _frame(scene: Scene, route_m: float) -> EgoFrame:
 def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
     """Translate the world's events, and the end of the route, into infractions."""
     found = [
-        _infraction(kind, event)
+        _infraction(kind, event, world)
         for event in world.events
         if (kind := _kind(event)) is not None
     ]
@@ -169,11 +181,29 @@ def _kind(event: Event) -> InfractionKind | None:
     return InfractionKind.COLLISION_VEHICLE
 
 
-def _infraction(kind: InfractionKind, event: Event) -> Infraction:
+def _infraction(kind: InfractionKind, event: Event, world: World) -> Infraction:
     partner = "" if event.actor_kind is None else f"{event.actor_kind.value} "
     number = "" if event.actor_id is None else f"{event.actor_id}"
     detail = f"{partner}{number}".strip() or event.detail
-    return Infraction(kind, event.time_us, event.x, event.y, detail)
+    found = Infraction(
+        *(kind, event.time_us, event.x, event.y, detail),
+        ego_speed_mps=event.ego_speed_mps,
+    )
+    return _judged(found, event, world) if kind in COLLISIONS else found
+
+
+def _judged(collision: Infraction, event: Event, world: World) -> Infraction:
+    """Say how the two came together, and whose fault it was.
+
+    The world ends at a collision, so what it holds now is what it held then.
+    """
+    scene = world.scene()
+    for actor in scene.actors:
+        if actor.id == event.actor_id:
+            contact = contact_of(scene.ego, actor)
+            fault = at_fault(contact, scene.ego, world.roadmap)
+            return replace(collision, contact=contact, at_fault=fault)
+    return collision
 
 
 def _outside(world: World) -> Infraction | None:

@@ -15,6 +15,8 @@ class EventKind(StrEnum):
     """The ego with another body."""
     ACTOR_COLLISION = "actor_collision"
     """Two others; never in a well-written scenario."""
+    STRUCK = "struck"
+    """Another body with the standing ego; counts against nobody."""
     OUTSIDE_LANES = "outside_lanes"
     RED_LIGHT = "red_light"
     STOP_SIGN = "stop_sign"
@@ -25,6 +27,7 @@ class EventKind(StrEnum):
 INFRACTIONS: frozenset[EventKind] = frozenset(EventKind) - {
     EventKind.TRIGGER,
     EventKind.ACTOR_COLLISION,
+    EventKind.STRUCK,
 }
 """What counts against the driver."""
 

@@ -24,6 +24,9 @@ DECISION_US = 100_000
 """Actors decide at 10 Hz whatever the frame rate; they move at the frame rate."""
 TOLERANCE_M = 0.5
 """The ego's centre may be this far outside every lane (OutsideRouteLanesTest)."""
+STANDING_MPS = 0.1
+"""Contact with an ego slower than this is no collision of the ego's, and the route
+goes on: CollisionTest in Bench2Drive's atomic_criteria.py."""
 
 
 class EndReason(StrEnum):
@@ -193,7 +196,9 @@ class World:
             if (a.id, b.id) in self._met:
                 continue
             self._met.add((a.id, b.id))
-            if a.id == 0:
+            if a.id == 0 and a.speed < STANDING_MPS:
+                event = self._stage.event(EventKind.STRUCK, "the standing ego", b)
+            elif a.id == 0:
                 event = self._stage.event(EventKind.COLLISION, "the ego", b)
                 self.reason = EndReason.COLLISION
             else:

@@ -11,6 +11,7 @@ from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.simulator.plane_geometry import resample
 from me2e_compress.simulator.scenarios.layouts.streets import two_way
 from me2e_compress.simulator.scene import ActorKind, Control
+from me2e_compress.simulator.traffic.cars import Behaviour
 from me2e_compress.simulator.traffic.stage import Script, Stage
 from me2e_compress.simulator.world import EndReason, EventKind, World
 from tests.simulator.world.driving import (
@@ -158,6 +159,26 @@ def test_two_actors_that_collide_are_told_from_the_ego() -> None:
     kinds = [event.kind for event in world.events]
     assert kinds == [EventKind.ACTOR_COLLISION]
     assert world.reason is None
+
+
+@pytest.mark.parametrize(
+    ("brake", "kinds"),
+    [(-8.0, [EventKind.STRUCK]), (0.0, [EventKind.COLLISION])],
+)
+def test_a_standing_ego_that_is_struck_has_not_collided(
+    brake: float, kinds: list[EventKind]
+) -> None:
+    def struck(stage: Stage) -> None:
+        street = two_way(stage)
+        (lane,) = street.ahead(0)
+        blind = Behaviour(sees_ego=False)
+        stage.car([lane], 20.0, 20.0, behaviour=blind).forced_mps2 = 0.0
+
+    world = World(route_of(), builder=struck)
+    coast(world, 120, Control(brake, 0.0))
+
+    assert [event.kind for event in world.events] == kinds
+    assert world.done is (EventKind.COLLISION in kinds)
 
 
 def test_leaving_the_road_is_measured() -> None:

@@ -1,0 +1,198 @@
+"""Measures how close a drive came to a collision: distance, TTC, PET, and whose fault.
+
+The numbers are made once, when the route is over, over all its frames: about 1 % of
+the time that driving it takes.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.evaluators.highway.rectangles import (
+    Floats,
+    contact_times,
+    corners,
+    gaps,
+    overlaps,
+)
+from me2e_compress.metrics.conflict_record import (
+    CROSSING_RAD,
+    PET_HORIZON_S,
+    TTC_HORIZON_S,
+    ConflictRecord,
+    Encounter,
+)
+from me2e_compress.metrics.episode import FRAME_US
+from me2e_compress.metrics.infraction import Contact
+from me2e_compress.simulator.plane_geometry import Lane, Roadmap
+from me2e_compress.simulator.scene import Actor, Ego, Scene
+
+LATEST = round(PET_HORIZON_S * 1e6 / FRAME_US)
+"""Frames between the first and the second at one place."""
+
+STOPPED_MPS = 0.05
+"""nuPlan's threshold of what stands, the ego and others alike."""
+
+BEHIND_RAD = math.radians(150.0)
+"""nuPlan: a partner whose centre is so far round from the ego's heading is behind."""
+
+AT_FAULT = (Contact.STANDING_PARTNER, Contact.FRONT)
+"""The ego's fault wherever it was; a contact at its side only where it left a lane."""
+
+CHUNK = 256
+"""Frames of the ego that are compared at once."""
+
+Box = tuple[float, float, float, float, float]
+
+
+@dataclass
+class ConflictRecorder:
+    """Keeps where everything was, frame by frame, until the route is over."""
+
+    _egos: list[tuple[float, ...]] = field(default_factory=list, init=False)
+    _actors: list[list[tuple[float, ...]]] = field(default_factory=list, init=False)
+    _kinds: dict[int, str] = field(default_factory=dict, init=False)
+
+    def record(self, scene: Scene) -> None:
+        """Keep one frame."""
+        self._egos.append((*_box(scene.ego), scene.ego.speed_mps))
+        rows = list[tuple[float, ...]]()
+        for actor in scene.actors:
+            self._kinds[actor.id] = actor.kind.value
+            rows.append((*_box(actor), actor.speed_mps, actor.id))
+        self._actors.append(rows)
+
+    def result(self) -> ConflictRecord:
+        """Return the distances, times and encounters of the frames kept so far."""
+        counts = [len(rows) for rows in self._actors]
+        frame = np.repeat(np.arange(len(counts)), counts)
+        actors = np.array([row for rows in self._actors for row in rows]).reshape(-1, 7)
+        egos = np.array(self._egos).reshape(-1, 6)
+        one, other = egos[frame], actors[:, :6]
+        distance = gaps(one[:, :5], other[:, :5])
+        velocity = _velocity(other) - _velocity(one)
+        seconds = contact_times(one[:, :5], other[:, :5], velocity)
+        nearest, soonest = np.full((2, len(counts)), np.inf)
+        np.minimum.at(nearest, frame, distance)
+        np.minimum.at(soonest, frame, seconds)
+        return ConflictRecord(
+            _known(nearest, math.inf),
+            _known(soonest, TTC_HORIZON_S),
+            tuple(self._encounters(egos, actors, frame)),
+        )
+
+    def _encounters(
+        self, egos: Floats, actors: Floats, frame: npt.NDArray[np.int64]
+    ) -> list[Encounter]:
+        found = list[Encounter]()
+        for number in np.unique(actors[:, 6]).astype(int).tolist():
+            own = actors[:, 6] == number
+            if actors[own, 5].any():
+                pairs = _same_place(egos, actors[own], frame[own])
+                kind = self._kinds[number]
+                found += [_encounter(number, kind, *pair) for pair in pairs]
+        return sorted(found, key=lambda each: (each.time_us, each.actor))
+
+
+def contact_of(ego: Ego, actor: Actor) -> Contact:
+    """Return how two that touch came together, as nuPlan's collision types.
+
+    The source is no_ego_at_fault_collisions.py of nuplan-devkit 1.2; our one point of
+    reference is the ego's centre, nuPlan's its rear axle.
+    """
+    if ego.speed_mps <= STOPPED_MPS:
+        return Contact.STANDING_EGO
+    if actor.speed_mps <= STOPPED_MPS:
+        return Contact.STANDING_PARTNER
+    bearing = math.atan2(actor.y - ego.y, actor.x - ego.x) - ego.heading
+    if abs(math.remainder(bearing, math.tau)) > BEHIND_RAD:
+        return Contact.REAR
+    front = ego.length / 2
+    x, y = ego.x + front * math.cos(ego.heading), ego.y + front * math.sin(ego.heading)
+    bumper = np.array((x, y, ego.heading, 0.0, ego.width))
+    return Contact.FRONT if overlaps(bumper, np.array(_box(actor))) else Contact.SIDE
+
+
+def at_fault(contact: Contact, ego: Ego, roadmap: Roadmap) -> bool:
+    """Return whether the ego could have prevented a contact, as nuPlan judges it.
+
+    It ran into something that stood, or hit with its front; or it was hit at the side
+    while it was not wholly in one lane (a lane and the one that it leads to are one).
+    """
+    if contact is Contact.SIDE:
+        return not _in_one_lane(ego, roadmap.lanes)
+    return contact in AT_FAULT
+
+
+def _in_one_lane(ego: Ego, lanes: tuple[Lane, ...]) -> bool:
+    four = corners(np.array(_box(ego)))
+    driven = [lane for lane in lanes if not lane.shoulder]
+    return any(
+        not Roadmap((lane, *_led_to(lane, driven))).outside_all(four).any()
+        for lane in driven
+    )
+
+
+def _led_to(lane: Lane, lanes: list[Lane]) -> list[Lane]:
+    return [each for each in lanes if np.allclose(each.centre[0], lane.centre[-1])]
+
+
+def _same_place(
+    egos: Floats, actor: Floats, frame: npt.NDArray[np.int64]
+) -> list[tuple[int, int, float]]:
+    """Return (frame of the ego, frame of the actor, angle) of the closest encounters.
+
+    At most two: one at 30 degrees or more, one below. Boxes that overlap at two times
+    hold a common place, so the fewest frames between two such times are the PET.
+    """
+    reach = (np.hypot(*egos[0, 3:5]) + np.hypot(*actor[:, 3:5].T).max()) / 2
+    best: dict[bool, tuple[int, int, int, float]] = {}
+    for start in range(0, len(egos), CHUNK):
+        near = (frame >= start - LATEST) & (frame < start + CHUNK + LATEST)
+        ego, other, when = egos[start : start + CHUNK], actor[near], frame[near]
+        apart = np.abs(start + np.arange(len(ego))[:, None] - when)
+        away = np.hypot(*(ego[:, None, :2] - other[:, :2]).transpose(2, 0, 1))
+        i, j = np.nonzero((apart <= LATEST) & (away <= reach))
+        hit = overlaps(ego[i, :5], other[j, :5])
+        i, j = i[hit], j[hit]
+        turn = np.abs(np.angle(np.exp(1j * (ego[i, 2] - other[j, 2]))))
+        for crossing in (True, False):
+            kind = np.flatnonzero((turn >= CROSSING_RAD) == crossing)
+            if len(kind):
+                k = kind[np.argmin(apart[i[kind], j[kind]])]
+                at = int(start + i[k]), int(when[j[k]])
+                pair = abs(at[0] - at[1]), *at, float(turn[k])
+                best[crossing] = min(best.get(crossing, pair), pair)
+    return [pair[1:] for pair in best.values()]
+
+
+def _encounter(
+    actor: int, kind: str, ego_frame: int, frame: int, angle_rad: float
+) -> Encounter:
+    return Encounter(
+        actor,
+        kind,
+        max(ego_frame, frame) * FRAME_US,
+        abs(ego_frame - frame) * FRAME_US / 1e6,
+        round(angle_rad, 3),
+        ego_frame < frame,
+    )
+
+
+def _box(one: Ego | Actor) -> Box:
+    return one.x, one.y, one.heading, one.length, one.width
+
+
+def _velocity(rows: Floats) -> Floats:
+    heading, speed = rows[:, 2], rows[:, 5]
+    return np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1)
+
+
+def _known(values: Floats, most: float) -> tuple[float | None, ...]:
+    """Return values to the millimetre or millisecond, None where there is none."""
+    return tuple(
+        round(value, 3) if math.isfinite(value) and value <= most else None
+        for value in values.tolist()
+    )

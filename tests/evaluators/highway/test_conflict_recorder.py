@@ -1,0 +1,155 @@
+"""Distance, time to collision, encounters and fault, on scenes made by hand."""
+
+import math
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from me2e_compress.evaluators.highway.conflict_recorder import (
+    ConflictRecorder,
+    at_fault,
+    contact_of,
+)
+from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
+from me2e_compress.metrics.conflict_record import ConflictRecord
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import Contact, Infraction
+from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
+from me2e_compress.simulator.routes import Route
+from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene
+from me2e_compress.simulator.traffic.events import Event, EventKind
+from me2e_compress.simulator.world import World
+from tests.evaluators.highway.tiny_world import actor, ego_at, straight
+
+LEFT = math.pi / 2
+FRAMES_A_SECOND = 20
+
+
+def lane(name: str, begin: float, end: float, y: float = 0.0) -> Lane:
+    points = np.array([[begin, y], [end, y]])
+    return Lane(name, points, 3.5, LaneMarking.DASHED, LaneMarking.DASHED, 10.0)
+
+
+ROAD = Roadmap((lane("a>b:0", -20.0, 6.0), lane("b>c:0", 6.0, 60.0)))
+
+
+def recorded(*frames: tuple[Ego, tuple[Actor, ...]]) -> ConflictRecord:
+    recorder = ConflictRecorder()
+    for k, (ego, actors) in enumerate(frames):
+        recorder.record(Scene(50_000 * k, ego, actors, ()))
+    return recorder.result()
+
+
+def crossing(late_s: float) -> ConflictRecord:
+    """Drive on at 8 m/s along x = 0; an actor of 4.6 m crosses at 5 m/s, from below."""
+    return recorded(
+        *(
+            (
+                ego_at(8.0 * t - 24.0),
+                (actor(0.0, 5.0 * (t - late_s) - 15.0, 5.0, LEFT),),
+            )
+            for t in np.arange(8 * FRAMES_A_SECOND) / FRAMES_A_SECOND
+        )
+    )
+
+
+def test_a_standing_car_ahead() -> None:
+    # outlines 20 m apart, closing at 8 m/s
+    found = recorded((ego_at(0.0), (actor(20.0 + 2.5 + 2.3),)))
+
+    assert found.nearest_m == (20.0,)
+    assert found.ttc_s == (2.5,)
+
+
+def test_who_drives_away_is_never_met_and_nobody_is_nowhere() -> None:
+    found = recorded((ego_at(0.0), (actor(30.0, speed=9.0),)), (ego_at(0.4), ()))
+
+    assert found.ttc_s == (None, None)
+    assert found.nearest_m[1] is None
+
+
+def test_a_contact_in_eleven_seconds_is_beyond_the_horizon() -> None:
+    found = recorded((ego_at(0.0, speed=1.0), (actor(11.0 + 4.8),)))
+
+    assert found.ttc_s == (None,)
+
+
+@pytest.mark.parametrize(("late_s", "ego_first"), [(2.5, True), (-2.5, False)])
+def test_paths_that_cross_one_after_the_other(late_s: float, ego_first: bool) -> None:
+    (found,) = crossing(late_s).encounters
+
+    # The ego (5 m, 8 m/s) covers the actor's 1.95 m path for (5 + 1.95) / 8 s, the
+    # actor (4.6 m, 5 m/s) the ego's 2 m path for (4.6 + 2) / 5 s; both are in its
+    # middle after 3 s, the actor late. One corner of the area is left last.
+    expected = 2.5 - (5.0 + 1.95) / 16.0 - (4.6 + 2.0) / 10.0
+    assert found.pet_s == pytest.approx(expected, abs=0.051)
+    assert found.ego_first is ego_first
+    assert found.angle_rad == pytest.approx(LEFT, abs=1e-3)
+
+
+def test_more_than_five_seconds_apart_is_no_encounter() -> None:
+    assert not crossing(6.5).encounters
+
+
+def test_a_standing_actor_encroaches_on_nothing() -> None:
+    frames = [(ego_at(8.0 * k), (actor(40.0),)) for k in range(6)]
+
+    assert not recorded(*frames).encounters
+
+
+@pytest.mark.parametrize(
+    ("ego", "other", "contact"),
+    [
+        (ego_at(speed=0.05), actor(9.0, speed=5.0), Contact.STANDING_EGO),
+        (ego_at(), actor(9.0, kind=ActorKind.BARRIER), Contact.STANDING_PARTNER),
+        (ego_at(), actor(0.5, speed=12.0), Contact.REAR),
+        (ego_at(), actor(9.0, speed=2.0), Contact.FRONT),
+        (ego_at(), actor(5.0, 1.9, 9.0), Contact.SIDE),
+    ],
+)
+def test_how_two_came_together(ego: Ego, other: Actor, contact: Contact) -> None:
+    assert contact_of(ego, other) is contact
+
+
+@pytest.mark.parametrize(
+    ("contact", "y", "fault"),
+    [
+        (Contact.STANDING_EGO, 0.0, False),
+        (Contact.STANDING_PARTNER, 0.0, True),
+        (Contact.REAR, 1.5, False),
+        (Contact.FRONT, 0.0, True),
+        (Contact.SIDE, 0.0, False),
+        (Contact.SIDE, 1.5, True),
+    ],
+)
+def test_whose_fault_it_was(contact: Contact, y: float, fault: bool) -> None:
+    # at x = 5 the ego stands over the border of two lanes that follow each other
+    assert at_fault(contact, ego_at(5.0, y), ROAD) is fault
+
+
+def collision(ego: Ego, other: Actor) -> Infraction:
+    event = Event(
+        *(50_000, EventKind.COLLISION, "the ego", ego.x, ego.y),
+        *(ego.speed_mps, other.id, other.kind),
+    )
+    world = SimpleNamespace(
+        route=Route("r", "HighwayExit", "Merging", 1),
+        path=straight(),
+        progress_m=10.0,
+        events=(event,),
+        roadmap=ROAD,
+        scene=lambda: Scene(50_000, ego, (other,), ()),
+    )
+    recorder = EpisodeRecorder(cast(World, world))
+    recorder.record(world.scene())
+    (found,) = recorder.episode(Ending.COLLISION).infractions
+    return found
+
+
+def test_a_collision_is_written_with_how_fast_and_whose_fault() -> None:
+    found = collision(ego_at(5.0), actor(9.0, speed=2.0))
+
+    assert (found.contact, found.at_fault) == (Contact.FRONT, True)
+    assert found.ego_speed_mps == 8.0
