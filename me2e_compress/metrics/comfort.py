@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.metrics.episode import FRAME_US, EgoFrame, Episode
+from me2e_compress.metrics.episode import FRAME_US, EgoFrame, Ending, Episode
 from me2e_compress.metrics.measure import Measure
 
 SEGMENT_FRAMES = 20
@@ -51,7 +51,8 @@ def comfort(episode: Episode, bounds: Bounds = BOUNDS) -> Measure:
       derivative of the acceleration vector in the plane of the road;
     * the bounds belong to the range;
     * an incomplete last segment is dropped;
-    * frames of a stop (at most 0.1 m/s for more than 60 s) are smooth whatever the
+    * frames of a stop that blocks the route (at most 0.1 m/s for 60 s, where the route
+      ends; the paper's "more than 60 s" would never come) are smooth whatever the
       filter makes of them.
     """
     if len(episode.frames) < SEGMENT_FRAMES:
@@ -136,11 +137,15 @@ def _filtered(values: Floats, delta_s: float = 1.0, derivative: int = 0) -> Floa
 
 
 def _blocked_frames(episode: Episode) -> npt.NDArray[np.bool_]:
-    """Mark the frames of every stop of more than 60 s."""
+    """Mark the frames of every stop of 60 s, and of the one that ended the route.
+
+    That one may be a frame short on file: the rule sees steps finer than frames.
+    """
     still = [frame.speed_mps <= BLOCKED_SPEED_MPS for frame in episode.frames]
     blocked = np.zeros(len(still), np.bool_)
     edges = np.flatnonzero(np.diff([False, *still, False]))
     for start, end in edges.reshape(-1, 2):
         lasted = episode.frames[end - 1].time_us - episode.frames[start].time_us
-        blocked[start:end] = lasted > BLOCKED_US
+        ended = end == len(still) and episode.ending is Ending.BLOCKED
+        blocked[start:end] = lasted >= BLOCKED_US or ended
     return blocked

@@ -11,7 +11,7 @@ from me2e_compress.metrics.comfort import (
     smooth_frames,
     standing_share,
 )
-from me2e_compress.metrics.episode import EgoFrame, Episode
+from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
 from tests.metrics.drives import drive, frames
 
 Floats = npt.NDArray[np.float64]
@@ -129,11 +129,13 @@ def test_an_incomplete_segment_is_dropped() -> None:
     assert comfort(rough).value == 1.0
 
 
-@pytest.mark.parametrize(("seconds", "value"), [(61, 1.0), (59, 0.0)])
-def test_standing_blocked_is_not_uncomfortable(seconds: int, value: float) -> None:
-    shaken = held(20 * seconds, speed_mps=0.05, lateral_acceleration_mps2=6.0)
+@pytest.mark.parametrize(("intervals", "value"), [(1200, 1.0), (1199, 0.0)])
+def test_standing_blocked_is_not_uncomfortable(intervals: int, value: float) -> None:
+    shaken = held(intervals + 1, speed_mps=0.05, lateral_acceleration_mps2=6.0)
+    ended = dataclasses.replace(shaken, ending=Ending.BLOCKED)
 
     assert comfort(shaken).value == value
+    assert comfort(ended).value == 1.0
 
 
 def test_the_interval_is_that_of_the_frames() -> None:

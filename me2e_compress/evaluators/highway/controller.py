@@ -107,8 +107,9 @@ class AnchoredPlan:
 class Controller:
     """Tracks an anchored plan; has no state of its own.
 
-    The runner calls it once a decision; its control is then held as long as equation 4
-    prescribes.
+    The runner calls it once a decision, at the frame of the observation; when its
+    control acts, and for how long, the latency model says (`driving.realtime`). It does
+    not steer again between two decisions.
 
     Args:
         lookahead_s: How far ahead the pursuit looks, in seconds of travel.
