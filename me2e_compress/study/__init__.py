@@ -1,6 +1,7 @@
 """Variants held against each other: size, latency, fidelity and the road."""
 
-from me2e_compress.study.definition import Condition, Study, Timing, Variant
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study

@@ -1,24 +1,18 @@
 """What a study is: variants, the conditions they drive under, the one they face."""
 
-import re
-from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import FramesError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route
-
-TRACE = "trace"
-"""A condition's latency: what was measured of each model, under the device scale."""
-
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
+from me2e_compress.study.condition import Condition, check_conditions
+from me2e_compress.study.names import check_name, check_unique
 
 
 @dataclass(frozen=True)
@@ -46,7 +40,7 @@ class Variant:
 
     def __post_init__(self) -> None:
         """Refuse what could not be run."""
-        _check_name("variant", self.name)
+        check_name("variant", self.name)
         options = (self.passes, self.module_map, self.adapter, self.trace)
         if not self.is_model and any(options):
             raise StudyError(
@@ -58,40 +52,6 @@ class Variant:
     def is_model(self) -> bool:
         """Whether an ONNX file drives."""
         return isinstance(driver_named(self.policy), OnnxDriver)
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What decisions cost.
-
-    Args:
-        name: As a variant's.
-        latency: ``none``, ``fps:F``, or ``trace``: each model's own latencies.
-
-    Raises:
-        StudyError: A bad name.
-        EvaluationError: Another latency.
-    """
-
-    name: str
-    latency: str
-
-    def __post_init__(self) -> None:
-        """Refuse a latency that nobody knows."""
-        _check_name("condition", self.name)
-        if self.traced:
-            return
-        if self.latency.startswith(TRACE) or self.latency == "measured":
-            raise StudyError(
-                f"condition {self.name}: latency {self.latency!r}: a study knows "
-                f"none, fps:F and {TRACE}"
-            )
-        parse_latency(self.latency)
-
-    @property
-    def traced(self) -> bool:
-        """Whether each model is charged what was measured of it."""
-        return self.latency == TRACE
 
 
 @dataclass(frozen=True)
@@ -143,7 +103,8 @@ class Study:
 
     Raises:
         StudyError: Nothing to drive, a name twice, a baseline that is not a variant, a
-            negative seed, or passes or a trace that need frames where there are none.
+            condition that names one that is not there, a negative seed, or passes or a
+            trace that need frames where there are none.
     """
 
     title: str
@@ -160,14 +121,15 @@ class Study:
 
     def __post_init__(self) -> None:
         """Refuse what could not be finished."""
-        _unique("variant", (variant.name for variant in self.variants))
-        _unique("condition", (condition.name for condition in self.conditions))
+        check_unique("variant", (variant.name for variant in self.variants))
+        check_unique("condition", (condition.name for condition in self.conditions))
         names = [variant.name for variant in self.variants]
         if self.baseline not in names:
             raise StudyError(
                 f"baseline {self.baseline!r} is not a variant; there are"
                 f" {', '.join(names)}"
             )
+        check_conditions(self.conditions, names)
         if not self.routes:
             raise StudyError(f"{self.title}: there is no route to drive")
         if self.seed < 0:
@@ -221,19 +183,3 @@ class Study:
     def reference(self) -> Variant:
         """The baseline."""
         return next(each for each in self.variants if each.name == self.baseline)
-
-
-def _check_name(kind: str, name: str) -> None:
-    if _NAME.fullmatch(name) is None:
-        raise StudyError(
-            f"{kind} {name!r}: a name is made of letters, digits, '_', '+' and '-'"
-        )
-
-
-def _unique(kind: str, names: Iterable[str]) -> None:
-    counts = Counter(names)
-    if not counts:
-        raise StudyError(f"the study has no {kind}")
-    name, count = counts.most_common(1)[0]
-    if count > 1:
-        raise StudyError(f"{count} {kind}s are named {name}")

@@ -8,7 +8,8 @@ from me2e_compress import recipe
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes
-from me2e_compress.study.definition import Condition, Study, Timing, Variant
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.run import run_study
 from me2e_compress.study.tables import differences, scoreboards

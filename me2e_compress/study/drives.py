@@ -1,18 +1,22 @@
 """Every variant under every condition, driven and scored."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from statistics import fmean
 from typing import Any
 
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.driving.latency import FixedLatency, LatencySource
+from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
+from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import Scores, score
-from me2e_compress.study.definition import Condition, Study
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
@@ -63,6 +67,7 @@ class DriveSetup:
         workspace: Where results go.
         engine: Where routes are driven.
         listener: Is called with progress and warnings.
+        means_us: What each mean of a drive came to, by its condition.
     """
 
     study: Study
@@ -70,6 +75,7 @@ class DriveSetup:
     workspace: Workspace
     engine: Engine
     listener: Listener
+    means_us: dict[str, int] = field(default_factory=dict)
 
     def under(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
@@ -94,11 +100,34 @@ class DriveSetup:
 
     def job(self, prepared: PreparedVariant, condition: Condition) -> Job | None:
         """Return who drives under what; None if its latency is not known."""
-        latency = self.clock.source(prepared.variant, condition, self.study.seed)
+        latency = self._latency(prepared, condition)
         if latency is None:
             return None
         size = image_size_of(prepared.driver.open())
-        return Job(prepared.driver, Conditions(latency, image_size=size))
+        return Job(prepared.driver, condition.drives(latency, size))
+
+    def _latency(
+        self, prepared: PreparedVariant, condition: Condition
+    ) -> LatencySource | None:
+        """Return what decisions cost; a mean is that of a drive that is done."""
+        if not condition.mean_of:
+            return self.clock.source(prepared.variant, condition, self.study.seed)
+        if condition.name not in self.means_us:
+            self.means_us[condition.name] = self._mean_us(condition)
+        return FixedLatency(self.means_us[condition.name])
+
+    def _mean_us(self, condition: Condition) -> int:
+        variant, under = condition.mean_cell
+        by_name = {each.name: each for each in self.study.variants}
+        conditions = {each.name: each for each in self.study.conditions}
+        path = self.workspace.results(by_name[variant], conditions[under])
+        driven = ResultsFolder.open(path).episodes().values() if path.exists() else ()
+        taken = [each.latency_us for episode in driven for each in episode.decisions]
+        if not taken:
+            raise StudyError(
+                f"condition {condition.name}: {condition.mean_of} took no decision"
+            )
+        return round(fmean(taken))
 
     def _episodes(
         self, prepared: PreparedVariant, condition: Condition

@@ -12,7 +12,8 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
-from me2e_compress.study.definition import Condition, Study, Timing, Variant
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.zoo.shipped import SHIPPED
 
@@ -76,7 +77,15 @@ class _Variant(_Table):
 
 class _Condition(_Table):
     name: str
-    latency: str
+    latency: str = ""
+    mean_of: str = ""
+    latency_model: str = "drop"
+    in_order: bool = False
+    limit_fps: float | None = None
+    seed: int | None = None
+    dt_ms: float = 50.0
+    weather: str = ""
+    against: str = ""
 
 
 class _Latency(_Table):
@@ -135,9 +144,7 @@ class _Reader:
         return Study(
             title=table.title,
             variants=tuple(self._variant(each) for each in table.variant),
-            conditions=tuple(
-                Condition(each.name, each.latency) for each in table.condition
-            ),
+            conditions=tuple(Condition(**dict(each)) for each in table.condition),
             baseline=table.baseline,
             routes=driven,
             set_size=set_size,

@@ -8,7 +8,8 @@ from typing import Any
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.providers import PROVIDERS
-from me2e_compress.study.definition import Condition, Study
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.plan_fidelity import PlanFidelity, measure_json
 from me2e_compress.study.prepared import PreparedVariant
@@ -166,10 +167,7 @@ class StudyResult(Result):
             "seed": study.seed,
             "provider": PROVIDERS.text(study.provider),
             "routes": {"driven": len(study.routes), "set": study.set_size},
-            "conditions": [
-                {"name": each.name, "charged": each.latency}
-                for each in study.conditions
-            ],
+            "conditions": [each.to_json() for each in study.conditions],
             "latency": {
                 "device_scale": self.device_scale,
                 "samples": study.timing.samples,

@@ -10,7 +10,7 @@ from me2e_compress.simulator.cameras import paint_texture
 from me2e_compress.simulator.pictures import Moment, RoutePicture, write_png
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.world import World
-from me2e_compress.study.definition import Condition
+from me2e_compress.study.condition import Condition
 from me2e_compress.study.drives import Drive, DriveSetup
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.route_outcomes import RouteOutcome

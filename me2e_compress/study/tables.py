@@ -7,7 +7,7 @@ from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.differences import PairedDifference
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.study.definition import Condition
+from me2e_compress.study.condition import Condition
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.plan_fidelity import EXACT
 from me2e_compress.workflows.result import Cell, Table
@@ -144,14 +144,9 @@ def _difference(found: PairedDifference) -> tuple[Cell, ...]:
 
 
 def _condition(outcome: "StudyResult", condition: Condition) -> str:
-    if condition.latency == "none":
-        return f"{condition.name}: decisions cost no time"
-    if not condition.traced:
-        fps = condition.latency.removeprefix("fps:")
-        return f"{condition.name}: {fps} decisions a second"
     scale = outcome.device_scale
     device = "this machine" if scale == 1.0 else f"a device {scale:.3g} times slower"
-    return f"{condition.name}: each model's own latency, {device}"
+    return condition.described(device)
 
 
 def _routes_note(outcome: "StudyResult") -> str:

@@ -4,15 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.latency import (
-    LatencySource,
-    TraceLatency,
-    parse_latency,
-)
+from me2e_compress.driving.latency import LatencySource
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.interleaved import describe_machine, record_traces
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.study.definition import Condition, Study, Variant
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.listener import Listener
@@ -43,12 +40,12 @@ class Clock:
         self, variant: Variant, condition: Condition, seed: int
     ) -> LatencySource | None:
         """Return what a variant's decisions cost; None without the trace for it."""
-        if not condition.traced:
-            return parse_latency(condition.latency)
+        source = condition.source(seed)
+        if not source.lacks_trace:
+            return source
         if variant.name not in self.traces:
             return None
-        samples = self.traces[variant.name].samples_us
-        return TraceLatency(samples, scale=self.scale, seed=seed)
+        return source.with_trace(self.traces[variant.name].samples_us, self.scale)
 
 
 def time_all(

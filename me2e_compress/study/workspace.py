@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from me2e_compress.errors import StudyError
-from me2e_compress.study.definition import Condition, Variant
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Variant
 
 JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
 """What is found, for programs, in a repository and in a browser."""

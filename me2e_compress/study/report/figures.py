@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.study.definition import Condition
+from me2e_compress.study.condition import Condition
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.findings import sure
 from me2e_compress.study.report.style import (

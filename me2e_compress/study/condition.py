@@ -1,0 +1,204 @@
+"""A condition of a study: what decisions cost, and what the cameras see."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.driving.latency import LatencySource, parse_latency
+from me2e_compress.driving.layered_latency import LimitedLatency
+from me2e_compress.errors import EvaluationError, StudyError
+from me2e_compress.evaluators.highway.conditions import (
+    Conditions,
+    latency_model_named,
+    step_us,
+)
+from me2e_compress.evaluators.highway.evaluation_options import weather_of
+from me2e_compress.registry import name_in
+from me2e_compress.study.names import check_name
+
+TRACE = "trace"
+"""A latency: what was measured of each model, under the device scale."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a variant drives under.
+
+    Args:
+        name: As a variant's.
+        latency: What decisions cost, as ``evaluate`` takes it: ``none``, ``fps:F``, or
+            ``trace``, which is each model's own latencies, also within another source:
+            ``agents{source=trace, per_agent_us=3000}``.
+        mean_of: Instead of a latency: every decision costs what decisions of this drive
+            cost on average, ``VARIANT.CONDITION``, a condition that stands before.
+        latency_model: ``drop`` or ``fifo``, see `LatencyModel`.
+        in_order: Replay traces in their order, which keeps bursts.
+        limit_fps: Frame limiter: a decision costs no less than its period.
+        seed: Of draws from traces; None takes the study's.
+        dt_ms: Step of the world; results at different steps are not compared.
+        weather: ``fog_m=80,night=0.5,noise=12,dropped=FRONT``; empty for a clear day.
+        against: Another condition, of which this one changes one thing: drives are
+            held against those under it, route by route.
+
+    Raises:
+        StudyError: A bad name, or options that do not go together.
+        EvaluationError: An option that `evaluate` refuses, too.
+    """
+
+    name: str
+    latency: str = ""
+    mean_of: str = ""
+    latency_model: str = "drop"
+    in_order: bool = False
+    limit_fps: float | None = None
+    seed: int | None = None
+    dt_ms: float = 50.0
+    weather: str = ""
+    against: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what nothing can be driven under."""
+        check_name("condition", self.name)
+        if bool(self.latency) == bool(self.mean_of):
+            raise StudyError(f"condition {self.name}: give a latency or mean_of")
+        if self.mean_of and (self.in_order or self.limit_fps is not None):
+            raise StudyError(
+                f"condition {self.name}: a mean has no order and takes no limit"
+            )
+        try:
+            source = None if self.mean_of else self.source(0)
+            latency_model_named(self.latency_model)
+            Conditions(dt_us=step_us(self.dt_ms), weather=weather_of(self.weather))
+        except EvaluationError as error:
+            raise EvaluationError(f"condition {self.name}: {error}") from error
+        if source is not None and source.measures:
+            raise StudyError(self._refusal())
+
+    def source(self, seed: int) -> LatencySource:
+        """Return what decisions cost; one that lacks its trace waits for a model's.
+
+        Args:
+            seed: Of draws, where the condition has none of its own.
+
+        Raises:
+            EvaluationError: No such source, or an option that it refuses.
+            StudyError: It names a file: that is a variant's.
+        """
+        if self._names_a_file:
+            raise StudyError(self._refusal())
+        own = seed if self.seed is None else self.seed
+        source = parse_latency(self.latency, in_order=self.in_order, seed=own)
+        if self.limit_fps is None:
+            return source
+        return LimitedLatency(source, self.limit_fps)
+
+    @property
+    def traced(self) -> bool:
+        """Whether each model is charged what was measured of it."""
+        return not self.mean_of and self.source(0).lacks_trace
+
+    @property
+    def mean_cell(self) -> tuple[str, str]:
+        """Variant and condition of the drive whose mean is charged."""
+        variant, _, condition = self.mean_of.partition(".")
+        return variant, condition
+
+    def drives(self, latency: LatencySource, image_size: tuple[int, int]) -> Conditions:
+        """Return what a policy drives under.
+
+        Args:
+            latency: What its decisions cost.
+            image_size: Rows and columns of each camera.
+        """
+        return Conditions(
+            latency,
+            step_us(self.dt_ms),
+            image_size,
+            weather_of(self.weather),
+            latency_model_named(self.latency_model),
+        )
+
+    def described(self, device: str) -> str:
+        """Say what it is in words, for the head of a table.
+
+        Args:
+            device: That each model's own latencies are of.
+        """
+        return ", ".join([f"{self.name}: {self._cost(device)}", *self._changes()])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return every option; ``charged`` is the latency, None where it is a mean."""
+        return {
+            "name": self.name,
+            "charged": self.latency or None,
+            "mean_of": self.mean_of or None,
+            "latency_model": self.latency_model,
+            "in_order": self.in_order,
+            "limit_fps": self.limit_fps,
+            "seed": self.seed,
+            "dt_ms": self.dt_ms,
+            "weather": self.weather,
+            "against": self.against or None,
+        }
+
+    @property
+    def _names_a_file(self) -> bool:
+        if self.latency.startswith(TRACE) and name_in(self.latency) != TRACE:
+            return True
+        return "trace:" in self.latency or "trace=" in self.latency
+
+    def _refusal(self) -> str:
+        return (
+            f"condition {self.name}: latency {self.latency!r}: a study knows none, "
+            f"fps:F and {TRACE}, and what is made of them (a file is a variant's: "
+            "trace = FILE)"
+        )
+
+    def _cost(self, device: str) -> str:
+        if self.mean_of:
+            return f"every decision costs the mean of {self.mean_of}"
+        if self.latency == "none":
+            return "decisions cost no time"
+        if self.latency == TRACE:
+            return f"each model's own latency, {device}"
+        if name_in(self.latency) == "fps" and ":" in self.latency:
+            return f"{self.latency.removeprefix('fps:')} decisions a second"
+        return f"{self.latency}, {device}" if self.traced else self.latency
+
+    def _changes(self) -> list[str]:
+        said = {
+            "in the trace's order": self.in_order,
+            f"limited to {self.limit_fps or 0:g} decisions a second": self.limit_fps,
+            "every control late (fifo)": self.latency_model != "drop",
+            f"a step of {self.dt_ms:g} ms": self.dt_ms != 50.0,
+            f"weather {self.weather}": self.weather,
+        }
+        return [words for words, true in said.items() if true]
+
+
+def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -> None:
+    """Check what conditions say of each other.
+
+    Args:
+        conditions: In their order.
+        variants: Names of what drives.
+
+    Raises:
+        StudyError: A mean of a drive that does not stand before, or a condition held
+            against one that is not there.
+    """
+    before = list[str]()
+    names = [each.name for each in conditions]
+    for each in conditions:
+        variant, condition = each.mean_cell
+        if each.mean_of and (variant not in variants or condition not in before):
+            raise StudyError(
+                f"condition {each.name}: mean_of {each.mean_of!r} is no"
+                " VARIANT.CONDITION of a condition before it"
+            )
+        if each.against and (each.against not in names or each.against == each.name):
+            raise StudyError(
+                f"condition {each.name}: against {each.against!r} is no other"
+                f" condition; there are {', '.join(names)}"
+            )
+        before.append(each.name)
