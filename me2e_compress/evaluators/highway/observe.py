@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation, Policy
+from me2e_compress.driving.can_bus import EgoMotion, can_bus_between
+from me2e_compress.driving.contract import Observation, Policy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CameraRig, Cameras
 from me2e_compress.simulator.scene import ActorKind, Ego, Scene
@@ -91,14 +92,15 @@ def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
 
 def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:
     """Return float32 [18], see `Observation`; ``last`` is the ego a decision ago."""
-    bus = np.zeros(CAN_BUS_SIZE, np.float64)
-    bus[3], bus[6] = math.cos(ego.heading / 2), math.sin(ego.heading / 2)
-    bus[7] = ego.speed_mps
-    bus[10:12] = ego.acceleration_mps2, ego.lateral_acceleration_mps2
-    bus[15] = ego.yaw_rate_radps
-    bus[16] = ego.heading % (2 * math.pi)
-    if last is not None:
-        bus[0:2] = ego.x - last.x, ego.y - last.y
-        turned = math.remainder(ego.heading - last.heading, 2 * math.pi)
-        bus[17] = math.degrees(turned)
-    return bus.astype(np.float32)
+    return can_bus_between(_motion(ego), None if last is None else _motion(last))
+
+
+def _motion(ego: Ego) -> EgoMotion:
+    return EgoMotion(
+        ego.x,
+        ego.y,
+        ego.heading,
+        ego.speed_mps,
+        (ego.acceleration_mps2, ego.lateral_acceleration_mps2, 0.0),
+        (0.0, 0.0, ego.yaw_rate_radps),
+    )

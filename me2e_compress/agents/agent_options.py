@@ -1,0 +1,65 @@
+"""Options of an agent: a TOML file that the leaderboard's configuration text names."""
+
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from me2e_compress import documents
+from me2e_compress.errors import EvaluationError
+
+
+class AgentOptions(BaseModel):
+    """The contents of a TOML file; relative paths start where the leaderboard runs."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a TOML file.
+
+        Raises:
+            EvaluationError: No such file, not TOML, or an unknown key or value.
+        """
+        try:
+            return cls.model_validate(documents.from_toml(documents.content(path)))
+        except OSError as error:
+            raise EvaluationError(f"{path}: {error.strerror}") from error
+        except documents.MalformedError as error:
+            raise EvaluationError(f"{path}: not TOML: {error}") from error
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"])) or "the file"
+            raise EvaluationError(f"{path}: {where}: {first['msg']}") from error
+
+
+def conf_parts(text: str) -> tuple[Path, str]:
+    """Take the leaderboard's configuration text apart.
+
+    Bench2Drive's evaluator appends ``+save_name`` for every route and never takes it
+    off again, so the first field is the file and the last the name of this route.
+
+    Args:
+        text: ``FILE``, or ``FILE+...+save_name``.
+
+    Returns:
+        The file, and the save name; empty where there is none.
+    """
+    first, *others = text.split("+")
+    return Path(first), others[-1] if others else ""
+
+
+def route_folder(parent: Path, save_name: str) -> Path:
+    """Make the folder of one route: of its save name, else the next free number.
+
+    Raises:
+        EvaluationError: It cannot be made.
+    """
+    folder, number = parent / save_name, 0
+    while not save_name and (folder := parent / f"route-{number:03}").exists():
+        number += 1
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EvaluationError(f"{folder}: cannot be made: {error.strerror}") from error
+    return folder

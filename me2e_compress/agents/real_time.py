@@ -1,0 +1,274 @@
+"""Equation 4 in a real leaderboard run: a wrapper around any agent.
+
+The leaderboard is left as it is. It waits for ``run_step`` while the world stands
+still, whatever that takes; this agent decides from what it took, or from a latency
+source, in which frame the control acts, exactly as the evaluator of highway-env does
+(`me2e_compress.driving.realtime`).
+"""
+
+import importlib
+import importlib.util
+import re
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from me2e_compress.agents.agent_options import AgentOptions, conf_parts, route_folder
+from me2e_compress.agents.carla_interface import (
+    CarlaControl,
+    SensorData,
+    SensorSpecs,
+    carla_control,
+    copy_of,
+)
+from me2e_compress.agents.decision_log import DecisionLog, DecisionRecord
+from me2e_compress.agents.forwarding import ForwardingAgent
+from me2e_compress.agents.metric_info import MetricInfo
+from me2e_compress.driving.latency import (
+    Charge,
+    DecisionFacts,
+    LatencySource,
+    parse_latency,
+)
+from me2e_compress.driving.realtime import (
+    DT_US,
+    ControlClock,
+    LatencyModel,
+    control_clock,
+)
+from me2e_compress.errors import EvaluationError
+from me2e_compress.graph import sha256_of
+from me2e_compress.runtime.profile import processor
+
+WALL_CLOCK = re.compile(r"(_\d\d){5}$")
+"""The end of a save name: month, day, hour, minute, second of the start."""
+
+
+def get_entry_point() -> str:
+    """Name the class that the leaderboard makes."""
+    return "RealTimeAgent"
+
+
+class RealTimeOptions(AgentOptions):
+    """How an agent is wrapped.
+
+    Attributes:
+        agent: The wrapped agent's file, or a module such as
+            ``me2e_compress.agents.graph_agent``.
+        config: Its own configuration text, without the save name.
+        latency: What a decision costs: ``measured`` here, ``fps:F``, ``trace:FILE``.
+        latency_model: ``drop`` is equation 4.
+        in_order: See `TraceLatency`.
+        scale: See `TraceLatency` and `MeasuredLatency`.
+        seed: See `TraceLatency`.
+        tick: The wrapped agent's cheap part, called with the sensors' data in the
+            frames that skip its decision: it follows the route and counts steps. The
+            agents of Bench2DriveZoo call it ``tick``; empty where there is none.
+        synchronize: ``module:function`` that waits until the GPU is done, such as
+            ``torch.cuda:synchronize``; empty where ``run_step`` returns with its
+            result computed.
+        folder: Where each route's folder is made; None takes the agent's own
+            ``save_path``.
+        model: The file whose digest the trace carries; None takes the agent's file.
+        machine: Where the agent runs, in words; empty for this machine's processor.
+    """
+
+    agent: str
+    config: str = ""
+    latency: str = "measured"
+    latency_model: LatencyModel = LatencyModel.DROP
+    in_order: bool = False
+    scale: float = 1.0
+    seed: int = 0
+    tick: str = "tick"
+    synchronize: str = ""
+    folder: Path | None = None
+    model: Path | None = None
+    machine: str = ""
+
+    def source(self) -> LatencySource:
+        """Build the latency source.
+
+        Raises:
+            EvaluationError: No such source, or an option that it refuses.
+        """
+        return parse_latency(
+            self.latency, in_order=self.in_order, scale=self.scale, seed=self.seed
+        )
+
+
+class RealTimeAgent(ForwardingAgent):
+    """Holds every control of the wrapped agent as long as its latency says.
+
+    In a frame whose decision is skipped the wrapped agent's cheap part alone is called;
+    ``metric_info`` goes on in every frame. The first call warms up: a latency that is
+    measured charges it nothing, and the trace leaves it out. Before the first control
+    acts, the brake is pressed fully. Each frame gets a control of its own, since the
+    leaderboard's ControlLoss changes it in place.
+    """
+
+    now_ns: Callable[[], int] = staticmethod(time.perf_counter_ns)
+    _log: DecisionLog | None = None
+
+    def setup(self, path_to_conf_file: str) -> None:
+        """Make the wrapped agent and set it up.
+
+        Args:
+            path_to_conf_file: ``FILE.toml+...+save_name``, see `RealTimeOptions`.
+
+        Raises:
+            EvaluationError: The options, the wrapped agent or the folder are unusable.
+            MissingPackageError: CARLA's client is not installed.
+        """
+        path, save_name = conf_parts(path_to_conf_file)
+        options = RealTimeOptions.load(path)
+        source, brake = options.source(), carla_control(0.0, 0.0, 1.0)
+        self._synchronize = _function(options.synchronize)
+        module = _module(options.agent)
+        self.adopt(_agent_class(module))
+        if options.tick and not hasattr(self._inner, options.tick):
+            raise EvaluationError(
+                f"agent {options.agent} has no method {options.tick}: name its cheap "
+                'part as `tick`, or "" where there is none'
+            )
+        self._inner.setup("+".join(filter(None, (options.config, save_name))))
+        self._clock: ControlClock[CarlaControl] = control_clock(
+            options.latency_model, brake, DT_US
+        )
+        self._charge = _but_the_first(source, WALL_CLOCK.sub("", save_name))
+        self._tick, self._frame, self._began_ns = options.tick, 0, self.now_ns()
+        folder = self._folder(options, save_name)
+        self._metrics = MetricInfo(self._inner, folder)
+        model = sha256_of(options.model or Path(str(module.__file__)))
+        self._log = DecisionLog(folder, model, options.machine or processor())
+
+    def sensors(self) -> SensorSpecs:
+        """List the wrapped agent's sensors."""
+        specs: SensorSpecs = self._inner.sensors()
+        return specs
+
+    def run_step(self, input_data: SensorData, timestamp: float) -> CarlaControl:
+        """Return the control that acts in this frame, a copy of its own."""
+        if self._clock.decision_is_due:
+            self._decide(input_data, timestamp)
+        else:
+            self._skip(input_data)
+        self._metrics.note(self._frame)
+        self._frame += 1
+        return copy_of(self._clock.advance())
+
+    def destroy(self) -> None:
+        """Write the trace and ``metric_info.json``, then let the wrapped agent go."""
+        self._write()
+        if self._inner is not None:
+            self._inner.destroy()
+
+    def _decide(self, input_data: SensorData, timestamp: float) -> None:
+        with ExitStack() as failed:
+            failed.callback(self._write)
+            self._synchronize()
+            begun = self.now_ns()
+            control = self._inner.run_step(input_data, timestamp)
+            self._synchronize()
+            done = self.now_ns()
+            failed.pop_all()
+        measured_us = (done - begun) // 1_000
+        latency_us = self._charge(DecisionFacts(measured_us))
+        self._clock.decide(copy_of(control), latency_us)
+        wall_s = round((done - self._began_ns) / 1e9, 6)
+        if self._log is not None:
+            self._log.note(
+                DecisionRecord(self._frame, timestamp, wall_s, measured_us, latency_us)
+            )
+
+    def _skip(self, input_data: SensorData) -> None:
+        """Let the wrapped agent see the frame, and count it, without deciding."""
+        before = getattr(self._inner, "step", None)
+        if self._tick:
+            getattr(self._inner, self._tick)(input_data)
+        if before is not None and self._inner.step == before:
+            self._inner.step += 1
+
+    def _write(self) -> None:
+        if self._log is not None:
+            self._log.write_trace()
+            self._metrics.write()
+
+    def _folder(self, options: RealTimeOptions, save_name: str) -> Path:
+        own = getattr(self._inner, "save_path", None)
+        if options.folder is not None:
+            return route_folder(options.folder, save_name)
+        if own is None:
+            raise EvaluationError(
+                f"agent {options.agent} has no save_path: name a `folder`"
+            )
+        return Path(own)
+
+
+def _but_the_first(source: LatencySource, route: str) -> Charge:
+    """Return the route's clock; a first decision that is measured here is free.
+
+    Raises:
+        EvaluationError: The source asks for what nobody tells here.
+    """
+    source.on_route(route)(DecisionFacts(0))  # a clock of its own
+    charge, warm = source.on_route(route), not source.measures
+
+    def charged(facts: DecisionFacts) -> int:
+        nonlocal warm
+        latency_us, warm = (charge(facts) if warm else 0), True
+        return latency_us
+
+    return charged
+
+
+def _module(text: str) -> ModuleType:
+    """Import an agent's module as the leaderboard does: its folder is on the path.
+
+    Raises:
+        EvaluationError: No such file.
+    """
+    if not text.endswith(".py"):
+        return importlib.import_module(text)
+    path = Path(text)
+    if not path.is_file():
+        raise EvaluationError(f"agent {text}: no such file")
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))
+    return importlib.import_module(path.stem)
+
+
+def _agent_class(module: ModuleType) -> Any:
+    """Return the class that a module's entry point names.
+
+    Raises:
+        EvaluationError: It names none, or an agent of ROS.
+    """
+    if not hasattr(module, "get_entry_point"):
+        raise EvaluationError(f"agent {module.__name__} has no get_entry_point")
+    found = getattr(module, module.get_entry_point())
+    if found.get_ros_version() != -1:
+        raise EvaluationError(
+            f"agent {module.__name__} is one of ROS: it has no run_step to wait for"
+        )
+    return found
+
+
+def _function(text: str) -> Callable[[], object]:
+    """Import what ``module:function`` names.
+
+    Raises:
+        EvaluationError: There is no such function.
+    """
+    if not text:
+        return lambda: None
+    module, _, name = text.partition(":")
+    try:
+        found: Callable[[], object] = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise EvaluationError(f"synchronize {text!r}: {error}") from error
+    return found

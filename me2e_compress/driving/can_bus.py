@@ -1,0 +1,52 @@
+"""The CAN bus of an observation: how the ego moves, and moved since it last decided."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.driving.contract import CAN_BUS_SIZE
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class EgoMotion:
+    """Where the ego is and how it moves, in a right-handed world (x east, y north).
+
+    Args:
+        x: Metres.
+        y: Metres.
+        heading: Radians counter-clockwise from east.
+        speed_mps: Forward.
+        acceleration_mps2: In the ego frame.
+        angular_velocity_radps: In the ego frame.
+    """
+
+    x: float
+    y: float
+    heading: float
+    speed_mps: float
+    acceleration_mps2: Triple
+    angular_velocity_radps: Triple
+
+
+def can_bus_between(now: EgoMotion, last: EgoMotion | None) -> npt.NDArray[np.float32]:
+    """Return float32 [18], laid out as `Observation` says.
+
+    Args:
+        now: At this decision.
+        last: At the decision before; None at the first.
+    """
+    bus = np.zeros(CAN_BUS_SIZE, np.float64)
+    bus[3], bus[6] = math.cos(now.heading / 2), math.sin(now.heading / 2)
+    bus[7] = now.speed_mps
+    bus[10:13] = now.acceleration_mps2
+    bus[13:16] = now.angular_velocity_radps
+    bus[16] = now.heading % (2 * math.pi)
+    if last is not None:
+        bus[0:2] = now.x - last.x, now.y - last.y
+        turned = math.remainder(now.heading - last.heading, 2 * math.pi)
+        bus[17] = math.degrees(turned)
+    return bus.astype(np.float32)
