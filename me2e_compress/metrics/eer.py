@@ -1,0 +1,208 @@
+"""EER_AV: driving and energy in one score a variant (equations 8 to 11).
+
+    Q_i = w_DS x_DS + C (w_DE x_DE + w_DC x_DC - w_E x_E),  C = 0 after a collision
+    EER_AV = mean over routes of Q_i, here times 100: points
+
+The x are normalized measures of route i, the w weights by CRITIC. The paper does not
+say how it normalizes; here the smallest value of all routes and variants that are
+compared becomes 0 and the largest 1 (`MIN_MAX`), which is how CRITIC was published
+(1995), and the weights are taken over the same rows. `rankings` says whether
+the order of the variants hangs on that choice. A score belongs to its weights and its
+scales: compare scores of one call, or of calls that share an `EerScale`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.critic import critic_weights
+from me2e_compress.metrics.intervals import bootstrap_interval
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.route_measures import RouteMeasures
+
+Floats = npt.NDArray[np.float64]
+
+MEASURES = ("driving score", "efficiency", "comfort", "energy")
+SIGNS = np.array([1.0, 1.0, 1.0, -1.0])
+POINTS = "points"
+
+
+class Normalization(StrEnum):
+    """How a measure becomes a number that others may be added to."""
+
+    MIN_MAX = "min-max"
+    """Over all routes of all variants: smallest 0, largest 1."""
+    NATURAL = "natural"
+    """Driving score and efficiency over 100 %, comfort as it is, energy over the most
+    that a route took: no measure but energy hangs on what is compared."""
+    Z_SCORE = "z-score"
+    """Over all routes of all variants: mean 0, standard deviation 1."""
+    VARIANT_MEANS = "variant means"
+    """Over the variants' means: smallest 0, largest 1; the weights too."""
+
+
+@dataclass(frozen=True, slots=True)
+class EerScale:
+    """What fixes the scores: x = (value - offset) / span, and the weight of each x.
+
+    Attributes:
+        normalization: How it was found.
+        weights: Of driving score, efficiency, comfort and energy; they add up to 1.
+        offset: Subtracted from %, %, ratio and joules.
+        span: Divided by.
+    """
+
+    normalization: Normalization
+    weights: tuple[float, float, float, float]
+    offset: tuple[float, float, float, float]
+    span: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EerResult:
+    """EER_AV of variants on the same routes.
+
+    Attributes:
+        scores: Points by variant, with its interval over routes (the weights as
+            they are), or the reason why there is none.
+        routes: [n] each, points by route and variant, for paired comparisons.
+        scale: Weights and scales; None where nothing could be scored.
+        left_out: Routes left out of all variants, by the measure that is missing.
+    """
+
+    scores: Mapping[str, Estimate]
+    routes: Mapping[str, Floats]
+    scale: EerScale | None
+    left_out: Mapping[str, int]
+
+    @property
+    def ranking(self) -> tuple[str, ...]:
+        """The variants that have a score, best first."""
+        known = [name for name, each in self.scores.items() if each.value is not None]
+        return tuple(sorted(known, key=lambda name: -(self.scores[name].value or 0.0)))
+
+
+def eer(
+    variants: Mapping[str, RouteMeasures],
+    scale: EerScale | None = None,
+    normalization: Normalization = Normalization.MIN_MAX,
+    seed: int = 0,
+) -> EerResult:
+    """Score variants that drove the same routes.
+
+    A route on which a measure of a variant is missing is left out of all. A variant of
+    which a measure is missing on every route has no score, and its reason names the
+    measure; the others are scored without it.
+
+    By hand, two variants on two routes, none crashed but b on the second:
+
+        a: DS 100, 60   DE 100, 80   DC 1.0, 0.5   E 10, 10 J
+        b: DS 100, 40   DE 120, 80   DC 0.5, 0.0   E  5,  5 J
+
+    min-max gives a: x = (1, 1/2, 1, 1), (1/3, 0, 1/2, 1); b: (1, 1, 1/2, 0),
+    (0, 0, 0, 0). With weights of 1/4 each a has Q = (1 + 1/2 + 1 - 1) / 4 = 3/8 and
+    (1/3 + 0 + 1/2 - 1) / 4 = -1/24, so 16.7 points; b has 5/8 and, after its
+    collision, 0: 31.3 points.
+
+    Args:
+        variants: Measures by name, all over the same routes in the same order.
+        scale: Weights and scales that are fixed already; else they follow from the
+            routes.
+        normalization: How, where no scale is given.
+        seed: Of the bootstrap.
+
+    Raises:
+        EvaluationError: The variants differ in the number of routes.
+    """
+    if len({len(each.driving_score) for each in variants.values()}) > 1:
+        raise EvaluationError("EER_AV compares variants on the same routes")
+    missing = {name: _missing(each) for name, each in variants.items()}
+    able = {name: each for name, each in variants.items() if not missing[name]}
+    kept, left_out = _kept(able)
+    tables = {name: each.table()[kept] for name, each in able.items()}
+    reason = "" if kept.any() else "no route has all four measures"
+    if not reason and scale is None:
+        try:
+            scale = scale_of(tables, normalization)
+        except EvaluationError as error:
+            reason = str(error)
+    scores, routes = dict[str, Estimate](), dict[str, Floats]()
+    for name, measures in variants.items():
+        why = missing[name] or reason
+        if why or scale is None:
+            scores[name] = Estimate(Measure(None, POINTS, why), None, None, 0)
+            continue
+        routes[name] = route_eer(tables[name], measures.crashed[kept], scale)
+        values = routes[name].tolist()
+        low, high = bootstrap_interval(values, seed)
+        mean = Measure(float(np.mean(values)), POINTS)
+        scores[name] = Estimate(mean, low, high, len(values))
+    return EerResult(scores, routes, None if reason else scale, left_out)
+
+
+def route_eer(table: Floats, crashed: npt.NDArray[np.bool_], scale: EerScale) -> Floats:
+    """Return [routes] 100 times Q_i (equation 8) of a table [routes, 4]."""
+    normalized = (table - np.array(scale.offset)) / np.array(scale.span)
+    terms = normalized * np.array(scale.weights) * SIGNS
+    safe = np.where(crashed, 0.0, terms[:, 1:].sum(axis=1))
+    return np.asarray(100.0 * (terms[:, 0] + safe))
+
+
+def scale_of(tables: Mapping[str, Floats], normalization: Normalization) -> EerScale:
+    """Return offset and span of every measure, and their weights by CRITIC.
+
+    Args:
+        tables: [routes, 4] by variant, nothing missing.
+        normalization: How.
+
+    Raises:
+        EvaluationError: CRITIC finds no weights.
+    """
+    rows = np.concatenate(list(tables.values()))
+    if normalization is Normalization.VARIANT_MEANS:
+        rows = np.stack([table.mean(axis=0) for table in tables.values()])
+    if normalization is Normalization.Z_SCORE:
+        offset, span = rows.mean(axis=0), rows.std(axis=0)
+    elif normalization is Normalization.NATURAL:
+        offset = np.zeros(rows.shape[1])
+        span = np.array([100.0, 100.0, 1.0, rows[:, 3].max()])
+    else:
+        offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
+    span = np.where(span > 0.0, span, 1.0)  # a constant measure has weight 0
+    weights = critic_weights((rows - offset) / span)
+    return EerScale(normalization, _four(weights), _four(offset), _four(span))
+
+
+def rankings(
+    variants: Mapping[str, RouteMeasures],
+) -> dict[Normalization, tuple[str, ...]]:
+    """Return the variants, best first, under every normalization that gives weights."""
+    found = {each: eer(variants, normalization=each) for each in Normalization}
+    return {each: result.ranking for each, result in found.items() if result.scale}
+
+
+def _missing(measures: RouteMeasures) -> str:
+    """Name the measures that a variant has on no route."""
+    absent = np.asarray(np.isnan(measures.table()).all(axis=0))
+    names = [name for name, gone in zip(MEASURES, absent, strict=True) if gone]
+    return f"{' and '.join(names)}: not measured" if names else ""
+
+
+def _kept(
+    variants: Mapping[str, RouteMeasures],
+) -> tuple[npt.NDArray[np.bool_], dict[str, int]]:
+    """Return which routes have all measures of all variants, and why others do not."""
+    if not variants:
+        return np.zeros(0, np.bool_), {}
+    gone = np.any([np.isnan(each.table()) for each in variants.values()], axis=0)
+    counts = zip(MEASURES, gone.sum(axis=0).tolist(), strict=True)
+    return ~gone.any(axis=1), {name: count for name, count in counts if count}
+
+
+def _four(values: Floats) -> tuple[float, float, float, float]:
+    one, two, three, four = values.tolist()
+    return one, two, three, four

@@ -1,0 +1,189 @@
+"""EER_AV against a hand-worked example, and what it must not hang on."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.eer import (
+    EerScale,
+    Normalization,
+    eer,
+    rankings,
+    scale_of,
+)
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
+from tests.metrics.drives import cruise, drive, infraction
+
+
+def measures(*rows: tuple[float, float, float, float], crashed: str) -> RouteMeasures:
+    """Rows of DS, DE, DC and joules; an ``x`` for every route with a collision."""
+    hits = np.array([letter == "x" for letter in crashed])
+    return RouteMeasures.of_table(np.array(rows, np.float64), hits)
+
+
+BY_HAND = {
+    "a": measures((100, 100, 1.0, 10), (60, 80, 0.5, 10), crashed=".."),
+    "b": measures((100, 120, 0.5, 5), (40, 80, 0.0, 5), crashed=".x"),
+}
+EQUAL = EerScale(
+    Normalization.MIN_MAX,
+    weights=(0.25, 0.25, 0.25, 0.25),
+    offset=(40.0, 80.0, 0.0, 5.0),
+    span=(60.0, 40.0, 1.0, 5.0),
+)
+NAN = math.nan
+
+routes = arrays(np.float64, (5, 4), elements=st.floats(0, 100, width=16))
+
+
+def of_table(table: np.ndarray) -> RouteMeasures:
+    return RouteMeasures.of_table(table, table[:, 0] < 50.0)
+
+
+def test_the_example_by_hand() -> None:
+    found = eer(BY_HAND, EQUAL)
+
+    assert found.routes["a"] == pytest.approx([100 * 3 / 8, -100 / 24])
+    assert found.routes["b"] == pytest.approx([100 * 5 / 8, 0.0])
+    assert found.scores["a"].value == pytest.approx(100 / 6)
+    assert found.scores["b"].value == pytest.approx(31.25)
+    assert found.scores["b"].measure.unit == "points"
+    assert found.ranking == ("b", "a")
+
+
+def test_smallest_and_largest_of_all_routes_are_the_scale() -> None:
+    scale = eer(BY_HAND).scale
+
+    assert scale is not None
+    assert (scale.offset, scale.span) == (EQUAL.offset, EQUAL.span)
+    assert sum(scale.weights) == pytest.approx(1.0)
+
+
+def test_weights_come_from_critic_over_routes_and_variants() -> None:
+    tables = {name: each.table() for name, each in BY_HAND.items()}
+    found = scale_of(tables, Normalization.MIN_MAX).weights
+
+    # normalized: DS 1 1/3 1 0, DE 1/2 0 1 0, DC 1 1/2 1/2 0, E 1 1 0 0
+    x = np.array([[1, 1 / 3, 1, 0], [0.5, 0, 1, 0], [1, 0.5, 0.5, 0], [1, 1, 0, 0]])
+    content = x.std(axis=1) * (1 - np.abs(np.corrcoef(x))).sum(axis=1)
+    assert found == pytest.approx(content / content.sum())
+
+
+def test_a_scale_is_used_again_on_another_variant() -> None:
+    scale = eer(BY_HAND).scale
+
+    alone = eer({"b": BY_HAND["b"]}, scale)
+
+    assert alone.routes["b"] == pytest.approx(eer(BY_HAND).routes["b"])
+
+
+@pytest.mark.parametrize("measure", range(4))
+def test_a_missing_measure_is_named_and_the_others_are_scored(measure: int) -> None:
+    table = BY_HAND["a"].table().copy()
+    table[:, measure] = NAN
+    lacking = RouteMeasures.of_table(table, BY_HAND["a"].crashed)
+
+    found = eer({**BY_HAND, "c": lacking})
+
+    names = ("driving score", "efficiency", "comfort", "energy")
+    assert found.scores["c"].measure.reason == f"{names[measure]}: not measured"
+    assert found.scores["a"] == eer(BY_HAND).scores["a"]
+
+
+def test_a_route_that_one_variant_did_not_measure_is_left_out_of_all() -> None:
+    more = {
+        "a": measures(
+            *BY_HAND["a"].table().tolist(), (10, NAN, 0.5, 10), crashed="..."
+        ),
+        "b": measures(*BY_HAND["b"].table().tolist(), (90, 90, 0.9, 1), crashed=".x."),
+    }
+
+    found = eer(more)
+
+    assert found.left_out == {"efficiency": 1}
+    assert found.scores["b"] == eer(BY_HAND).scores["b"]
+
+
+def test_variants_that_measure_the_same_have_no_weights() -> None:
+    same = measures((50, 50, 0.5, 5), (50, 50, 0.5, 5), crashed="..")
+
+    found = eer({"a": same, "b": same}).scores["a"]
+
+    assert found.value is None
+    assert "CRITIC finds no weights" in found.measure.reason
+
+
+def test_unequal_routes_are_refused() -> None:
+    with pytest.raises(EvaluationError, match="the same routes"):
+        eer({**BY_HAND, "c": measures((1, 1, 1, 1), crashed=".")})
+
+
+@given(routes, routes, st.sampled_from([1e-3, 0.5, 8.0]), st.permutations(range(5)))
+def test_neither_units_nor_the_order_of_routes_change_a_score(
+    one: np.ndarray, other: np.ndarray, unit: float, order: list[int]
+) -> None:
+    found = eer({"a": of_table(one), "b": of_table(other)})
+    moved = eer(
+        {
+            name: dataclasses.replace(
+                of_table(table[order]), energy_j=unit * table[order, 3]
+            )
+            for name, table in (("a", one), ("b", other))
+        }
+    )
+
+    for name, score in found.scores.items():
+        again = moved.scores[name]
+        assert score.n == again.n
+        assert score.value == pytest.approx(again.value, abs=1e-6)
+
+
+def test_the_ranking_under_every_normalization() -> None:
+    drawn = np.random.default_rng(1).uniform(0, 1, (3, 30, 4)) * (100, 100, 1, 10)
+    drawn[0, :, 0] = 100.0
+    variants = {
+        name: RouteMeasures.of_table(table, np.zeros(30, np.bool_))
+        for name, table in zip("abc", drawn, strict=True)
+    }
+
+    found = rankings(variants)
+
+    assert set(found) == set(Normalization)
+    assert found[Normalization.MIN_MAX] == eer(variants).ranking
+    assert found[Normalization.MIN_MAX][0] == "a"
+
+
+def test_joules_of_a_route_are_those_of_its_decisions() -> None:
+    found = route_measures([drive(driven=cruise(traffic=5.0))], 2.5)
+
+    assert found.energy_j.tolist() == [2.5]  # a drive by hand has one decision
+    assert found.efficiency.tolist() == pytest.approx([200.0])
+    assert found.comfort.tolist() == [1.0]
+
+
+def test_no_counter_no_joules() -> None:
+    assert np.isnan(route_measures([drive()], None).energy_j).all()
+
+
+def test_a_driver_that_failed_at_once_is_not_left_out() -> None:
+    stuck = drive(completion=1.0, driven=cruise(1.0), ending=Ending.TIMEOUT)
+    found = route_measures([stuck], 1.0)
+
+    assert (found.efficiency[0], found.comfort[0]) == (0.0, 0.0)
+
+
+def test_without_a_record_nothing_is_made_up() -> None:
+    hit = infraction(InfractionKind.COLLISION_VEHICLE)
+    silent = dataclasses.replace(drive(hit, completion=2.0), decisions=())
+    found = route_measures([silent], 1.0)
+
+    assert np.isnan(found.table()[0, 1:]).all()
+    assert found.crashed.tolist() == [True]
