@@ -1,0 +1,93 @@
+"""Counters of energy: what a device can be asked, and what its answer is.
+
+To add one: write its class and its reader, then add it to this table.
+"""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.registry import Registry, name_in
+from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.recording import EnergyRecording
+
+__all__ = [
+    "ENERGY_COUNTERS",
+    "EnergyCounter",
+    "open_counter",
+]
+
+AUTO = "auto"
+"""Asks every counter of this machine in turn."""
+
+
+@dataclass(frozen=True)
+class EnergyCounter(abc.ABC):
+    """A kind of counter; its fields are its options.
+
+    Class attributes:
+        name: What the command line calls it.
+        automatic: True if ``auto`` may ask it.
+    """
+
+    name: ClassVar[str]
+    automatic: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def open(self) -> Reader | EnergyRecording | Absent:
+        """Ask it for what is wanted of it, not for its neighbours, and open it.
+
+        Raises:
+            EnergyError: A file that it is to be read from is not usable.
+        """
+
+
+_HERE = "me2e_compress.runtime.energy"
+
+ENERGY_COUNTERS: Registry[EnergyCounter] = Registry(
+    "energy counter",
+    "me2e_compress.energy_counters",
+    EnergyError,
+    {
+        "nvml": f"{_HERE}.nvml:Nvml",
+        "ina3221": f"{_HERE}.ina3221:Ina3221",
+        "rapl": f"{_HERE}.rapl:Rapl",
+        "recorded": f"{_HERE}.recorded:Recorded",
+    },
+)
+
+
+def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
+    """Open the counter of a text, e.g. ``rapl`` or ``recorded:FILE``.
+
+    Args:
+        text: ``auto`` asks the counters of this machine in turn and opens the first
+            that answers; else a name and options, see :data:`ENERGY_COUNTERS`.
+
+    Returns:
+        The open counter; or why there is none, with every one that was asked and what
+        it answered.
+
+    Raises:
+        EnergyError: No such counter, an option that it has not, or a file that is not
+            usable.
+    """
+    if text.strip() != AUTO:
+        if name_in(text) not in ENERGY_COUNTERS.names():
+            names = ", ".join((AUTO, *ENERGY_COUNTERS.names()))
+            raise EnergyError(f"no energy counter {text!r}; there are {names}")
+        return _first([ENERGY_COUNTERS.parse(text)])
+    kinds = [ENERGY_COUNTERS.get(name) for name in ENERGY_COUNTERS.usable()]
+    return _first([ENERGY_COUNTERS.make(kind, {}) for kind in kinds if kind.automatic])
+
+
+def _first(counters: Sequence[EnergyCounter]) -> Reader | EnergyRecording | Absent:
+    answers = list[str]()
+    for each in counters:
+        found = each.open()
+        if not isinstance(found, Absent):
+            return found
+        answers.append(f"{each.name}: {found.reason}")
+    return Absent(f"no energy counter answers ({'; '.join(answers)})")

@@ -1,0 +1,144 @@
+"""The power rails of a Jetson: INA3221 sensors under sysfs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.counter import EnergyCounter
+from me2e_compress.runtime.energy.reader import Absent, Reader
+
+INPUTS = ("VDD_IN", "POM_5V_IN")
+"""Rails that feed the module (Xavier NX, Orin NX and Nano, TX2; Nano); all others hang
+on them, and adding them up counts those twice (jetson_stats, issue 51)."""
+CONTAINED = {"VDDQ_VDD2_1V8AO": "VIN_SYS_5V0"}
+"""Rails that another one already holds (Jetson AGX Orin, NVIDIA's developer guide)."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One rail of a sensor.
+
+    Attributes:
+        label: name of the rail.
+        millivolts: file of its voltage.
+        milliamperes: file of its current.
+    """
+
+    label: str
+    millivolts: Path
+    milliamperes: Path
+
+    def watts(self) -> float:
+        """Return the power now.
+
+        Raises:
+            OSError: a file cannot be read.
+            ValueError: it holds no number.
+        """
+        volts, amperes = self.millivolts.read_text(), self.milliamperes.read_text()
+        return int(volts) * int(amperes) / 1e6
+
+
+@dataclass(frozen=True)
+class Ina3221(EnergyCounter):
+    """Jetson: the rail that feeds the module; without one, the sum of its rails.
+
+    Attributes:
+        rails: labels of those to add up; empty: as said.
+        root: folder of the drivers of I2C devices.
+    """
+
+    name: ClassVar[str] = "ina3221"
+    rails: tuple[str, ...] = ()
+    root: Path = Path("/sys/bus/i2c/drivers")
+
+    def open(self) -> Reader | Absent:
+        """Read every rail that counts once."""
+        sensors = sorted(self.root.glob("ina3221*/*/hwmon/hwmon*"))
+        if not sensors:
+            return Absent(f"no {self.root}/ina3221")
+        found = [each for sensor in sensors for each in _channels(sensor)]
+        labels = [each.label for each in found]
+        if lacking := [label for label in self.rails if label not in labels]:
+            there = ", ".join(labels) or "none"
+            return Absent(f"no rail {lacking[0]}; there are {there}")
+        wanted = self.rails or counted(labels)
+        chosen = [each for each in found if each.label in wanted]
+        if not chosen:
+            return Absent(
+                f"{sensors[0]}: no rail with a label, a voltage and a current"
+            )
+        try:
+            for each in chosen:
+                each.watts()
+        except PermissionError as error:
+            return Absent(f"{error.filename} may not be read: permission denied")
+        except (OSError, ValueError) as error:
+            return Absent(str(error))
+        return Ina3221Reader(chosen, sensors)
+
+
+class Ina3221Reader(Reader):
+    """Open rails; their power is integrated.
+
+    Args:
+        channels: those that are added up.
+        sensors: folders of the sensors.
+    """
+
+    counter = "ina3221-integrated"
+    counts = False
+    tells_power = True
+
+    def __init__(self, channels: Sequence[Channel], sensors: Sequence[Path]) -> None:
+        self._channels = channels
+        self.device = "Jetson"
+        averaging = ", ".join(
+            f"{name} {text}"
+            for name in ("samples", "update_interval")
+            if (text := _text(sensors[0] / name))
+        )
+        rails = " + ".join(each.label for each in channels)
+        self.scope = f"{rails} ({averaging})" if averaging else rails
+        self.step_s = _seconds(_text(sensors[0] / "update_interval"))
+
+    def watts(self) -> float:
+        """Return the power of all rails that count."""
+        try:
+            return sum(each.watts() for each in self._channels)
+        except (OSError, ValueError) as error:
+            raise EnergyError(f"ina3221: {error}") from error
+
+
+def counted(labels: Sequence[str]) -> list[str]:
+    """Return the rails that are added up: none is part of another one."""
+    inputs = [label for label in labels if label in INPUTS]
+    if inputs:
+        return inputs[:1]
+    return [label for label in labels if CONTAINED.get(label) not in labels]
+
+
+def _channels(sensor: Path) -> list[Channel]:
+    """List the rails of a sensor; one without a name is not connected."""
+    return [
+        Channel(label, sensor / f"in{number}_input", sensor / f"curr{number}_input")
+        for number in (1, 2, 3)
+        if (label := _text(sensor / f"in{number}_label")) not in ("", "NC")
+        and (sensor / f"curr{number}_input").exists()
+    ]
+
+
+def _seconds(milliseconds: str) -> float | None:
+    try:
+        return int(milliseconds) / 1e3 or None
+    except ValueError:
+        return None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""

@@ -1,0 +1,221 @@
+"""Measure the energy of models: windows of a counter, in turn, idle around them."""
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import fmean, median
+
+import numpy as np
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.estimate import BEATS, Window, beat, detuning
+from me2e_compress.runtime.energy.power import SAMPLED_S, PowerSamples, in_background
+from me2e_compress.runtime.energy.reader import DeviceState, Reader
+from me2e_compress.runtime.energy.result import EnergyResult
+from me2e_compress.runtime.energy.schedule import EnergySchedule
+from me2e_compress.runtime.energy.summary import CountedBy, summarise
+
+Work = Callable[[], object]
+"""Runs one frame of a model and returns when it is done, on the device too."""
+Every = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
+"""Calls something every so many seconds while the context is open."""
+
+_STEPS = 5
+"""Steps of a counter that are waited for to learn how long one is."""
+_LONGEST_STEP_S = 2.0
+"""A counter that does not move for so long stands still."""
+_POLL_S = 0.002
+_SHORTEST_PAUSE_S = 1e-3
+"""The system keeps no shorter ones: they are saved up."""
+
+
+@dataclass(frozen=True)
+class _Span:
+    """A stretch between two readings; joules are None where power is integrated."""
+
+    begin_s: float
+    end_s: float
+    frames: int
+    joules: float | None
+    paused_s: float = 0.0
+    states: tuple[DeviceState, ...] = ()
+
+
+class EnergyMeter:
+    """Measures models beside one another by one counter.
+
+    The idle device comes first, the models loaded; they warm up together; then windows
+    in turn (A B B A), each at a random phase of the counter and behind frames of its
+    own model; then idle again.
+
+    Args:
+        reader: The counter, open; nothing else may run on its device.
+        schedule: How long, and how often; None takes the defaults.
+        clock: Seconds, never going back.
+        sleep: Waits so many seconds.
+        every: Calls something all the while.
+        on_window: Called with windows done, windows in all, and the model's name.
+    """
+
+    def __init__(
+        self,
+        reader: Reader,
+        schedule: EnergySchedule | None = None,
+        *,
+        clock: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], None] = time.sleep,
+        every: Every = in_background,
+        on_window: Callable[[int, int, str], None] = lambda done, total, name: None,
+    ) -> None:
+        self._reader, self._schedule = reader, schedule or EnergySchedule()
+        self._clock, self._sleep, self._every = clock, sleep, every
+        self._on_window = on_window
+        self._random = np.random.default_rng(self._schedule.seed)
+        self._power = PowerSamples(reader, clock)
+
+    def measure(self, work: Mapping[str, Work]) -> dict[str, EnergyResult]:
+        """Measure models in turn.
+
+        Args:
+            work: What runs a frame, by model.
+
+        Raises:
+            EnergyError: The counter goes back, stands still, or cannot be read.
+        """
+        spans: dict[str, list[_Span]] = {name: [] for name in work}
+        turns = self._schedule.turns(list(work))
+        with (
+            self._every(SAMPLED_S, self._power.add)
+            if self._reader.tells_power
+            else contextlib.nullcontext()
+        ):
+            step_s = self._reader.step_s or self._learnt_step()
+            idle = [self._idle()]
+            frame_s = self._warm_up(work)
+            for done, name in enumerate(turns):
+                self._on_window(done, len(turns), name)
+                spans[name].append(self._work(work[name], frame_s[name], step_s))
+            self._on_window(len(turns), len(turns), turns[-1])
+            self._sleep(self._schedule.lead_in_s)
+            idle.append(self._idle())
+            self._sleep(2 * SAMPLED_S)  # the last sample of power lies behind it
+        idle_w = fmean(self._window(each).watts for each in idle)
+        return {
+            name: self._result(spans[name], step_s, idle_w, frame_s[name])
+            for name in work
+        }
+
+    def _result(
+        self, spans: Sequence[_Span], step_s: float, idle_w: float, frame_s: float
+    ) -> EnergyResult:
+        reader, frames = self._reader, spans[0].frames
+        by_power = None
+        if reader.counts and reader.tells_power:
+            joules = sum(self._power.joules(each.begin_s, each.end_s) for each in spans)
+            by_power = joules / sum(each.frames for each in spans)
+        pause = detuning(frame_s, frames, step_s)
+        left = beat(frame_s + pause, frames, step_s)
+        warnings = (
+            f"energy: frames of {frame_s * 1e3:.1f} ms keep step with the counter"
+            f" ({step_s * 1e3:.0f} ms), which sees only a part of each",
+        )
+        return summarise(
+            [self._window(each) for each in spans],
+            CountedBy(reader.counter, reader.device, reader.scope, step_s),
+            idle_w,
+            states=[state for each in spans for state in each.states],
+            power_j_per_frame=by_power,
+            warnings=warnings if left > BEATS else (),
+        )
+
+    def _window(self, span: _Span) -> Window:
+        joules = span.joules
+        if joules is None:
+            joules = self._power.joules(span.begin_s, span.end_s)
+        return Window(span.begin_s, span.end_s, span.frames, joules, span.paused_s)
+
+    def _learnt_step(self) -> float:
+        """Learn the counter's step from when it moves."""
+        if not self._reader.counts:
+            return SAMPLED_S
+        moved, last = [self._clock()], self._reader.joules()
+        while len(moved) < _STEPS + 2:  # the first wait is but a part of a step
+            self._sleep(_POLL_S)
+            now = self._reader.joules()
+            if now != last:
+                moved.append(self._clock())
+            elif self._clock() - moved[-1] > _LONGEST_STEP_S:
+                raise EnergyError(self._says(f"stands still at {now:g} J"))
+            last = now
+        return float(np.median(np.diff(moved[1:])))
+
+    def _idle(self) -> _Span:
+        begin, before = self._read()
+        self._sleep(self._schedule.idle_s)
+        end, after = self._read()
+        return _Span(begin, end, 0, self._moved(before, after, end - begin))
+
+    def _warm_up(self, work: Mapping[str, Work]) -> dict[str, float]:
+        """Run all models, a lead-in each in turn; return the seconds of a frame."""
+        taken: dict[str, list[float]] = {name: [] for name in work}
+        until = self._clock() + self._schedule.warm_up_s
+        while self._clock() < until or not all(taken.values()):
+            for name, run in work.items():
+                taken[name] += self._lead_in(run)
+        return {name: median(each) for name, each in taken.items()}
+
+    def _lead_in(self, run: Work) -> list[float]:
+        times = [self._clock()]
+        while times[-1] - times[0] < self._schedule.lead_in_s:
+            run()
+            times.append(self._clock())
+        return [after - before for before, after in pairwise(times)]
+
+    def _work(self, run: Work, frame_s: float, step_s: float) -> _Span:
+        """Run a window, at a random phase of the counter."""
+        frames = self._schedule.frames(frame_s)
+        pause = detuning(frame_s, frames, step_s)
+        self._sleep(float(self._random.uniform(0, step_s)))
+        first = self._reader.state()
+        self._lead_in(run)
+        begin, before = self._read()
+        paused = self._frames(run, frames, pause)
+        end, after = self._read()
+        joules = self._moved(before, after, end - begin)
+        states = (first, self._reader.state())
+        return _Span(begin, end, frames, joules, paused, states)
+
+    def _frames(self, run: Work, frames: int, pause: float) -> float:
+        """Run frames with pauses between; return the seconds of these."""
+        owed, paused = 0.0, 0.0
+        for _ in range(frames):
+            run()
+            owed += pause
+            if owed >= _SHORTEST_PAUSE_S:
+                begun = self._clock()
+                self._sleep(owed)
+                taken = self._clock() - begun
+                owed, paused = owed - taken, paused + taken
+        return paused
+
+    def _read(self) -> tuple[float, float]:
+        """Return the time and the joules; 0 where power is integrated."""
+        joules = self._reader.joules() if self._reader.counts else 0.0
+        return self._clock(), joules
+
+    def _moved(self, before: float, after: float, taken_s: float) -> float | None:
+        if not self._reader.counts:
+            return None
+        if after < before:
+            raise EnergyError(self._says(f"went back from {before:g} to {after:g} J"))
+        if after == before:
+            raise EnergyError(
+                self._says(f"stands still at {after:g} J for {taken_s:.1f} s")
+            )
+        return after - before
+
+    def _says(self, what: str) -> str:
+        return f"energy counter {self._reader.counter} of {self._reader.device} {what}"

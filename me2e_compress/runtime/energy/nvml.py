@@ -1,0 +1,158 @@
+"""NVIDIA's own counter: the total energy of a board, and its power beside it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+import pynvml
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.counter import EnergyCounter
+from me2e_compress.runtime.energy.reader import Absent, DeviceState, Reader
+
+T = TypeVar("T")
+
+_SLOWED = {
+    "nvmlClocksEventReasonSwPowerCap": "power cap",
+    "nvmlClocksEventReasonHwSlowdown": "hardware slowdown",
+    "nvmlClocksEventReasonHwThermalSlowdown": "hardware thermal slowdown",
+    "nvmlClocksEventReasonHwPowerBrakeSlowdown": "power brake",
+    "nvmlClocksEventReasonSwThermalSlowdown": "thermal slowdown",
+}
+"""Reasons of NVML that cost speed; idle, and clocks that someone set, are none."""
+
+
+_CLOCKS = {"sm": pynvml.NVML_CLOCK_SM, "memory": pynvml.NVML_CLOCK_MEM}
+
+
+@dataclass(frozen=True)
+class Nvml(EnergyCounter):
+    """NVIDIA GPU: total energy (Volta and later), else its power integrated.
+
+    That NVML answers says nothing: on a Jetson with JetPack 7 it does, and supports
+    neither. So the calls themselves are asked.
+
+    Attributes:
+        index: of the GPU.
+
+    Raises:
+        ValueError: a negative index.
+    """
+
+    name: ClassVar[str] = "nvml"
+    index: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the index."""
+        if self.index < 0:
+            raise ValueError(f"index {self.index}: must be 0 or more")
+
+    def open(self) -> Reader | Absent:
+        """Ask for the total energy, then for the power."""
+        try:
+            pynvml.nvmlInit()
+        except pynvml.NVMLError as error:
+            return Absent(str(error))
+        reader = self._asked()
+        if isinstance(reader, Absent):
+            pynvml.nvmlShutdown()
+        return reader
+
+    def _asked(self) -> Reader | Absent:
+        try:
+            handle = pynvml.nvmlDeviceGetHandleByIndex(self.index)
+        except pynvml.NVMLError as error:
+            return Absent(f"GPU {self.index}: {error}")
+        energy = _answer(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
+        power = _answer(_instant_power, handle)
+        if isinstance(energy, str) and isinstance(power, str):
+            return Absent(
+                f"{_name(handle)} tells no energy: total energy: {energy};"
+                f" instant power: {power}"
+            )
+        return NvmlReader(handle, not isinstance(energy, str), power)
+
+
+class NvmlReader(Reader):
+    """An open GPU.
+
+    Args:
+        handle: NVML's.
+        counts: whether it counts energy.
+        power: its power in mW; or why it does not tell.
+    """
+
+    scope = "the whole board"
+
+    def __init__(self, handle: Any, counts: bool, power: int | str) -> None:
+        self._handle, self.counts = handle, counts
+        self.tells_power = not isinstance(power, str)
+        self.counter = "nvml-total" if counts else "nvml-power-integrated"
+        self.device = _name(handle)
+
+    def joules(self) -> float:
+        """Return the joules since the driver was loaded."""
+        return self._ask(pynvml.nvmlDeviceGetTotalEnergyConsumption) / 1e3
+
+    def watts(self) -> float:
+        """Return the power now, not the average of a second."""
+        return self._ask(_instant_power) / 1e3
+
+    def state(self) -> DeviceState:
+        """Return temperature, clocks and why it is slowed down."""
+        degrees = _number(
+            pynvml.nvmlDeviceGetTemperature, self._handle, pynvml.NVML_TEMPERATURE_GPU
+        )
+        clocks = {
+            name: _number(pynvml.nvmlDeviceGetClockInfo, self._handle, kind)
+            for name, kind in _CLOCKS.items()
+        }
+        mask = _number(pynvml.nvmlDeviceGetCurrentClocksEventReasons, self._handle)
+        slowed = tuple(
+            words
+            for bit, words in _SLOWED.items()
+            if mask is not None and int(mask) & getattr(pynvml, bit)
+        )
+        told = {name: mhz for name, mhz in clocks.items() if mhz is not None}
+        return DeviceState(degrees, told, slowed)
+
+    def close(self) -> None:
+        """Leave NVML."""
+        pynvml.nvmlShutdown()
+
+    def _ask(self, question: Callable[[Any], int]) -> int:
+        found = _answer(question, self._handle)
+        if isinstance(found, str):
+            raise EnergyError(f"{self.counter} of {self.device}: {found}")
+        return found
+
+
+def _answer(question: Callable[[Any], T], handle: Any) -> T | str:
+    """Return what NVML answers, or its error in words."""
+    try:
+        return question(handle)
+    except pynvml.NVMLError as error:
+        return str(error)
+
+
+def _number(question: Callable[..., int], *arguments: Any) -> float | None:
+    """Return what NVML answers; None where it does not."""
+    try:
+        return float(question(*arguments))
+    except pynvml.NVMLError:
+        return None
+
+
+def _instant_power(handle: Any) -> int:
+    """Return milliwatts now; nvmlDeviceGetPowerUsage averages over a second."""
+    (found,) = pynvml.nvmlDeviceGetFieldValues(
+        handle, [pynvml.NVML_FI_DEV_POWER_INSTANT]
+    )
+    if found.nvmlReturn != pynvml.NVML_SUCCESS:
+        raise pynvml.NVMLError(found.nvmlReturn)
+    return int(found.value.uiVal)
+
+
+def _name(handle: Any) -> str:
+    name = _answer(pynvml.nvmlDeviceGetName, handle)
+    return name.decode() if isinstance(name, bytes) else str(name)

@@ -1,0 +1,87 @@
+"""Power that is read again and again, and its integral."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from threading import Event, Thread
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.reader import Reader
+
+Floats = npt.NDArray[np.float64]
+
+SAMPLED_S = 0.02
+"""Power is read so often: five times within a usual step of 0.1 s."""
+_FEWEST = 20
+"""Samples of a window; with fewer, its integral tells nothing of it."""
+
+
+class PowerSamples:
+    """What a reader says of its power, with the time.
+
+    Args:
+        reader: Tells its power.
+        clock: Seconds.
+    """
+
+    def __init__(self, reader: Reader, clock: Callable[[], float]) -> None:
+        self._reader, self._clock = reader, clock
+        self._taken = list[tuple[float, float]]()
+
+    def add(self) -> None:
+        """Read the power once."""
+        self._taken.append((self._clock(), self._reader.watts()))
+
+    def joules(self, begin_s: float, end_s: float) -> float:
+        """Return the energy from one time to another.
+
+        Raises:
+            EnergyError: The power was read too seldom between them.
+        """
+        times, watts = np.array(self._taken or [(0.0, 0.0)]).T
+        count = int(np.sum((times >= begin_s) & (times <= end_s)))
+        if count < _FEWEST:
+            raise EnergyError(
+                f"{self._reader.counter} of {self._reader.device}: power was read"
+                f" {count} times in {end_s - begin_s:.1f} s, at least {_FEWEST} are"
+                " needed"
+            )
+        so_far = integrated(times, watts)
+        return float(
+            np.interp(end_s, times, so_far) - np.interp(begin_s, times, so_far)
+        )
+
+
+def integrated(times_s: Floats, watts: Floats) -> Floats:
+    """Return the joules since the first time, by trapezoids, one a time."""
+    steps = np.diff(times_s) * (watts[1:] + watts[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+@contextlib.contextmanager
+def in_background(period_s: float, call: Callable[[], None]) -> Iterator[None]:
+    """Call something every so many seconds while the context is open, in a thread.
+
+    Raises:
+        EnergyError: The call did, when the context is left.
+    """
+    done, failed = Event(), list[EnergyError]()
+
+    def repeat() -> None:
+        while not done.wait(period_s) and not failed:
+            try:
+                call()
+            except EnergyError as error:
+                failed.append(error)
+
+    thread = Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+    if failed:
+        raise failed[0]

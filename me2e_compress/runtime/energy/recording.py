@@ -1,0 +1,104 @@
+"""Energy or power over time beside the frames that were done, and windows cut of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.estimate import FEWEST_WINDOWS, Window
+from me2e_compress.runtime.energy.result import EnergyResult
+from me2e_compress.runtime.energy.schedule import EnergySchedule
+from me2e_compress.runtime.energy.summary import CountedBy, summarise
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyRecording:
+    """What a device counted while one model ran on it.
+
+    Attributes:
+        times_s: Ascending, seconds.
+        joules: Since some moment, one a time.
+        frames: Inferences done, one a time; where it stands, the device is idle.
+        device: Its name.
+        scope: What was counted.
+        counter: What counted.
+    """
+
+    times_s: Floats
+    joules: Floats
+    frames: Floats
+    device: str
+    scope: str
+    counter: str
+
+    def measured(self, schedule: EnergySchedule) -> EnergyResult:
+        """Return the energy of the model that ran.
+
+        Raises:
+            EnergyError: The recording is too short, or its counter stands still.
+        """
+        by = CountedBy(self.counter, self.device, self.scope, self.step_s())
+        return summarise(self.windows(schedule), by, self.idle_w(schedule))
+
+    def windows(self, schedule: EnergySchedule) -> list[Window]:
+        """Cut windows out of the work, after the warm-up, one behind the other.
+
+        Raises:
+            EnergyError: The recording is too short, or its counter stands still.
+        """
+        working = np.flatnonzero(np.diff(self.frames) > 0)
+        if not len(working):
+            raise EnergyError("energy recording: no frame is done in it")
+        first, last = int(working[0]), int(working[-1]) + 1
+        start = self.times_s[first] + schedule.warm_up_s
+        at = int(np.searchsorted(self.times_s, start))
+        found = list[Window]()
+        while at < last:
+            end = self._end(at, last, schedule)
+            if end is None:
+                break
+            found.append(self._window(at, end))
+            at = end
+        if len(found) < FEWEST_WINDOWS:
+            raise EnergyError(
+                f"energy recording: {len(found)} windows of {schedule.window_s:g} s and"
+                f" {schedule.window_frames} frames after a warm-up of"
+                f" {schedule.warm_up_s:g} s: at least {FEWEST_WINDOWS} are needed"
+            )
+        return found
+
+    def idle_w(self, schedule: EnergySchedule) -> float | None:
+        """Return the watts before and behind the work; None where that is too short."""
+        working = np.flatnonzero(np.diff(self.frames) > 0)
+        ends = ((0, int(working[0])), (int(working[-1]) + 1, len(self.times_s) - 1))
+        idle = [
+            self._window(begin, end)
+            for begin, end in ends
+            if self.times_s[end] - self.times_s[begin] >= schedule.idle_s
+        ]
+        return sum(each.watts for each in idle) / len(idle) if idle else None
+
+    def step_s(self) -> float:
+        """Return the seconds from one row to the next: the median."""
+        return float(np.median(np.diff(self.times_s)))
+
+    def _end(self, at: int, last: int, schedule: EnergySchedule) -> int | None:
+        """Return the row that ends the window which begins at one; None: too late."""
+        long = int(np.searchsorted(self.times_s, self.times_s[at] + schedule.window_s))
+        many = self.frames[at] + schedule.window_frames
+        end = max(long, int(np.searchsorted(self.frames, many)))
+        return end if end <= last else None
+
+    def _window(self, begin: int, end: int) -> Window:
+        joules = float(self.joules[end] - self.joules[begin])
+        times = float(self.times_s[begin]), float(self.times_s[end])
+        if joules <= 0:
+            went = "stands still" if joules == 0 else "goes back"
+            raise EnergyError(
+                f"energy recording: the counter {went} from {times[0]:g} to"
+                f" {times[1]:g} s"
+            )
+        return Window(*times, int(self.frames[end] - self.frames[begin]), joules)

@@ -1,0 +1,83 @@
+"""From windows of a counter to the result that is written."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.runtime.energy.estimate import Window, estimate
+from me2e_compress.runtime.energy.reader import DeviceState
+from me2e_compress.runtime.energy.result import EnergyResult
+
+
+@dataclass(frozen=True)
+class CountedBy:
+    """What counted, in words.
+
+    Attributes:
+        counter: ``nvml-total``, ``rapl``, ...
+        device: Its name.
+        scope: What is counted.
+        step_s: From one value to the next.
+    """
+
+    counter: str
+    device: str
+    scope: str
+    step_s: float
+
+
+def summarise(
+    windows: Sequence[Window],
+    by: CountedBy,
+    idle_w: float | None,
+    *,
+    states: Sequence[DeviceState] = (),
+    power_j_per_frame: float | None = None,
+    warnings: tuple[str, ...] = (),
+) -> EnergyResult:
+    """Return the result of one model.
+
+    Args:
+        windows: Of its frames.
+        by: What counted.
+        idle_w: Watts of the idle device; None: not measured.
+        states: Of the device, before and after each window.
+        power_j_per_frame: By integrated power, beside the counter.
+        warnings: What puts the figure in doubt.
+
+    Raises:
+        EnergyError: Too few windows.
+    """
+    found = estimate(windows, by.step_s, idle_w)
+    frames = sum(each.frames for each in windows)
+    frame_s = sum(each.taken_s - each.paused_s for each in windows) / frames
+    warmth = [e.temperature_c for e in states if e.temperature_c is not None]
+    clocks: dict[str, list[float]] = {}
+    for state in states:
+        for name, mhz in state.clocks_mhz.items():
+            clocks.setdefault(name, []).append(mhz)
+    throttled = dict.fromkeys(reason for each in states for reason in each.throttled)
+    return EnergyResult(
+        joules=sum(each.joules for each in windows),
+        frames=frames,
+        j_per_frame=found.j_per_frame,
+        net_j_per_frame=None
+        if idle_w is None
+        else found.j_per_frame - idle_w * frame_s,
+        low=found.low,
+        high=found.high,
+        windows=len(windows),
+        window_s=float(np.mean([each.taken_s for each in windows])),
+        counter=by.counter,
+        counter_step_s=by.step_s,
+        idle_w=idle_w,
+        temperature=(warmth[0], warmth[-1]) if warmth else None,
+        clocks={name: (min(seen), max(seen)) for name, seen in clocks.items()},
+        throttled=tuple(throttled),
+        device=by.device,
+        scope=by.scope,
+        window_j_per_frame=tuple(each.joules / each.frames for each in windows),
+        power_j_per_frame=power_j_per_frame,
+        warnings=warnings,
+    )

@@ -1,0 +1,280 @@
+"""Counters are found by asking them: they answer in joules, or say why not."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pynvml
+import pytest
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.counter import ENERGY_COUNTERS, open_counter
+from me2e_compress.runtime.energy.ina3221 import Ina3221, counted
+from me2e_compress.runtime.energy.nvml import Nvml
+from me2e_compress.runtime.energy.rapl import Rapl
+from me2e_compress.runtime.energy.reader import Absent, Reader
+
+RANGE = 1_000_000
+
+
+def answered(found: object) -> Reader:
+    assert isinstance(found, Reader)
+    return found
+
+
+def reason(found: object) -> str:
+    assert isinstance(found, Absent)
+    return found.reason
+
+
+def zone(root: Path, folder: str, name: str, energy: str = "0") -> Path:
+    place = root / folder
+    place.mkdir(parents=True)
+    (place / "name").write_text(f"{name}\n")
+    (place / "energy_uj").write_text(energy)
+    (place / "max_energy_range_uj").write_text(str(RANGE))
+    return place / "energy_uj"
+
+
+def test_packages_and_memory_are_added_up_and_parts_are_not(tmp_path: Path) -> None:
+    zones = [
+        zone(tmp_path, "intel-rapl:0", "package-0"),
+        zone(tmp_path, "intel-rapl:1", "package-1"),
+        zone(tmp_path, "intel-rapl:0:2", "dram"),
+        zone(tmp_path, "intel-rapl:0:0", "core"),
+        zone(tmp_path, "intel-rapl:2", "psys"),
+        zone(tmp_path, "intel-rapl-mmio:0", "package-0"),
+    ]
+    reader = answered(Rapl(tmp_path).open())
+    for each in zones:
+        each.write_text("100000")
+
+    assert reader.joules() == pytest.approx(0.3)
+    assert reader.scope == "package-0 + dram + package-1"
+
+
+def test_a_range_that_is_passed_is_no_step_back(tmp_path: Path) -> None:
+    energy = zone(tmp_path, "intel-rapl:0", "package-0", str(RANGE - 1000))
+    reader = answered(Rapl(tmp_path).open())
+    energy.write_text("2000")
+
+    assert reader.joules() == pytest.approx(3000e-6)
+
+
+def test_a_step_back_is_no_range_that_is_passed(tmp_path: Path) -> None:
+    energy = zone(tmp_path, "intel-rapl:0", "package-0", "500000")
+    reader = answered(Rapl(tmp_path).open())
+    energy.write_text("400000")
+
+    with pytest.raises(EnergyError, match="rapl package-0 went back from 500000"):
+        reader.joules()
+
+
+def test_a_counter_that_vanishes_is_an_error(tmp_path: Path) -> None:
+    energy = zone(tmp_path, "intel-rapl:0", "package-0")
+    reader = answered(Rapl(tmp_path).open())
+    energy.unlink()
+
+    with pytest.raises(EnergyError, match=r"rapl package-0: .*energy_uj"):
+        reader.joules()
+
+
+def test_what_may_not_be_read_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    energy = zone(tmp_path, "intel-rapl:0", "package-0")
+    read = Path.read_text
+
+    def refused(path: Path, *args: str) -> str:
+        if path == energy:  # root may read it whatever its mode
+            raise PermissionError(13, "Permission denied", str(path))
+        return read(path, *args)
+
+    monkeypatch.setattr(Path, "read_text", refused)
+
+    found = reason(Rapl(tmp_path).open())
+    assert f"{energy} may not be read: permission denied" in found
+
+
+@pytest.mark.parametrize(
+    ("folder", "name", "says"),
+    [("intel-rapl:0", "psys", "no package in"), ("dtpm", "dtpm", "no package in")],
+)
+def test_no_package(folder: str, name: str, says: str, tmp_path: Path) -> None:
+    zone(tmp_path, folder, name)
+
+    assert says in reason(Rapl(tmp_path).open())
+
+
+def jetson(root: Path, rails: dict[str, tuple[int, int]]) -> Path:
+    sensor = root / "ina3221" / "1-0040" / "hwmon" / "hwmon3"
+    sensor.mkdir(parents=True)
+    for number, (label, (millivolts, milliamperes)) in enumerate(rails.items(), 1):
+        (sensor / f"in{number}_label").write_text(f"{label}\n")
+        (sensor / f"in{number}_input").write_text(str(millivolts))
+        (sensor / f"curr{number}_input").write_text(str(milliamperes))
+    (sensor / "samples").write_text("64")
+    (sensor / "update_interval").write_text("20")
+    return sensor
+
+
+def test_the_input_rail_is_not_added_to_its_children(tmp_path: Path) -> None:
+    rails = {"VDD_IN": (5000, 2000), "VDD_CPU_GPU_CV": (5000, 900), "VDD_SOC": (1, 1)}
+    jetson(tmp_path, rails)
+    reader = answered(Ina3221(root=tmp_path).open())
+
+    assert reader.watts() == pytest.approx(10.0)
+    assert reader.scope == "VDD_IN (samples 64, update_interval 20)"
+    assert reader.step_s == pytest.approx(0.02)
+    assert not reader.counts
+
+
+def test_rails_without_an_input_are_added_up_once(tmp_path: Path) -> None:
+    rails = {"VDD_GPU_SOC": (5000, 2000), "NC": (5000, 900), "VIN_SYS_5V0": (5000, 1)}
+    jetson(tmp_path, rails)
+
+    assert answered(Ina3221(root=tmp_path).open()).watts() == pytest.approx(10.005)
+    orin = ["VDD_GPU_SOC", "VDD_CPU_CV", "VIN_SYS_5V0", "VDDQ_VDD2_1V8AO"]
+    assert counted(orin) == orin[:3]
+
+
+def test_rails_may_be_named(tmp_path: Path) -> None:
+    jetson(tmp_path, {"VDD_IN": (5000, 2000), "VDD_SOC": (5000, 100)})
+    named = Ina3221(("VDD_SOC",), tmp_path)
+
+    assert answered(named.open()).watts() == pytest.approx(0.5)
+    assert reason(Ina3221(("GPU",), tmp_path).open()) == (
+        "no rail GPU; there are VDD_IN, VDD_SOC"
+    )
+
+
+def test_a_rail_that_says_nothing_is_the_answer(tmp_path: Path) -> None:
+    sensor = jetson(tmp_path, {"VDD_IN": (5000, 2000)})
+    (sensor / "curr1_input").write_text("")
+
+    assert "invalid literal" in reason(Ina3221(root=tmp_path).open())
+
+
+class Driver:
+    """What NVML says, call by call; an error code where it does not."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **says: int) -> None:
+        self.says, self.shut = {"energy": 5_000, "power": 250_000, **says}, 0
+        calls = {
+            "nvmlInit": lambda: self.answer("init"),
+            "nvmlShutdown": self.shutdown,
+            "nvmlDeviceGetHandleByIndex": lambda index: self.answer("gpu", index),
+            "nvmlDeviceGetName": lambda handle: "A GPU",
+            "nvmlDeviceGetTotalEnergyConsumption": lambda handle: self.answer("energy"),
+            "nvmlDeviceGetFieldValues": lambda handle, fields: [self.field()],
+            "nvmlDeviceGetTemperature": lambda handle, sensor: 61,
+            "nvmlDeviceGetClockInfo": lambda handle, kind: self.answer("clock", 1_700),
+            "nvmlDeviceGetCurrentClocksEventReasons": lambda handle: self.answer(
+                "slow"
+            ),
+        }
+        for name, call in calls.items():
+            monkeypatch.setattr(pynvml, name, call)
+
+    def shutdown(self) -> None:
+        self.shut += 1
+
+    def answer(self, what: str, usual: int = 0) -> int:
+        found = self.says.get(what, usual)
+        if found < 0:
+            raise pynvml.NVMLError(-found)
+        return found
+
+    def field(self) -> SimpleNamespace:
+        power = self.says["power"]
+        code, milliwatts = (-power, 0) if power < 0 else (0, power)
+        return SimpleNamespace(nvmlReturn=code, value=SimpleNamespace(uiVal=milliwatts))
+
+
+UNSUPPORTED = -pynvml.NVML_ERROR_NOT_SUPPORTED
+
+
+def test_a_board_counts_and_tells_its_power(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = Driver(monkeypatch, slow=pynvml.nvmlClocksEventReasonSwPowerCap)
+    reader = answered(Nvml().open())
+
+    assert (reader.counter, reader.device) == ("nvml-total", "A GPU")
+    assert (reader.joules(), reader.watts()) == (5.0, 250.0)
+    assert reader.state().temperature_c == 61
+    assert reader.state().clocks_mhz == {"sm": 1_700, "memory": 1_700}
+    assert reader.state().throttled == ("power cap",)
+    reader.close()
+    assert driver.shut == 1
+
+
+def test_a_card_without_a_counter_has_its_power_integrated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    Driver(monkeypatch, energy=UNSUPPORTED)
+    reader = answered(Nvml().open())
+
+    assert (reader.counter, reader.counts) == ("nvml-power-integrated", False)
+
+
+def test_a_counter_without_power_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    Driver(monkeypatch, power=UNSUPPORTED, clock=UNSUPPORTED, slow=UNSUPPORTED)
+    reader = answered(Nvml().open())
+
+    assert (reader.counts, reader.tells_power) == (True, False)
+    assert reader.state().clocks_mhz == {}
+
+
+def test_a_driver_that_answers_and_supports_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driver = Driver(monkeypatch, energy=UNSUPPORTED, power=UNSUPPORTED)
+
+    assert reason(Nvml().open()) == (
+        "A GPU tells no energy: total energy: Not Supported;"
+        " instant power: Not Supported"
+    )
+    assert driver.shut == 1
+
+
+@pytest.mark.parametrize("what", ["init", "gpu"])
+def test_no_driver_or_no_such_gpu(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    Driver(monkeypatch, **{what: -pynvml.NVML_ERROR_NOT_FOUND})
+
+    assert "Not Found" in reason(Nvml(1).open())
+
+
+def test_a_gpu_that_is_lost_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = Driver(monkeypatch)
+    reader = answered(Nvml().open())
+    driver.says["energy"] = -pynvml.NVML_ERROR_GPU_IS_LOST
+
+    with pytest.raises(EnergyError, match="nvml-total of A GPU: GPU is lost"):
+        reader.joules()
+
+
+def test_no_counter_lists_what_each_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    Driver(monkeypatch, init=-pynvml.NVML_ERROR_LIBRARY_NOT_FOUND)
+    monkeypatch.setattr(Path, "is_dir", lambda path: False)
+    monkeypatch.setattr(Path, "glob", lambda path, pattern: iter(()))
+
+    assert reason(open_counter()) == (
+        "no energy counter answers (nvml: NVML Shared Library Not Found; ina3221: no"
+        " /sys/bus/i2c/drivers/ina3221; rapl: no /sys/class/powercap)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("watts", "no energy counter 'watts'; there are auto, nvml, ina3221, rapl"),
+        ("nvml:-1", "nvml: index -1"),
+        ("rapl{size=1}", "rapl has no option 'size'"),
+        ("recorded", "recorded needs the option file"),
+    ],
+)
+def test_a_counter_that_is_none(text: str, fault: str) -> None:
+    with pytest.raises(EnergyError, match=fault):
+        open_counter(text)
+
+
+def test_every_counter_of_ours_loads() -> None:
+    assert ENERGY_COUNTERS.usable() == ("nvml", "ina3221", "rapl", "recorded")

@@ -1,0 +1,147 @@
+"""The meter finds what a device takes, in turn, and refuses a counter that fails."""
+
+from itertools import groupby
+
+import pytest
+
+from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.meter import EnergyMeter
+from me2e_compress.runtime.energy.result import EnergyResult
+from me2e_compress.runtime.energy.schedule import EnergySchedule
+from tests.runtime.energy.world import World
+
+SCHEDULE = EnergySchedule(
+    warm_up_s=2, window_s=2, window_frames=10, windows=6, idle_s=2
+)
+
+
+def meter(world: World, schedule: EnergySchedule = SCHEDULE) -> EnergyMeter:
+    return EnergyMeter(
+        world, schedule, clock=world.clock, sleep=world.sleep, every=world.every
+    )
+
+
+def measured(world: World, frame_s: float = 0.03, watts: float = 300) -> EnergyResult:
+    return meter(world).measure({"m": world.model("m", frame_s, watts)})["m"]
+
+
+def test_joules_a_frame_gross_and_net() -> None:
+    found = measured(World())
+
+    assert found.low is not None
+    assert found.high is not None
+    assert found.low <= 9.0 <= found.high
+    assert found.j_per_frame == pytest.approx(9.0, rel=0.03)
+    assert found.net_j_per_frame == pytest.approx(7.5, rel=0.05)
+    assert found.idle_w == pytest.approx(50, rel=0.1)
+
+
+def test_the_windows_are_as_the_schedule_says() -> None:
+    found = measured(World())
+
+    assert (found.windows, found.frames) == (6, 6 * 67)
+    assert found.window_s == pytest.approx(2.01, abs=0.02)
+    assert found.counter_step_s == pytest.approx(0.1, rel=0.05)
+
+
+def test_the_device_is_described() -> None:
+    found = measured(World())
+
+    assert (found.counter, found.device, found.scope) == (
+        "simulated",
+        "a device",
+        "board",
+    )
+    assert found.temperature is not None
+    assert found.temperature[0] < found.temperature[1]
+    assert found.clocks["sm"][0] < found.clocks["sm"][1]
+
+
+def test_models_take_turns_there_and_back() -> None:
+    world = World()
+    found = meter(world).measure(
+        {"a": world.model("a", 0.03, 300), "b": world.model("b", 0.04, 100)}
+    )
+
+    after = [name for name, at in world.worked if at > 6.5]  # idle and warm-up
+    assert "".join(name for name, _ in groupby(after)) == "abababa"
+    assert found["a"].j_per_frame == pytest.approx(9.0, rel=0.03)
+    assert found["b"].j_per_frame == pytest.approx(4.0, rel=0.03)
+
+
+def test_power_alone_is_integrated() -> None:
+    world = World(tells_power=True)
+    world.counts = False
+
+    assert measured(world).j_per_frame == pytest.approx(9.0, rel=0.01)
+    assert world.readings == 0
+
+
+@pytest.mark.parametrize(("factor", "alerts"), [(1.0, 0), (1.2, 1)])
+def test_power_stands_beside_the_counter(factor: float, alerts: int) -> None:
+    world = World(tells_power=True)
+    world.power_factor = factor
+    found = measured(world)
+
+    assert found.power_j_per_frame == pytest.approx(9.0 * factor, rel=0.01)
+    assert len(found.alerts()) == alerts
+
+
+def test_power_that_cannot_be_read_often_enough_is_an_error() -> None:
+    world = World(tells_power=True)
+    world.counts = False
+    slow = EnergyMeter(
+        world,
+        SCHEDULE,
+        clock=world.clock,
+        sleep=world.sleep,
+        every=lambda period, call: world.every(10 * period, call),
+    )
+
+    with pytest.raises(EnergyError, match="power was read 10 times"):
+        slow.measure({"m": world.model("m", 0.03, 300)})
+
+
+def test_frames_that_keep_step_with_the_counter_are_held_up() -> None:
+    world = World()
+    found = measured(world, frame_s=0.1)
+
+    assert found.window_s == pytest.approx(2.1)
+    assert found.j_per_frame == pytest.approx(30.0, rel=0.02)
+    assert found.warnings == ()
+
+
+def test_a_counter_that_stands_still_is_an_error() -> None:
+    world = World()
+    world.joules = lambda: 7.0  # type: ignore[method-assign]
+
+    with pytest.raises(EnergyError, match="simulated of a device stands still at 7 J"):
+        measured(world)
+
+
+@pytest.mark.parametrize("step_s", [None, 0.1])
+def test_a_counter_that_goes_back_is_an_error(step_s: float | None) -> None:
+    world = World()
+    world.step_s = step_s
+    world.joules = lambda: 900.0 - world.now  # type: ignore[method-assign]
+
+    with pytest.raises(EnergyError, match="simulated of a device went back from"):
+        measured(world)
+
+
+def test_the_seed_decides_the_phases() -> None:
+    assert measured(World()) == measured(World())
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"windows": 4}, "4 windows: at least 5"),
+        ({"window_s": 0.0}, "window_s 0 is not a positive number"),
+        ({"warm_up_s": float("nan")}, "warm_up_s nan"),
+        ({"seed": -1}, "seed -1"),
+    ],
+)
+def test_a_schedule_that_cannot_be(change: dict[str, float], fault: str) -> None:
+    with pytest.raises(EnergyError, match=fault):
+        EnergySchedule(**change)  # type: ignore[arg-type]
