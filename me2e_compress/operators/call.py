@@ -235,6 +235,16 @@ def names_in(where: ir.Graph | ir.Function) -> set[str]:
     return {*values, *(value.name or "" for value in where.inputs)}
 
 
+def _typed(value: ir.Value) -> bool:
+    """Give a constant type and shape: of a Constant node, files record neither."""
+    known = array_of(value)
+    if known is None:
+        return False
+    value.type = ir.TensorType(ir.DataType.from_numpy(known.dtype))
+    value.shape = ir.Shape(known.shape)
+    return True
+
+
 def _infer(node: ir.Node, opset: int) -> None:
     """Infer what a node gives, from the types of its operands and small constants."""
     if node.domain or not onnx.defs.has(node.op_type, opset, ""):
@@ -245,7 +255,7 @@ def _infer(node: ir.Node, opset: int) -> None:
     for value in node.inputs:
         if value is None or not value.name:
             continue
-        if value.type is None:
+        if value.type is None and not _typed(value):
             return  # what the operands are of decides what the result is of
         info = ir.to_proto(value)
         types[value.name] = info.type
