@@ -3,6 +3,7 @@
 * ``resnet50``: a classifier, 224 x 224.
 * ``bev-head``: see :mod:`benchmarks.bev_head`.
 * ``vad-tiny``: the reference stack.
+* ``highway``: the driver that ships; its frames need the extra ``highway``.
 * the models of :mod:`benchmarks.model_kinds`, which need the extra ``models``.
 
 The model in the folder is what ``quantize-int8`` sees: the exact passes are done.
@@ -18,12 +19,14 @@ from benchmarks import bev_head, resnet50
 from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.zoo.export import export
 
 __all__ = ["SUBJECTS", "Subject", "at", "make"]
 
-SUBJECTS = ("resnet50", "bev-head", "vad-tiny")
+SUBJECTS = ("resnet50", "bev-head", "vad-tiny", "highway")
+PRESETS = {"vad-tiny": "vad", "highway": "highway"}
+"""Module maps of the stacks of the zoo."""
 WHOLE = """
 [modules.network]
 role = "feature"
@@ -61,11 +64,10 @@ def _make_kind(subject: Subject) -> Subject:
 
 
 def _export(subject: Subject) -> None:
-    if subject.name == "vad-tiny":
-        export(subject.name, subject.source)
-        text = (Path(graph.__file__).parents[1] / "modules/presets/vad.toml").read_text(
-            encoding="utf-8"
-        )
+    if subject.name in PRESETS:
+        export_stack(subject.name, subject.source)
+        preset = f"modules/presets/{PRESETS[subject.name]}.toml"
+        text = (Path(graph.__file__).parents[1] / preset).read_text("utf-8")
     else:
         maker = {"resnet50": resnet50, "bev-head": bev_head}[subject.name]
         maker.export(subject.source)
@@ -76,7 +78,7 @@ def _export(subject: Subject) -> None:
 
 
 def _record(name: str, folder: Path, count: int, seed: int) -> None:
-    if name == "vad-tiny":
+    if name in PRESETS:
         record_frames(name, folder, FramesOptions(count, seed, SCENE))
     elif name == "bev-head":
         bev_head.record(folder, count, seed)
