@@ -8,7 +8,7 @@ agent returned.
 
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from pathlib import Path
@@ -135,9 +135,9 @@ class Leaderboard:
     """What runs an agent for a number of ticks."""
 
     world: World = field(default_factory=World)
-    acted: list[VehicleControl] = field(default_factory=list)
     returned: list[VehicleControl] = field(default_factory=list)
     seen: list[tuple[float, float, float]] = field(default_factory=list)
+    noise: float = 0.125
 
     def make(self, module: ModuleType, config: str, route: Route = STRAIGHT_ON) -> Any:
         """Make an agent and set it up for a route."""
@@ -172,7 +172,7 @@ class Leaderboard:
             control = agent()
             self.seen.append((control.throttle, control.steer, control.brake))
             self.returned.append(control)
-            control.steer += 0.125  # ControlLoss
+            control.steer += self.noise  # ControlLoss
 
     def drive(
         self, module: ModuleType, config: str, ticks: int, route: Route = STRAIGHT_ON
@@ -258,7 +258,3 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Leaderboard:
 def written(path: Path, text: str) -> Path:
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def fields(control: VehicleControl) -> Iterator[object]:
-    return iter(vars(control).values())

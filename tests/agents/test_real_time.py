@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.agents import real_time
@@ -71,6 +71,7 @@ def seen_as(decision: int) -> tuple[float, float, float]:
     st.lists(st.integers(0, 400_000), min_size=24, max_size=24),
     st.sampled_from(LatencyModel),
 )
+@settings(max_examples=25)
 def test_a_control_acts_when_the_evaluators_rule_says(
     latencies_us: list[int], model: LatencyModel
 ) -> None:

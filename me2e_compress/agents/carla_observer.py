@@ -1,0 +1,165 @@
+"""CARLA's sensors to an observation: the one way in for whatever a model sees.
+
+Raises:
+    MissingExtraError: On import, if OpenCV is not installed.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.agents.carla_interface import SensorData
+from me2e_compress.agents.carla_rig import GPS, IMU, SPEED, CarlaRig, Triple
+from me2e_compress.agents.geo_reference import GeoReference
+from me2e_compress.agents.route_follower import RouteFollower
+from me2e_compress.driving.can_bus import EgoMotion, can_bus_between
+from me2e_compress.driving.contract import Observation
+from me2e_compress.errors import MissingExtraError
+
+if find_spec("cv2") is None:
+    raise MissingExtraError("cv2", "highway")
+
+import cv2
+
+Images = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class CarlaReading:
+    """What the cheap sensors say at one tick, in a right-handed world.
+
+    Args:
+        motion: Of the ego.
+        command: Where the route goes next, 0 to 5.
+        node: The next node of the route, metres to the right and forward.
+    """
+
+    motion: EgoMotion
+    command: int
+    node: tuple[float, float]
+
+
+class Preprocessing(Protocol):
+    """Makes an observation of one tick that decides.
+
+    What another stack needs besides (lidar, a history, a map) is made here and here
+    alone: an agent asks nothing else.
+    """
+
+    def observe(
+        self, sensors: SensorData, reading: CarlaReading, time_us: int
+    ) -> Observation:
+        """Return what the policy gets.
+
+        Args:
+            sensors: All of the tick's data.
+            reading: What the cheap ones say.
+            time_us: Simulated time since the route began, microseconds.
+        """
+        ...
+
+
+class RouteReader:
+    """Reads the cheap sensors at every tick, and follows the route with them.
+
+    Args:
+        gps_plan: The leaderboard's plan: ({"lat", "lon"}, RoadOption) by node.
+        world_plan: The same nodes: (transform, RoadOption).
+    """
+
+    def __init__(
+        self, gps_plan: Sequence[tuple[Any, Any]], world_plan: Sequence[tuple[Any, Any]]
+    ) -> None:
+        places = [(at.location.x, -at.location.y, option) for at, option in world_plan]
+        first = gps_plan[0][0]
+        self._geo = GeoReference.through(first["lat"], first["lon"], *places[0][:2])
+        self._follower = RouteFollower(places)
+
+    def read(self, sensors: SensorData) -> CarlaReading:
+        """Return what GPS, IMU and speedometer say at one tick."""
+        latitude, longitude, *_ = sensors[GPS][1]
+        x, y = self._geo.metres(latitude, longitude)
+        imu = [float(value) for value in sensors[IMU][1]]
+        if math.isnan(imu[6]):  # as it is in the first frames
+            imu = [0.0] * 7
+        # the compass turns clockwise from north
+        heading = math.pi / 2 - imu[6]
+        forward, right, up = imu[:3]
+        motion = EgoMotion(
+            x,
+            y,
+            heading,
+            float(sensors[SPEED][1]["speed"]),
+            (forward, -right, up),
+            # Bench2Drive's agents turn all three round
+            (-imu[3], -imu[4], -imu[5]),
+        )
+        place, command = self._follower.next(x, y)
+        east, north = place - (x, y)
+        sin, cos = math.sin(heading), math.cos(heading)
+        node = (east * sin - north * cos, east * cos + north * sin)
+        return CarlaReading(motion, command, node)
+
+
+@dataclass
+class CarlaObserver:
+    """Makes observations as the contract has them, of six cameras.
+
+    Args:
+        rig: How the cameras see.
+        with_images: Whether the model takes images.
+        origin_m: Of the model's ground frame, in the ego frame.
+        jpeg_quality: Every image is written and read as a JPEG of this quality, as
+            Bench2Drive's agents do to match their training data; 0 leaves it as it is.
+        fill: Colour of what is padded, R, G, B.
+    """
+
+    rig: CarlaRig
+    with_images: bool
+    origin_m: Triple
+    jpeg_quality: int
+    fill: tuple[int, ...] = (0, 0, 0)
+    _last: EgoMotion | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        """Compute the projection, which never changes."""
+        self._lidar2img = self.rig.lidar2img(self.origin_m)
+
+    def observe(
+        self, sensors: SensorData, reading: CarlaReading, time_us: int
+    ) -> Observation:
+        """Return the observation; the CAN bus counts from the one before."""
+        can_bus = can_bus_between(reading.motion, self._last)
+        self._last = reading.motion
+        return Observation(
+            time_us,
+            self._images(sensors) if self.with_images else None,
+            self._lidar2img,
+            can_bus,
+            reading.command,
+            reading.motion.speed_mps,
+        )
+
+    def _images(self, sensors: SensorData) -> Images:
+        ids = [camera.id for camera in self.rig.cameras]
+        return np.stack([self._taken(sensors[each][1]) for each in ids])
+
+    def _taken(self, bgra: Images) -> Images:
+        """Return one picture, BGRA [rows, columns, 4], as RGB of the model's size."""
+        picture = np.asarray(cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGB))
+        if self.jpeg_quality:
+            # red and blue swapped, as in those agents: chroma is what it costs
+            quality = (cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality)
+            _, content = cv2.imencode(".jpg", picture, quality)
+            picture = np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR))
+        columns, rows = (round(side * self.rig.scale) for side in self.rig.rendered)
+        smaller = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        taken = np.empty((*self.rig.taken, 3), np.uint8)
+        taken[:] = self.fill
+        taken[:rows, :columns] = smaller
+        return taken

@@ -1,0 +1,127 @@
+"""Sensors as Bench2Drive's VAD and UniAD agents mount them, and how cameras project.
+
+CARLA is left-handed: y to the right, yaw clockwise. Angles and places are turned once,
+here, into the ego frame of the contract: x forward, y left, its origin on the ground
+under the centre of the ego.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from me2e_compress.agents.carla_interface import SensorSpecs
+
+Triple = tuple[float, float, float]
+
+IMU, GPS, SPEED = "IMU", "GPS", "SPEED"
+BEHIND_M = -1.4
+"""Where those agents mount IMU and GPS: x of CARLA, on the ground."""
+
+
+class CarlaCamera(BaseModel):
+    """A level pinhole camera, in CARLA's own terms.
+
+    Attributes:
+        id: What the leaderboard calls it.
+        x: Metres forward of the vehicle's centre.
+        y: Metres to the right.
+        z: Metres above the ground.
+        yaw: Degrees, clockwise from straight ahead.
+        fov: Horizontal field of view, degrees.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    id: str
+    x: float
+    y: float
+    z: float = 1.6
+    yaw: float
+    fov: float = Field(default=70.0, gt=0.0, lt=180.0)
+
+
+BENCH2DRIVE_CAMERAS = (
+    CarlaCamera(id="CAM_FRONT", x=0.80, y=0.0, yaw=0.0),
+    CarlaCamera(id="CAM_FRONT_LEFT", x=0.27, y=-0.55, yaw=-55.0),
+    CarlaCamera(id="CAM_FRONT_RIGHT", x=0.27, y=0.55, yaw=55.0),
+    CarlaCamera(id="CAM_BACK", x=-2.0, y=0.0, yaw=180.0, fov=110.0),
+    CarlaCamera(id="CAM_BACK_LEFT", x=-0.32, y=-0.55, yaw=-110.0),
+    CarlaCamera(id="CAM_BACK_RIGHT", x=-0.32, y=0.55, yaw=110.0),
+)
+"""Bench2DriveZoo, team_code/vad_b2d_agent.py and uniad_b2d_agent.py, ``sensors``; in
+the contract's order."""
+
+
+@dataclass(frozen=True, eq=False)
+class CarlaRig:
+    """Six cameras as CARLA renders them and as a model takes them.
+
+    A picture is scaled as a whole, as large as the model's allows, and stands at the
+    upper left of it: 1600 x 900 at 0.4 in 384 rows of 640 leaves 24 rows below, as the
+    pipelines of VAD and UniAD pad.
+
+    Args:
+        cameras: In the contract's order.
+        rendered: Columns and rows of CARLA's pictures.
+        taken: Rows and columns of the model's.
+    """
+
+    cameras: tuple[CarlaCamera, ...]
+    rendered: tuple[int, int]
+    taken: tuple[int, int]
+
+    @property
+    def scale(self) -> float:
+        """Of a picture, from CARLA's to the model's pixels."""
+        (columns, rows), (high, wide) = self.rendered, self.taken
+        return min(wide / columns, high / rows)
+
+    def specs(self, *, with_cameras: bool) -> SensorSpecs:
+        """List the sensors that an agent asks for: cameras, IMU, GPS, speedometer."""
+        columns, rows = self.rendered
+        mounted: SensorSpecs = [
+            {
+                "type": "sensor.camera.rgb",
+                **{"x": camera.x, "y": camera.y, "z": camera.z},
+                **{"roll": 0.0, "pitch": 0.0, "yaw": camera.yaw},
+                **{"width": columns, "height": rows, "fov": camera.fov},
+                "id": camera.id,
+            }
+            for camera in self.cameras
+        ]
+        level = {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}
+        behind = {"x": BEHIND_M, "y": 0.0, "z": 0.0, **level}
+        others: SensorSpecs = [
+            {"type": "sensor.other.imu", **behind, "id": IMU},
+            {"type": "sensor.other.gnss", **behind, "id": GPS},
+            {"type": "sensor.speedometer", "reading_frequency": 20, "id": SPEED},
+        ]
+        return [*mounted, *others] if with_cameras else others
+
+    def lidar2img(self, origin_m: Triple) -> npt.NDArray[np.float32]:
+        """Return [6, 4, 4]: a frame parallel to the ego's to the model's pixels.
+
+        Args:
+            origin_m: Of that frame, in the ego frame; zeros for the ego frame itself.
+        """
+        places = [self._projection(camera) for camera in self.cameras]
+        moved = np.eye(4)
+        moved[:3, 3] = origin_m
+        return np.asarray(np.stack(places) @ moved, np.float32)
+
+    def _projection(self, camera: CarlaCamera) -> npt.NDArray[np.float64]:
+        columns, rows = self.rendered
+        focal = columns / 2 / np.tan(np.deg2rad(camera.fov) / 2)
+        intrinsics = self.scale * np.array(
+            [[focal, 0, columns / 2], [0, focal, rows / 2], [0, 0, 1 / self.scale]]
+        )
+        yaw = -np.deg2rad(camera.yaw)
+        sin, cos = np.sin(yaw), np.cos(yaw)
+        # rows: the camera's right, down and forward in the ego frame
+        turn = np.array([[sin, -cos, 0.0], [0.0, 0.0, -1.0], [cos, sin, 0.0]])
+        matrix = np.eye(4)
+        matrix[:3, :3] = intrinsics @ turn
+        matrix[:3, 3] = -intrinsics @ turn @ (camera.x, -camera.y, camera.z)
+        return matrix

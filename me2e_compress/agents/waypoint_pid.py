@@ -1,0 +1,139 @@
+"""Waypoints to throttle, brake and steering, as Bench2Drive's VAD and UniAD agents do.
+
+Two PID controllers over sliding windows: one steers towards a waypoint some metres
+ahead, one presses the throttle towards the mean speed of the plan. The defaults are
+those of TCP (OpenDriveLab/TCP, TCP/config.py and model.py ``control_pid``), which
+Bench2DriveZoo's ``team_code/pid_controller.py`` repeats; forks tune them, so each is an
+option.
+"""
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from me2e_compress.driving.contract import PLAN_STEP_US
+
+STEPS_PER_S = 1e6 / PLAN_STEP_US
+
+Place = tuple[float, float]
+"""Metres to the right and forward."""
+
+
+class PidOptions(BaseModel):
+    """Gains and limits.
+
+    Attributes:
+        turn_kp: Of the angle to the aim, a quarter turn being 1.
+        turn_ki: Of its mean over the window.
+        turn_kd: Of its change since the last decision.
+        turn_window: Decisions; at 20 Hz, 40 are 2 s.
+        speed_kp: Of the speed that is missing, m/s.
+        speed_ki: Of its mean over the window.
+        speed_kd: Of its change since the last decision.
+        speed_window: Decisions.
+        max_throttle: Upper limit.
+        brake_speed_mps: A plan slower than this brakes.
+        brake_ratio: So does one that is this many times slower than the ego.
+        clip_delta_mps: The most missing speed that is looked at.
+        aim_m: The waypoint aimed at is that whose middle with the next is nearest to
+            this far away.
+        angle_threshold: The route's node takes the waypoint's place where its angle
+            and that of the plan's end differ by more, quarter turns,
+        node_within_m: and it is less far ahead than this; or where its angle is the
+            smaller one.
+        coast_above_mps: Faster than this the throttle is let go; UniAD's agent has 5,
+            VAD's no such limit.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=True)
+
+    turn_kp: float = 0.75
+    turn_ki: float = 0.75
+    turn_kd: float = 0.3
+    turn_window: int = Field(default=40, ge=2)
+    speed_kp: float = 5.0
+    speed_ki: float = 0.5
+    speed_kd: float = 1.0
+    speed_window: int = Field(default=40, ge=2)
+    max_throttle: float = 0.75
+    brake_speed_mps: float = 0.4
+    brake_ratio: float = 1.1
+    clip_delta_mps: float = 0.25
+    aim_m: float = 4.0
+    angle_threshold: float = 0.3
+    node_within_m: float = 10.0
+    coast_above_mps: float = math.inf
+
+
+class PedalsAndWheel(NamedTuple):
+    """Throttle and brake 0 to 1, steering -1 (left) to 1 (right)."""
+
+    throttle: float
+    steer: float
+    brake: float
+
+
+class WaypointPid:
+    """Follows one plan after the other; its windows count decisions, not seconds.
+
+    Args:
+        options: Gains and limits.
+    """
+
+    def __init__(self, options: PidOptions) -> None:
+        self.options = options
+        self._angles = deque([0.0] * options.turn_window, options.turn_window)
+        self._misses = deque([0.0] * options.speed_window, options.speed_window)
+
+    def control(
+        self, plan: npt.NDArray[np.floating], speed_mps: float, node: Place
+    ) -> PedalsAndWheel:
+        """Return what follows from one plan.
+
+        Args:
+            plan: [6, 2] waypoints every 0.5 s, metres, x forward, y left.
+            speed_mps: Of the ego.
+            node: The next node of the route, metres to the right and forward.
+        """
+        asked = self.options
+        waypoints = np.stack([-plan[:, 1], plan[:, 0]], axis=1).astype(np.float64)
+        steps = np.hypot(*np.diff(waypoints, axis=0).T)
+        wanted_mps = float(np.mean(steps)) * STEPS_PER_S
+        steer = self._steering(waypoints, node)
+        missing = min(max(wanted_mps - speed_mps, 0.0), asked.clip_delta_mps)
+        self._misses.append(missing)
+        gains = asked.speed_kp, asked.speed_ki, asked.speed_kd
+        throttle = min(max(_pid(self._misses, *gains), 0.0), asked.max_throttle)
+        too_fast = speed_mps > asked.brake_ratio * wanted_mps
+        if wanted_mps < asked.brake_speed_mps or too_fast:
+            return PedalsAndWheel(0.0, steer, 1.0)
+        coasting = speed_mps > asked.coast_above_mps
+        return PedalsAndWheel(0.0 if coasting else throttle, steer, 0.0)
+
+    def _steering(self, waypoints: npt.NDArray[np.float64], node: Place) -> float:
+        asked = self.options
+        middles = (waypoints[1:] + waypoints[:-1]) / 2
+        aim = int(np.argmin(np.abs(np.hypot(*middles.T) - asked.aim_m)))
+        angle = _quarter_turns(*waypoints[aim])
+        at_end = _quarter_turns(*(waypoints[-1] - waypoints[-2]))
+        to_node = _quarter_turns(*node)
+        outlier = abs(to_node - at_end) > asked.angle_threshold
+        near = node[1] < asked.node_within_m
+        follow = abs(to_node) < abs(angle) or (outlier and near)
+        self._angles.append(to_node if follow else angle)
+        gains = asked.turn_kp, asked.turn_ki, asked.turn_kd
+        return min(max(_pid(self._angles, *gains), -1.0), 1.0)
+
+
+def _quarter_turns(right: float, forward: float) -> float:
+    """Return an angle from straight ahead to the right; behind to the left above 2."""
+    return 1.0 - math.atan2(forward, right) / (math.pi / 2)
+
+
+def _pid(window: deque[float], kp: float, ki: float, kd: float) -> float:
+    change = window[-1] - window[-2]
+    return kp * window[-1] + ki * sum(window) / len(window) + kd * change
