@@ -18,6 +18,7 @@ KEY_PARTS = 64
 """The most parts of a dotted TOML key."""
 
 _DECODER = json.JSONDecoder(parse_constant=lambda word: _refuse(word))
+_ANY_NUMBER = json.JSONDecoder()
 _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|[\w-]+|\.|[^\s.]')
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
 
@@ -41,14 +42,19 @@ def content(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def from_json(text: bytes | str) -> Any:
-    """Read a JSON document; NaN and infinities are refused.
+def from_json(text: bytes | str, *, finite: bool = True) -> Any:
+    """Read a JSON document.
+
+    Args:
+        text: the document.
+        finite: whether to refuse NaN and infinities, which Python's own writer writes;
+            else the reader must look at its numbers.
 
     Raises:
         MalformedError: it is none.
     """
     try:
-        found = _DECODER.decode(_decoded(text))
+        found = (_DECODER if finite else _ANY_NUMBER).decode(_decoded(text))
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:

@@ -1,0 +1,203 @@
+"""What an agent recorded of its ego: ``metric_info.json``, as frames.
+
+Bench2Drive's agents write, for every step, acceleration (m/s2, world), angular velocity
+(degrees per second), forward and right vector, location (m) and rotation (degrees), in
+CARLA's left-handed world. There is no time in it: it follows from the motion itself.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.metrics.episode import LARGEST, EgoFrame
+
+TICK_S = 0.05
+"""Simulated seconds between two ticks of a leaderboard run."""
+INTERVALS_S = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0)
+"""What agents may record at: UniAD, VAD, TCP every tick, ADMLP every tenth."""
+
+_PARTS = ("acceleration", "angular_velocity", "forward_vector", "right_vector")
+_LOCATION = "location"
+_STEP = re.compile(r"-?\d{1,15}")
+_LIKENESS = 0.5
+"""Correlation from which two signals are taken to tell of the same motion."""
+_LEAST_MPS2, _LEAST_RADPS = 0.05, 0.01
+"""Root mean squares below which a signal is noise."""
+_AGREES = 1.5
+
+Floats = npt.NDArray[np.float64]
+
+
+class BrokenRecordingError(ValueError):
+    """A recording is not whole; the message is one line, without the file."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording in our conventions: x east, y north, turns counter-clockwise.
+
+    Attributes:
+        steps: [N] the agent's own counts, in the order of the file.
+        position_m: [N, 2].
+        acceleration_mps2: [N, 2] in the world.
+        heading_rad: [N], without jumps.
+        yaw_rate_radps: [N].
+        along_mps2: [N] acceleration along the ego's heading.
+        left_mps2: [N] acceleration to its left.
+    """
+
+    steps: npt.NDArray[np.int64]
+    position_m: Floats
+    acceleration_mps2: Floats
+    heading_rad: Floats
+    yaw_rate_radps: Floats
+    along_mps2: Floats
+    left_mps2: Floats
+
+    def frames(self, interval_s: float) -> tuple[EgoFrame, ...]:
+        """Return a frame a step.
+
+        The speed is that of the positions. What of the route was passed is not
+        recorded: ``route_m`` is the way driven.
+
+        Args:
+            interval_s: Seconds from one step to the next.
+        """
+        moved = _lengths(np.diff(self.position_m, axis=0))
+        columns = {
+            "x": self.position_m[:, 0],
+            "y": self.position_m[:, 1],
+            "heading": self.heading_rad,
+            "speed_mps": self._speeds(interval_s),
+            "acceleration_mps2": self.along_mps2,
+            "lateral_acceleration_mps2": self.left_mps2,
+            "yaw_rate_radps": self.yaw_rate_radps,
+            "route_m": np.concatenate([[0.0], moved.cumsum()]),
+            "acceleration_norm_mps2": _lengths(self.acceleration_mps2),
+        }
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        return tuple(
+            EgoFrame(
+                time_us=round(1e6 * interval_s * index),
+                steering_rad=None,
+                traffic_speed_mps=None,
+                **dict(zip(columns, row, strict=True)),
+            )
+            for index, row in enumerate(rows)
+        )
+
+    def _speeds(self, interval_s: float) -> Floats:
+        if len(self.steps) < 2:
+            return np.zeros(len(self.steps))
+        return _lengths(np.gradient(self.position_m, interval_s, axis=0))
+
+    def interval_s(self, duration_s: float | None = None) -> float:
+        """Return the seconds from one step to the next.
+
+        They are taken from what position and acceleration say of the same motion, or
+        else heading and yaw rate; a duration that roughly agrees decides, and decides
+        alone for an ego that never moved. Without any of them a step is a tick.
+
+        Args:
+            duration_s: Simulated seconds of the whole route.
+        """
+        moved = self._from_positions() or self._from_headings()
+        lasted = None
+        if duration_s is not None and len(self.steps) > 1:
+            lasted = duration_s / len(self.steps)
+        if lasted and (moved is None or 1 / _AGREES < lasted / moved < _AGREES):
+            return TICK_S * max(1, round(lasted / TICK_S))
+        if moved is not None:
+            return min(INTERVALS_S, key=lambda each: abs(np.log(each / moved)))
+        return self._from_steps()
+
+    def _from_positions(self) -> float | None:
+        """Compare second differences of the position with the acceleration, dt2 * a.
+
+        CARLA's acceleration is that of the step that led here; one that was computed
+        may be that of the moment between.
+        """
+        bends = np.diff(self.position_m, 2, axis=0)
+        if not bends.size:
+            return None
+        squares = (
+            _slope(bends.ravel(), self.acceleration_mps2[part].ravel(), _LEAST_MPS2)
+            for part in (slice(2, None), slice(1, -1))
+        )
+        square = max((each for each in squares if each is not None), default=None)
+        return None if square is None else float(np.sqrt(square))
+
+    def _from_headings(self) -> float | None:
+        turns = np.diff(self.heading_rad)
+        between = (self.yaw_rate_radps[1:] + self.yaw_rate_radps[:-1]) / 2.0
+        return _slope(turns, between, _LEAST_RADPS) if turns.size else None
+
+    def _from_steps(self) -> float:
+        between = np.diff(self.steps)
+        ticks = float(np.median(between)) if between.size else 1.0
+        return TICK_S * max(1.0, min(ticks, 20.0))
+
+
+def _lengths(vectors: Any) -> Floats:
+    """Return the length of each of [N, 2] vectors."""
+    return np.asarray(np.hypot(vectors[:, 0], vectors[:, 1]))
+
+
+def _slope(of: Floats, over: Floats, least: float) -> float | None:
+    """Return the positive factor that ties two signals, None if none does."""
+    power = float((over * over).sum())
+    if np.sqrt(power / over.size) < least:
+        return None
+    both = float((of * over).sum())
+    likeness = both / np.sqrt(power * float((of * of).sum()) or np.inf)
+    return both / power if likeness > _LIKENESS else None
+
+
+def read_recording(raw: object) -> Recording:
+    """Read a ``metric_info.json``.
+
+    Args:
+        raw: As JSON gives it; numbers may be infinite or NaN.
+
+    Raises:
+        BrokenRecordingError: It holds no step, or one that lacks a part, is of another
+            form or not finite.
+    """
+    if not isinstance(raw, dict) or not raw:
+        raise BrokenRecordingError("no step is recorded")
+    steps = [key for key in raw if not _STEP.fullmatch(key)]
+    if steps:
+        raise BrokenRecordingError(f"{steps[0][:60]!r} is not the number of a step")
+    acceleration, turning, forward, right = (_column(raw, part, 3) for part in _PARTS)
+    location = _column(raw, _LOCATION, 3)
+    ahead, aside, push = forward[:, :2], right[:, :2], acceleration[:, :2]
+    mirror = np.array([1.0, -1.0])  # CARLA's y points right
+    return Recording(
+        np.array([int(key) for key in raw], np.int64),
+        location[:, :2] * mirror,
+        push * mirror,
+        np.unwrap(-np.arctan2(ahead[:, 1], ahead[:, 0])),
+        -np.radians(turning[:, 2]),
+        np.einsum("ij,ij->i", push, ahead),
+        -np.einsum("ij,ij->i", push, aside),
+    )
+
+
+def _column(raw: dict[str, object], part: str, size: int) -> Floats:
+    rows = [_vector(step, values, part, size) for step, values in raw.items()]
+    return np.array(rows, np.float64)
+
+
+def _vector(step: str, values: object, part: str, size: int) -> Sequence[float]:
+    vector = values.get(part) if isinstance(values, dict) else None
+    if not isinstance(vector, list) or len(vector) < size:
+        raise BrokenRecordingError(f"step {step}: no {part}")
+    if not all(type(each) in (int, float) for each in vector):
+        raise BrokenRecordingError(f"step {step}: {part} is not made of numbers")
+    if not all(abs(each) <= LARGEST for each in vector):  # NaN compares as false
+        raise BrokenRecordingError(f"step {step}: {part} is not finite")
+    return vector[:size]

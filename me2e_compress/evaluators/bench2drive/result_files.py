@@ -1,0 +1,153 @@
+"""The files below a folder of results, found by what they hold, not by their names."""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from me2e_compress import documents
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.bench2drive.records import (
+    BrokenRecordError,
+    RouteRecord,
+    read_record,
+)
+
+_CHECKPOINT = b'"_checkpoint"'
+_STEP = re.compile(rb'\s*\{\s*"-?\d+"\s*:\s*\{\s*"\w+"\s*:\s*\[')
+_PARTS = (b'"angular_velocity"', b'"forward_vector"')
+_HEAD_BYTES = 4096
+_PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".bin"}
+
+
+@dataclass
+class ResultFile:
+    """One results file: a worker's checkpoint, or several merged.
+
+    Attributes:
+        path: Of the file.
+        records: Those that could be read, in the order of the file.
+        broken: Why others could not, by their place in the file.
+        stated: What a merged file says of itself; empty of a checkpoint.
+    """
+
+    path: Path
+    records: tuple[RouteRecord, ...] = ()
+    broken: dict[int, str] = field(default_factory=dict)
+    stated: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class FoundFiles:
+    """What lies below a folder.
+
+    Attributes:
+        results: In the order of their paths.
+        recordings: Files of recorded steps, in the order of their paths.
+        broken: Results files that are not whole, with the reason.
+    """
+
+    results: list[ResultFile] = field(default_factory=list)
+    recordings: list[Path] = field(default_factory=list)
+    broken: dict[Path, str] = field(default_factory=dict)
+
+
+def holds_records(folder: Path) -> bool:
+    """Return whether any results file of a leaderboard lies below a folder."""
+    return any(kind == _CHECKPOINT for _, kind in _kinds(folder))
+
+
+def find_files(folder: Path) -> FoundFiles:
+    """Find and read the results files below a folder, and find its recordings.
+
+    Raises:
+        EvaluationError: There is no such folder.
+    """
+    if not folder.exists():
+        raise EvaluationError(f"{folder}: no such folder")
+    found = FoundFiles()
+    for path, kind in _kinds(folder):
+        if kind is None:
+            continue
+        if kind != _CHECKPOINT:
+            found.recordings.append(path)
+            continue
+        try:
+            found.results.append(_read(path))
+        except documents.MalformedError as error:
+            found.broken[path] = f"not JSON: {error}"
+        except (OSError, BrokenRecordError) as error:
+            found.broken[path] = str(getattr(error, "strerror", None) or error)
+    return found
+
+
+def _kinds(folder: Path) -> Iterator[tuple[Path, bytes | None]]:
+    """Yield every file with what tells its kind; None of those that are neither."""
+    if folder.is_file():
+        yield folder, _kind(folder)
+    for where, folders, names in os.walk(folder):
+        folders.sort()
+        for name in sorted(names):
+            path = Path(where, name)
+            if path.suffix.lower() not in _PICTURES and path.is_file():
+                yield path, _kind(path)
+
+
+def _kind(path: Path) -> bytes | None:
+    """Look at the beginning of a file, at all of it where that does not tell."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            if not head.lstrip().startswith(b"{"):
+                return None
+            if _CHECKPOINT in head:
+                return _CHECKPOINT
+            if _STEP.match(head):
+                return _PARTS[0] if all(part in head for part in _PARTS) else None
+            if path.stat().st_size > documents.LARGEST_BYTES:
+                return None
+            return _CHECKPOINT if _CHECKPOINT in file.read() else None
+    except OSError:
+        return None
+
+
+def _read(path: Path) -> ResultFile:
+    document = documents.from_json(documents.content(path), finite=False)
+    try:
+        checked = _Document.model_validate(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"]) or "document"
+        raise BrokenRecordError(f"{where}: {first['msg']}") from error
+    records, broken = list[RouteRecord](), dict[int, str]()
+    for place, raw in enumerate(checked.checkpoint.records):
+        try:
+            records.append(read_record(raw))
+        except BrokenRecordError as error:
+            broken[place] = str(error)
+    return ResultFile(path, tuple(records), broken, checked.stated())
+
+
+class _Checkpoint(BaseModel):
+    records: list[Any]
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(allow_inf_nan=False, extra="ignore")
+    checkpoint: _Checkpoint = Field(alias="_checkpoint")
+    driving_score: float | None = Field(None, alias="driving score")
+    success_rate: float | None = Field(None, alias="success rate")
+    eval_num: float | None = Field(None, alias="eval num")
+
+    def stated(self) -> dict[str, float]:
+        """Return what merging wrote of the whole."""
+        written = {
+            "driving score": self.driving_score,
+            "success rate": self.success_rate,
+            "eval num": self.eval_num,
+        }
+        return {name: value for name, value in written.items() if value is not None}
