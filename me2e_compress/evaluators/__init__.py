@@ -15,5 +15,8 @@ EVALUATORS: Registry[Evaluator] = Registry(
     "evaluator",
     _HERE,
     EvaluationError,
-    {"highway": f"{_HERE}.highway.evaluation_options:HighwayEvaluation"},
+    {
+        "highway": f"{_HERE}.highway.evaluation_options:HighwayEvaluation",
+        "bench2drive": f"{_HERE}.bench2drive.evaluator:Bench2DriveResults",
+    },
 )

@@ -20,13 +20,28 @@ import numpy.typing as npt
 
 from me2e_compress.metrics.efficiency import CHECKPOINTS, OUTLIER_PERCENT, PERCENT
 from me2e_compress.metrics.episode import EgoFrame, Episode
+from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.measure import Measure
 
 BLOCK_FRAMES = 20
 DELTA_S = 0.1
 DONE_PERCENT = 95.0
+SUCCESSES = ("Completed", "Perfect")
 
 Floats = npt.NDArray[np.float64]
+
+
+def success(episode: Episode) -> bool:
+    """Return whether a record counts as a success (tools/merge_route_json.py).
+
+    Its status is Completed or Perfect, and every list of infractions but that of low
+    speed is empty; without a status this is `Episode.succeeded`.
+    """
+    if episode.given is None:
+        return episode.succeeded
+    return episode.given.status in SUCCESSES and all(
+        each.kind is InfractionKind.MIN_SPEED for each in episode.infractions
+    )
 
 
 def efficiency(episode: Episode) -> Measure:

@@ -15,6 +15,7 @@ from statistics import fmean
 from typing import Literal, get_args
 
 from me2e_compress.metrics.abilities import ABILITIES, TRAFFIC_SIGNS
+from me2e_compress.metrics.bench2drive import success
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.intervals import binomial_interval
@@ -69,14 +70,14 @@ def _signs(
 ) -> Estimate:
     """Count Traffic_Signs; 0.0.4 asks for the junction of failed routes alone."""
     either = rules == "0.0.4"
-    asked = [one for one in episodes if not (either and one.succeeded)]
+    asked = [one for one in episodes if not (either and success(one))]
     passed = {one.route: passes_the_junction(one, junctions) for one in asked}
     unknown = [route for route, each in passed.items() if each is None]
     if unknown:
         others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
         reason = f"where the junction is on {unknown[0]}{others} is not known"
         return Estimate(Measure(None, "%", reason), None, None, len(episodes))
-    good = sum(one.succeeded for one in episodes)
+    good = sum(success(one) for one in episodes)
     if either:
         return _share(good + sum(bool(each) for each in passed.values()), episodes)
     counted = good + sum(bool(each) for each in passed.values())
@@ -88,7 +89,7 @@ def _signs(
 
 
 def _rate(episodes: Sequence[Episode]) -> Estimate:
-    return _share(sum(one.succeeded for one in episodes), episodes)
+    return _share(sum(success(one) for one in episodes), episodes)
 
 
 def _share(good: int, episodes: Sequence[Episode]) -> Estimate:

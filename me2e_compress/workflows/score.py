@@ -4,12 +4,19 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.bench2drive.result_files import holds_records
+from me2e_compress.evaluators.highway.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import scores as metrics
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number, table
+from me2e_compress.workflows.score_bench2drive import (
+    Bench2DriveOptions,
+    RealRun,
+    score_real_run,
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -18,9 +25,11 @@ class ScoreResult(Result):
 
     Attributes:
         scores: in the order in which the folders were named.
+        real: more of those that hold the results of real runs.
     """
 
     scores: Mapping[str, Scores]
+    real: Mapping[str, RealRun] = dataclasses.field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -34,8 +43,18 @@ class ScoreResult(Result):
         return ()
 
     def tables(self) -> tuple[Table, ...]:
-        """Return a table a folder."""
-        return tuple(scores_table(name, scores) for name, scores in self.scores.items())
+        """Return a table a folder; of a real run also what its records say."""
+        return tuple(
+            each
+            for name, scores in self.scores.items()
+            for each in self._of(name, scores)
+        )
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what is wrong with the records of real runs."""
+        return tuple(
+            line for name, each in self.real.items() for line in each.alerts(name)
+        )
 
     def records(self) -> list[dict[str, object]]:
         """Return a row a score of a folder."""
@@ -47,24 +66,51 @@ class ScoreResult(Result):
 
     def to_json(self) -> object:
         """Return the scores of every folder."""
-        found = [{"results": name, **s.to_json()} for name, s in self.scores.items()]
+        found = [
+            {"results": name, **self.real.get(name, scores).to_json()}
+            for name, scores in self.scores.items()
+        ]
         return {"folders": found}
+
+    def _of(self, name: str, scores: Scores) -> tuple[Table, ...]:
+        if name not in self.real:
+            return (scores_table(name, scores),)
+        real = self.real[name]
+        return (
+            *real.tables(name),
+            scores_table(f"{name}, abilities by the rules {real.rules}", scores),
+        )
 
 
 def score(
     *results: str | Path,
     listener: Listener = SILENT,
+    real: Bench2DriveOptions | None = None,
 ) -> ScoreResult:
     """Score the episodes in folders of results.
 
     Args:
-        results: folders that ``evaluate`` wrote.
+        results: folders that ``evaluate`` wrote, or that real runs of Bench2Drive left.
         listener: is called with the files that are damaged and left out.
+        real: how results of real runs are read; None takes the defaults. Given, all
+            folders are taken to be of real runs.
 
     Raises:
         EvaluationError: not a folder of results.
     """
-    return ScoreResult({str(path): _scores(Path(path), listener) for path in results})
+    scores, runs = dict[str, Scores](), dict[str, RealRun]()
+    for path in map(Path, results):
+        if real is None and (path / MANIFEST).exists():
+            scores[str(path)] = _scores(path, listener)
+            continue
+        if real is None and not holds_records(path):
+            raise EvaluationError(
+                f"{path}: not a results folder: it holds neither {MANIFEST} nor "
+                "records of a leaderboard"
+            )
+        run = score_real_run(path, real or Bench2DriveOptions())
+        scores[str(path)], runs[str(path)] = run.scores, run
+    return ScoreResult(scores, runs)
 
 
 def _scores(path: Path, listener: Listener) -> Scores:

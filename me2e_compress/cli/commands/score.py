@@ -1,20 +1,54 @@
 """``me2e-compress score``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.metrics.penalties import Version
+from me2e_compress.metrics.traffic_signs import Rules
 from me2e_compress.workflows import score as workflow
+from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
+
+Metrics = Annotated[
+    Path | None, typer.Option(help="a folder of metric_info.json apart from RESULTS")
+]
+Junctions = Annotated[
+    Path | None, typer.Option(help="JSON: where each route passes its junction")
+]
+AbilityRules = Annotated[
+    str | None, typer.Option("--abilities", help="by the rules of 0.0.3 or 0.0.4")
+]
+Penalties = Annotated[
+    str | None, typer.Option(help="of infractions: b2d, 1.0, 2.0 or 2.1")
+]
 
 
 def score(
-    results: Annotated[list[Path], typer.Argument(help="folders of results")],
+    results: Annotated[
+        list[Path], typer.Argument(help="folders of results, ours or Bench2Drive's")
+    ],
+    metrics: Metrics = None,
+    junctions: Junctions = None,
+    rules: AbilityRules = None,
+    penalties: Penalties = None,
     as_json: given.Json = False,
 ) -> None:
-    """Print driving score, success rate, efficiency, comfort and abilities."""
+    """Print driving score, success rate, efficiency, comfort and abilities.
+
+    All options but --json are about results of real Bench2Drive or CARLA runs.
+    """
+    options = Bench2DriveOptions(
+        metrics,
+        junctions,
+        cast("Rules | None", rules),
+        cast("Version", penalties or "b2d"),
+    )
+    asked = any(each is not None for each in (metrics, junctions, rules, penalties))
     with listening() as listener:
-        found = workflow.score(*results, listener=listener)
+        found = workflow.score(
+            *results, listener=listener, real=options if asked else None
+        )
     show(found, as_json)

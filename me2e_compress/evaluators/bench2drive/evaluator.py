@@ -22,6 +22,7 @@ from me2e_compress.evaluators.bench2drive.result_files import (
 )
 from me2e_compress.evaluators.bench2drive.route_sets import (
     ROUTE_SETS,
+    RouteSet,
     by_number,
     likely_set,
 )
@@ -51,12 +52,13 @@ class CollectedResults:
         unrecorded: Routes without a recording of the ego.
         off_rate: Routes recorded at another rate than the simulator's, with the
             seconds between two steps.
-        stated: What merged files say of themselves, by file.
+        repetitions: How often the set was driven: a leaderboard's ``--repetitions``.
+        stated: Merged files, which say something of themselves.
         notes: Surprises, one line each.
     """
 
     episodes: tuple[Episode, ...]
-    route_set: str | None
+    route_set: RouteSet | None
     crashed: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     foreign: tuple[str, ...] = ()
@@ -67,6 +69,7 @@ class CollectedResults:
     unfinished: tuple[Path, ...] = ()
     unrecorded: tuple[str, ...] = ()
     off_rate: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    repetitions: int = 1
     stated: Mapping[Path, ResultFile] = dataclasses.field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -160,6 +163,7 @@ class _Collection:
             ),
             unrecorded=tuple(self.unrecorded),
             off_rate=self.off_rate,
+            repetitions=max(Counter(numbers).values()),
             stated={file.path: file for file in self.found.results if file.stated},
             notes=tuple(self.notes),
         )

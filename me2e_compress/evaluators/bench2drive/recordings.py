@@ -27,7 +27,7 @@ _LIKENESS = 0.5
 """Correlation from which two signals are taken to tell of the same motion."""
 _LEAST_MPS2, _LEAST_RADPS = 0.05, 0.01
 """Root mean squares below which a signal is noise."""
-_AGREES = 1.5
+_AGREES, _EQUALS = float(np.log(1.5)), float(np.log(1.1))
 
 Floats = npt.NDArray[np.float64]
 
@@ -99,21 +99,18 @@ class Recording:
         """Return the seconds from one step to the next.
 
         They are taken from what position and acceleration say of the same motion, or
-        else heading and yaw rate; a duration that roughly agrees decides, and decides
-        alone for an ego that never moved. Without any of them a step is a tick.
+        else heading and yaw rate. The duration divided by the steps decides where it
+        is one of the usual intervals and roughly agrees, and decides alone for an ego
+        that never moved. Without any of them a step is a tick.
 
         Args:
             duration_s: Simulated seconds of the whole route.
         """
         moved = self._from_positions() or self._from_headings()
-        lasted = None
-        if duration_s is not None and len(self.steps) > 1:
-            lasted = duration_s / len(self.steps)
-        if lasted and (moved is None or 1 / _AGREES < lasted / moved < _AGREES):
-            return TICK_S * max(1, round(lasted / TICK_S))
-        if moved is not None:
-            return min(INTERVALS_S, key=lambda each: abs(np.log(each / moved)))
-        return self._from_steps()
+        lasted = None if duration_s is None else _usual(duration_s / len(self.steps))
+        if lasted and (moved is None or abs(np.log(lasted / moved)) < _AGREES):
+            return lasted
+        return self._from_steps() if moved is None else _nearest(moved)
 
     def _from_positions(self) -> float | None:
         """Compare second differences of the position with the acceleration, dt2 * a.
@@ -145,6 +142,16 @@ class Recording:
 def _lengths(vectors: Any) -> Floats:
     """Return the length of each of [N, 2] vectors."""
     return np.asarray(np.hypot(vectors[:, 0], vectors[:, 1]))
+
+
+def _nearest(interval_s: float) -> float:
+    return min(INTERVALS_S, key=lambda each: abs(np.log(each / interval_s)))
+
+
+def _usual(interval_s: float) -> float | None:
+    """Return the interval that is within a tenth of one of the usual, if it is."""
+    nearest = _nearest(interval_s)
+    return nearest if abs(np.log(nearest / interval_s)) < _EQUALS else None
 
 
 def _slope(of: Floats, over: Floats, least: float) -> float | None:

@@ -7,6 +7,9 @@ bench2drive_0.0.4_val.xml (0.0.4); the two sets share two of them. The ten route
 
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
+from typing import Literal
+
+RouteSet = Literal["0.0.3", "0.0.4"]
 
 _FIRST = """
     1711 1773 1790 1792 1825 1833 1852 1956 2050 2082 2084 2086 2091 2115 2127 2129
@@ -46,20 +49,16 @@ _SECOND = """
     37447 37969
 """
 
-ROUTE_SETS: Mapping[str, frozenset[str]] = MappingProxyType(
+ROUTE_SETS: Mapping[RouteSet, frozenset[str]] = MappingProxyType(
     {"0.0.3": frozenset(_FIRST.split()), "0.0.4": frozenset(_SECOND.split())}
 )
 """By the version of Bench2Drive that brought them, 220 each."""
 
 
-def likely_set(numbers: Collection[str]) -> str | None:
+def likely_set(numbers: Collection[str]) -> RouteSet | None:
     """Return the set that most of the routes are of; None if they are of neither."""
-    shares = {
-        name: sum(number in each for number in numbers)
-        for name, each in ROUTE_SETS.items()
-    }
-    best = max(shares, key=lambda name: shares[name])
-    return best if shares[best] else None
+    best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(numbers)))
+    return best if ROUTE_SETS[best] & set(numbers) else None
 
 
 def by_number(number: str) -> tuple[int, str]:

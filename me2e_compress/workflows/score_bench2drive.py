@@ -1,0 +1,268 @@
+"""Scores of the results of real Bench2Drive runs, and what was found beside them."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from me2e_compress import documents
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.bench2drive.evaluator import (
+    Bench2DriveResults,
+    CollectedResults,
+)
+from me2e_compress.evaluators.bench2drive.records import number_of
+from me2e_compress.metrics import scores as metrics
+from me2e_compress.metrics.comfort import standing_share
+from me2e_compress.metrics.leaderboard_scores import (
+    LeaderboardScores,
+    Quotients,
+    leaderboard_scores,
+)
+from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.penalties import VERSIONS, Version
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.metrics.traffic_signs import MEAN, RULES, Rules, ability_rates
+from me2e_compress.workflows.result import Table, number, table
+
+STOOD = 0.5
+"""Share of a route's frames from which on its comfort is that of standing."""
+_NAMED = 5
+_TOLERANCE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench2DriveOptions:
+    """How results of real runs are read and scored.
+
+    Attributes:
+        metrics: a folder with the recordings (``metric_info.json``), where they do not
+            lie below that of the results.
+        junctions: JSON file of the share of each route, by its number, at which its
+            first junction is passed: (c + 8) / n, as Traffic_Signs asks for it.
+        rules: of the abilities: ``0.0.3`` or ``0.0.4``; None takes those that came
+            with the routes.
+        penalties: of infractions: ``b2d``, ``1.0``, ``2.0`` or ``2.1``.
+
+    Raises:
+        EvaluationError: no such rules or penalties.
+    """
+
+    metrics: str | Path | None = None
+    junctions: str | Path | None = None
+    rules: Rules | None = None
+    penalties: Version = "b2d"
+
+    def __post_init__(self) -> None:
+        """Check the choices."""
+        if self.rules is not None and self.rules not in RULES:
+            raise EvaluationError(
+                f"no rules {self.rules!r} of abilities; there are {', '.join(RULES)}"
+            )
+        if self.penalties not in VERSIONS:
+            raise EvaluationError(
+                f"no penalties {self.penalties!r}; there are {', '.join(VERSIONS)}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class RealRun:
+    """A real run, scored.
+
+    Attributes:
+        collected: the episodes, and what was found beside.
+        scores: as of any other run, with Bench2Drive's rules of abilities.
+        leaderboard: as the leaderboard and Bench2Drive's tools compute them.
+        rules: of the abilities.
+        stood: routes on which the ego stood most of its time.
+    """
+
+    collected: CollectedResults
+    scores: Scores
+    leaderboard: LeaderboardScores
+    rules: Rules
+    stood: tuple[str, ...]
+
+    def tables(self, name: str) -> tuple[Table, ...]:
+        """Return what was found, and both quotients of what was given and computed."""
+        return (self._counts(name), self._quotients())
+
+    def alerts(self, name: str) -> Iterator[str]:
+        """Say what must not be overlooked, one line each."""
+        found = self.collected
+        if found.foreign:
+            yield (
+                f"{name}: {len(found.foreign)} routes are not of the set "
+                f"{found.route_set}: {_some(found.foreign)}"
+            )
+        elif found.route_set is None:
+            yield f"{name}: the routes are of no set of Bench2Drive that is known"
+        if found.contradictory:
+            yield (
+                f"{name}: {len(found.contradictory)} routes were driven more than once "
+                "with different results, the lowest driving score counts: "
+                f"{_some(found.contradictory)}"
+            )
+        for where, reason in list(found.broken.items())[:_NAMED]:
+            yield f"{where}: {reason}: left out"
+        if len(found.broken) > _NAMED:
+            yield f"{name}: {len(found.broken) - _NAMED} more are broken and left out"
+        yield from self._stated()
+        if self.stood:
+            yield (
+                f"{name}: the ego stood for most of {len(self.stood)} routes, which is "
+                f"comfortable: see comfort in motion: {_some(self.stood)}"
+            )
+        if found.off_rate:
+            route, interval_s = next(iter(found.off_rate.items()))
+            yield (
+                f"{name}: {len(found.off_rate)} routes are not recorded at 20 Hz "
+                f"({route} at {1 / interval_s:.3g} Hz): their comfort does not compare "
+                "with others'"
+            )
+        yield from found.notes[:_NAMED]
+
+    def to_json(self) -> dict[str, object]:
+        """Return scores, quotients, and every route that was named."""
+        found = self.collected
+        return {
+            **self.scores.to_json(),
+            "leaderboard": {
+                "route_set": found.route_set,
+                "set_size": self.leaderboard.set_size,
+                "rules": self.rules,
+                **self.leaderboard.to_json(),
+            },
+            "records": {
+                "evaluated": len(found.episodes),
+                **{name: list(each) for name, each in self._named().items()},
+                "unfinished": [str(path) for path in found.unfinished],
+                "broken": dict(found.broken),
+                "intervals_s": dict(found.off_rate),
+            },
+        }
+
+    def _named(self) -> dict[str, tuple[str, ...]]:
+        found = self.collected
+        return {
+            "crashed": found.crashed,
+            "missing": found.missing,
+            "foreign": found.foreign,
+            "repeated": found.repeated,
+            "rerun": found.rerun,
+            "contradictory": found.contradictory,
+            "unrecorded": found.unrecorded,
+            "stood": self.stood,
+        }
+
+    def _stated(self) -> Iterator[str]:
+        """Compare what merged files say of themselves with their own records."""
+        for path, file in self.collected.stated.items():
+            episodes = [each.episode for each in file.records]
+            again = leaderboard_scores(episodes)
+            rate = again.success_rate.over_set.value
+            found = {
+                "driving score": again.given_score.over_set.value,
+                "success rate": None if rate is None else rate / 100.0,
+                "eval num": float(len(episodes)),
+            }
+            for key, said in file.stated.items():
+                value = found[key]
+                if value is None or not math.isclose(said, value, abs_tol=_TOLERANCE):
+                    yield (
+                        f"{path}: it says {key} {said:g}, its {len(episodes)} records "
+                        f"say {number(value, 'g')}"
+                    )
+
+    def _counts(self, name: str) -> Table:
+        found = self.collected
+        rows = [
+            ("evaluated", "", str(len(found.episodes))),
+            *((key, _some(of), str(len(of))) for key, of in self._named().items()),
+            ("unfinished files", "", str(len(found.unfinished))),
+            ("broken", _some(tuple(found.broken)), str(len(found.broken))),
+        ]
+        route_set = found.route_set or "of no known set"
+        title = f"{name}: real runs, Bench2Drive's routes {route_set}"
+        return table(title, ("records", "which", "n"), rows, words=2)
+
+    def _quotients(self) -> Table:
+        """Show given and computed figures, each over the set and over the records."""
+        of = self.leaderboard
+        none = Measure(None, "", "not so")
+        nothing = Quotients(none, none)
+        lines = [
+            ("driving score", of.given_score, of.score, "%"),
+            ("success rate", nothing, of.success_rate, "%"),
+            ("route completion", of.given_completion, nothing, "%"),
+            ("infraction penalty", of.given_penalty, of.penalty, "ratio"),
+        ]
+        if of.score != of.score_without_low_speed:
+            without = of.score_without_low_speed
+            lines.insert(1, ("  without low speed", nothing, without, "%"))
+        rows = [
+            (label, over, _shown(given, over), _shown(computed, over), str(n), unit)
+            for label, given, computed, unit in lines
+            for over, n in (("set", of.set_size), ("driven", of.driven))
+            if unit == "%" or over == "driven"  # a missing route has no penalty
+        ]
+        columns = ("score", "over", "given", "computed", "n", "unit")
+        title = f"given by the simulator, and computed with penalties {of.penalties}"
+        return table(title, columns, rows, words=2)
+
+
+def score_real_run(path: Path, options: Bench2DriveOptions) -> RealRun:
+    """Read and score the results of a real run.
+
+    Raises:
+        EvaluationError: no such folder, no record below it, or a bad file of junctions.
+    """
+    metric_folder = None if options.metrics is None else Path(options.metrics)
+    collected = Bench2DriveResults(path, metric_folder).collect()
+    episodes = collected.episodes
+    set_size = metrics.FULL_SET * collected.repetitions
+    rules = options.rules or collected.route_set or RULES[0]
+    junctions = _junctions(options.junctions, [each.route for each in episodes])
+    rates = ability_rates(episodes, rules, junctions)
+    scores = dataclasses.replace(
+        metrics.score(episodes, set_size),
+        abilities=rates.pop(MEAN),
+        each_ability=rates,
+    )
+    return RealRun(
+        collected,
+        scores,
+        leaderboard_scores(episodes, options.penalties, set_size),
+        rules,
+        tuple(e.route for e in episodes if (standing_share(e) or 0.0) > STOOD),
+    )
+
+
+def _junctions(path: str | Path | None, routes: Sequence[str]) -> dict[str, float]:
+    """Read the places of junctions, by route; they stand there by route or number."""
+    if path is None:
+        return {}
+    try:
+        found = documents.from_json(documents.content(Path(path)))
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be read: {error.strerror}") from error
+    except documents.MalformedError as error:
+        raise EvaluationError(f"{path}: not JSON: {error}") from error
+    if not isinstance(found, Mapping):
+        raise EvaluationError(f"{path}: not an object of shares by route")
+    for route, share in found.items():
+        if type(share) not in (int, float) or not share > 0.0:
+            raise EvaluationError(f"{path}: {route}: {share!r} is not a share")
+    places = {route: found.get(route, found.get(number_of(route))) for route in routes}
+    return {route: float(each) for route, each in places.items() if each is not None}
+
+
+def _shown(quotients: Quotients, over: str) -> str:
+    measure = quotients.over_set if over == "set" else quotients.over_driven
+    return number(measure.value, ".4f")
+
+
+def _some(names: Sequence[str]) -> str:
+    """Name the first of many."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more

@@ -1,0 +1,248 @@
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.bench2drive.evaluator import (
+    Bench2DriveResults,
+    CollectedResults,
+)
+from me2e_compress.testing import check_evaluator
+from tests.evaluators.bench2drive.files import (
+    RAMMED,
+    Json,
+    checkpoint,
+    merged,
+    record,
+    recording,
+    write,
+)
+
+GOOD = record(1711)
+OTHER = record(2082, "Accident", score=(60.0, 1.0, 60.0), status="Failed - TickRuntime")
+CRASHED = record(2084, status="Failed - Simulation crashed", score=(0, 1.0, 0))
+
+
+def collect(folder: Path) -> CollectedResults:
+    return Bench2DriveResults(folder).collect()
+
+
+def routes(found: CollectedResults) -> list[str]:
+    return [each.route.split("_")[1] for each in found.episodes]
+
+
+def test_files_are_found_by_what_they_hold(tmp_path: Path) -> None:
+    write(tmp_path / "a" / "eval.json", checkpoint(OTHER))
+    write(tmp_path / "gpu1.results", checkpoint(GOOD, CRASHED))
+    write(tmp_path / "meta" / "0001.json", {"speed": 3.0})
+    (tmp_path / "log.txt").write_text("Traceback (most recent call last):")
+
+    found = collect(tmp_path)
+
+    assert routes(found) == ["1711", "2082", "2084"]
+    assert found.route_set == "0.0.3"
+    assert found.crashed == ("RouteScenario_2084_rep0",)
+    assert len(found.missing) == 217
+    assert found.missing[0] == "1773"
+
+
+def test_the_evaluator_keeps_its_promises(tmp_path: Path) -> None:
+    write(tmp_path / "merged.json", merged(OTHER, GOOD))
+    write(tmp_path / "metrics" / GOOD["save_name"] / "metric_info.json", recording(372))
+
+    first, second = check_evaluator(Bench2DriveResults(tmp_path))
+
+    assert (len(first.frames), len(second.frames)) == (372, 0)
+
+
+def test_a_merged_file_beside_its_parts_counts_once(tmp_path: Path) -> None:
+    write(tmp_path / "0.json", checkpoint({**GOOD, "index": 7}))
+    write(tmp_path / "1.json", checkpoint(OTHER))
+    write(tmp_path / "all.json", merged(GOOD, OTHER))
+
+    found = collect(tmp_path)
+
+    assert routes(found) == ["1711", "2082"]
+    assert len(found.repeated) == 2
+    assert found.contradictory == ()
+
+
+def test_the_worst_of_contradictory_drives_counts(tmp_path: Path) -> None:
+    rammed = record(
+        score=(100, 0.6, 60.0), collisions_vehicle=[RAMMED], duration_s=19.0
+    )
+    write(tmp_path / "first.json", checkpoint(GOOD))
+    write(tmp_path / "second.json", checkpoint(rammed))
+
+    found = collect(tmp_path)
+
+    assert found.contradictory == ("RouteScenario_1711_rep0",)
+    (episode,) = found.episodes
+    assert episode.given is not None
+    assert episode.given.composed_percent == 60.0
+
+
+def test_a_crash_gives_way_to_the_drive_that_followed(tmp_path: Path) -> None:
+    crashed = record(status="Failed - Agent crashed", score=(3.0, 1.0, 3.0))
+    write(tmp_path / "first.json", checkpoint(crashed))
+    write(tmp_path / "second.json", checkpoint(GOOD))
+
+    found = collect(tmp_path)
+
+    assert found.rerun == ("RouteScenario_1711_rep0",)
+    assert (found.contradictory, found.crashed) == ((), ())
+    assert found.episodes[0].succeeded
+
+
+def test_repetitions_are_other_drives(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD, record(rep=1)))
+
+    found = collect(tmp_path)
+
+    assert len(found.episodes) == found.repetitions == 2
+    assert found.repeated == found.contradictory == ()
+
+
+def test_mixed_sets_are_named(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD, OTHER, record(469, weather=None)))
+
+    found = collect(tmp_path)
+
+    assert found.route_set == "0.0.3"
+    assert found.foreign == ("RouteScenario_469_rep0",)
+
+
+def test_routes_of_no_set(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(record(5)))
+
+    found = collect(tmp_path)
+
+    assert found.route_set is None
+    assert found.missing == ()
+
+
+def test_what_is_broken_is_named_and_the_rest_read(tmp_path: Path) -> None:
+    half = json.dumps(checkpoint(record(2086)))
+    (tmp_path / "half.json").write_text(half[: len(half) // 2])
+    begun = {"route_id": "RouteScenario_2091_rep0", "status": "Started"}
+    score: Json = {"score_route": 0, "score_penalty": 0, "score_composed": float("nan")}
+    write(
+        tmp_path / "r.json", checkpoint(GOOD, begun, {**record(2115), "scores": score})
+    )
+    write(tmp_path / "killed.json", checkpoint())
+
+    found = collect(tmp_path)
+
+    assert routes(found) == ["1711"]
+    reasons = list(found.broken.values())
+    assert reasons[0].startswith("not JSON: ")
+    assert reasons[1] == "infractions: Field required"
+    assert reasons[2].startswith("scores.score_composed: Input should be")
+    assert list(found.broken)[1] == f"{tmp_path / 'r.json'}, record 1"
+    assert found.unfinished == (tmp_path / "killed.json",)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "no results of a leaderboard below it"),
+        ('{"_checkpoint": {"rec', "no results of a leaderboard: r.json: not JSON"),
+        ('{"_checkpoint": 5}', "r.json: _checkpoint: Input should be"),
+        ('{"_checkpoint": {"records": []}}', "no record: r.json holds none"),
+        ('{"_checkpoint": {"records": [7]}}', "no whole record: r.json: record 0"),
+    ],
+)
+def test_a_folder_of_nothing(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "r.json").write_text(content)
+
+    with pytest.raises(EvaluationError, match=message):
+        collect(tmp_path)
+
+
+def test_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="no such folder"):
+        collect(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        f"{GOOD['save_name']}/metric_info.json",
+        f"deep/bench2drive220_{GOOD['save_name']}/metric_info.json",
+        f"{GOOD['save_name']}.json",
+        "metric_info.json",  # beside the only record of the folder
+    ],
+)
+def test_recordings_are_found_by_the_name_of_the_drive(
+    tmp_path: Path, where: str
+) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    write(tmp_path / where, recording(40))
+
+    found = collect(tmp_path)
+
+    assert len(found.episodes[0].frames) == 40
+    assert found.unrecorded == ()
+
+
+def test_the_recording_of_another_drive_is_not_taken(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    earlier = GOOD["save_name"].replace("_36", "_11")
+    write(tmp_path / earlier / "metric_info.json", recording())
+
+    assert collect(tmp_path).unrecorded == ("RouteScenario_1711_rep0",)
+
+
+def test_recordings_may_lie_apart(tmp_path: Path) -> None:
+    write(tmp_path / "results" / "r.json", checkpoint(GOOD))
+    write(tmp_path / "saved" / GOOD["save_name"] / "m.json", recording(25, 0.5))
+
+    found = Bench2DriveResults(tmp_path / "results", tmp_path / "saved").collect()
+
+    assert len(found.episodes[0].frames) == 25
+    assert found.off_rate == {"RouteScenario_1711_rep0": 0.5}
+
+
+def test_a_broken_recording_leaves_the_route(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    file = tmp_path / GOOD["save_name"] / "metric_info.json"
+    write(file, recording(40))
+    file.write_text(file.read_text()[:9000])
+
+    found = collect(tmp_path)
+
+    assert found.episodes[0].frames == ()
+    assert list(found.broken) == [str(file)]
+
+
+FILES = {
+    "r.json": json.dumps(checkpoint(GOOD, OTHER)),
+    f"{GOOD['save_name']}/metric_info.json": json.dumps(recording(3)),
+}
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@given(
+    st.sampled_from(list(FILES)),
+    st.floats(0.0, 1.0),
+    st.sampled_from(["cut", "1e999", "NaN", "null", "[]", "{}", '"', "\x00", "-"]),
+)
+def test_whatever_became_of_a_file(
+    tmp_path: Path, name: str, share: float, change: str
+) -> None:
+    for each, text in FILES.items():
+        at = int(share * len(text))
+        if each == name:
+            text = text[:at] + ("" if change == "cut" else change + text[at + 1 :])
+        path = tmp_path / each
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+
+    try:
+        found = collect(tmp_path)
+    except EvaluationError:
+        return
+    assert len(found.episodes) <= 2

@@ -1,0 +1,198 @@
+import contextlib
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from me2e_compress.evaluators.bench2drive.records import (
+    BrokenRecordError,
+    number_of,
+    read_record,
+)
+from me2e_compress.evaluators.bench2drive.scenario_types import TYPES
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.episode import Ending, Given
+from me2e_compress.metrics.infraction import InfractionKind
+from tests.evaluators.bench2drive.files import OUTSIDE, RAMMED, Json, record, speed
+
+
+def test_a_record_becomes_an_episode() -> None:
+    raw = record(
+        score=(80.0, 0.56328, 45.0624),
+        status="Failed - Agent got blocked",
+        collisions_vehicle=[RAMMED],
+        outside_route_lanes=[OUTSIDE],
+        min_speed_infractions=[speed(131.0), speed(54.5)],
+        vehicle_blocked=["Agent got blocked at (x=1.0, y=2.0, z=0.1)"],
+    )
+
+    read = read_record(raw)
+
+    episode = read.episode
+    assert (episode.route, read.number) == ("RouteScenario_1711_rep0", "1711")
+    assert (episode.scenario, episode.abilities) == (
+        "ParkingCutIn",
+        ("Emergency_Brake",),
+    )
+    assert episode.ending is Ending.BLOCKED
+    assert episode.speed_ratios_percent == (131.0, 54.5)
+    assert episode.given == Given("Failed - Agent got blocked", 80.0, 0.56328, 45.0624)
+    rammed, outside, *_ = episode.infractions
+    assert (rammed.x, rammed.y, rammed.time_us) == (3130.105, -5245.413, None)
+    assert outside.percent == 6.12
+    # what was computed from the lists agrees with what was given
+    assert route_score(episode).penalty == 0.56328
+    assert route_score(episode).composed == 45.0624
+
+
+@pytest.mark.parametrize(
+    ("status", "ending", "crashed"),
+    [
+        ("Completed", Ending.COMPLETED, False),
+        ("Perfect", Ending.COMPLETED, False),
+        ("Failed - TickRuntime", Ending.TIMEOUT, False),
+        ("Failed - Agent timed out", Ending.TIMEOUT, False),
+        ("Failed - Agent deviated from the route", Ending.DEVIATION, False),
+        ("Failed - Agent crashed", Ending.POLICY_FAILED, True),
+        ("Failed - Agent couldn't be set up", Ending.POLICY_FAILED, True),
+        ("Failed - Agent's sensors were invalid", Ending.POLICY_FAILED, True),
+        ("Failed - Simulation crashed", Ending.SIMULATOR_FAILED, True),
+        ("Failed", Ending.SIMULATOR_FAILED, True),
+        ("Failed - for a reason of tomorrow", Ending.SIMULATOR_FAILED, True),
+    ],
+)
+def test_every_status_has_an_ending(status: str, ending: Ending, crashed: bool) -> None:
+    read = read_record(record(status=status))
+
+    assert read.episode.ending is ending
+    assert read.crashed is crashed
+
+
+def test_a_crash_before_the_first_tick() -> None:
+    raw = record(status="Failed - Simulation crashed", score=(0, 1.0, 0))
+    raw["meta"] = {"route_length": 0, "duration_game": 0, "duration_system": 0.1}
+
+    read = read_record(raw)
+
+    assert read.episode.completion_percent == 0.0
+    assert read.duration_s is None
+
+
+def test_a_route_without_weather_of_the_table() -> None:
+    read = read_record(record(weather=None))
+
+    assert read.recording is not None
+    assert "_None_" in read.recording
+
+
+def test_speeds_beyond_all_bounds_stay_finite() -> None:
+    huge = "9" * 400
+    read = read_record(record(min_speed_infractions=[speed(12.5), f"{huge}% of it"]))
+
+    assert read.episode.speed_ratios_percent == (12.5, 1e9)
+
+
+def test_a_message_without_a_percentage_is_named() -> None:
+    read = read_record(record(min_speed_infractions=["Average speed is nan% of it"]))
+
+    assert read.notes == (
+        "min_speed_infractions: no percentage in 'Average speed is nan% of it': "
+        "left out",
+    )
+    assert read.episode.speed_ratios_percent == ()
+
+
+def without(key: str) -> Json:
+    raw = record()
+    del raw[key]
+    return raw
+
+
+def scored(value: object) -> Json:
+    raw = record()
+    raw["scores"]["score_composed"] = value
+    return raw
+
+
+@pytest.mark.parametrize(
+    ("raw", "message"),
+    [
+        (without("status"), "status: Field required"),
+        (without("scores"), "scores: Field required"),
+        (scored(math.nan), "scores.score_composed: Input should be"),
+        (scored(math.inf), "scores.score_composed: Input should be"),
+        (scored("high"), "scores.score_composed: Input should be"),
+        (record(score=(140.0, 1.0, 140.0)), "scores.score_route: Input should be less"),
+        (record(status="Started"), "status 'Started' is not that of a finished route"),
+        ({**record(), "route_id": "../x"}, "route_id: '../x' is no name"),
+        ([], "record: Input should be"),
+        (
+            {**record(), "infractions": {"ran_over_a_cat": ["once"]}},
+            "infractions: nobody knows 'ran_over_a_cat'",
+        ),
+    ],
+)
+def test_a_broken_record_is_one_line(raw: object, message: str) -> None:
+    with pytest.raises(BrokenRecordError, match=message) as caught:
+        read_record(raw)
+    assert "\n" not in str(caught.value)
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=6),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.text(max_size=6), inner, max_size=3)
+    ),
+    max_leaves=5,
+)
+
+
+@given(st.data(), values)
+def test_whatever_stands_in_a_record(data: st.DataObject, value: Any) -> None:
+    raw: Any = record(min_speed_infractions=[speed(80.0)])
+    part = raw
+    while True:
+        keys = list(part) if isinstance(part, dict) else list(range(len(part)))
+        key = data.draw(st.sampled_from(keys))
+        nested = part[key]
+        if (
+            not isinstance(nested, dict | list)
+            or not nested
+            or data.draw(st.booleans())
+        ):
+            part[key] = value
+            break
+        part = nested
+
+    with contextlib.suppress(BrokenRecordError):
+        read_record(raw)
+
+
+def test_the_types_are_as_many_as_bench2drive_has() -> None:
+    counts = {ability: len(types) for ability, types in TYPES.items()}
+
+    assert counts == {
+        "Overtaking": 9,
+        "Merging": 16,
+        "Emergency_Brake": 12,
+        "Give_Way": 2,
+        "Traffic_Signs": 19,
+    }
+    assert len({each for types in TYPES.values() for each in types}) == 44
+
+
+def test_numbers_are_found_as_the_tools_find_them() -> None:
+    assert number_of("RouteScenario_1711_rep0") == "1711"
+    assert number_of("17") == "17"
+
+
+@pytest.mark.parametrize("kind", InfractionKind)
+def test_every_list_of_the_leaderboard_is_read(kind: InfractionKind) -> None:
+    raw = {**record(), "infractions": {kind.value: ["it happened (5.0% of it)"]}}
+
+    (infraction,) = read_record(raw).episode.infractions
+
+    assert infraction.kind is kind
