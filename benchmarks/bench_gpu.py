@@ -34,24 +34,24 @@ import numpy as np
 import onnxruntime as ort
 
 from benchmarks import subjects
-from benchmarks.bench_runtime import (
+from benchmarks.bench_runtime import sqnr_db
+from benchmarks.gpu_table import Found, write
+from benchmarks.runtime_files import (
     BEFORE,
     FUSED,
+    REFERENCE,
     Entry,
     first_frame,
     last_line,
     made,
     path_of,
-    sqnr_db,
 )
-from benchmarks.gpu_table import Found, write
 from benchmarks.subject import Subject
 from me2e_compress import graph
 from me2e_compress.errors import ProviderError
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider, provider_named
 
-REFERENCE = "onnxruntime, as exported"
 FRAMES = {"highway": 64, "vad-tiny": 2}
 """To calibrate on, unless told otherwise: VAD-tiny takes 3 CPU seconds a frame."""
 EXACT = f"{BEFORE},fuse-basic"

@@ -2,6 +2,7 @@
 
     python -m benchmarks.bench_runtime OUT [--peer-python PYTHON] [--rounds 5]
         [--threads 2] [--frames 1] [--only "ours, int8;PyTorch, eager"]
+        [--static-geometry] [--with torch.compile] [--prepare]
 
 One frame of the stack at its published size, recurrent state at zeros: a process a row,
 in turn, round by round, so that whatever else runs on the machine falls on all rows.
@@ -13,7 +14,13 @@ of 2,048 x 2,048 (float32, and uint8 by int8 for what is int8) over the time the
 
 OpenVINO runs in PYTHON, which needs ``openvino`` and numpy; int8 there is the file of
 onnxruntime.quantization. A runtime that is missing or refuses a file is named below
-the table. Files stay in OUT and are not made again.
+the table. Files stay in OUT and are not made again; ``--prepare`` writes them, and
+measures nothing.
+
+The cameras' matrices are an input. With ``--static-geometry`` they are constants, for
+every file: others read the exported file after our passes ``static-geometry`` and
+``fold-constants``; PyTorch has no such pass and runs what it always does. SQNR is still
+that against the file as exported.
 """
 
 import argparse
@@ -24,7 +31,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,43 +40,24 @@ import onnx_ir as ir
 
 from benchmarks import subjects
 from benchmarks.bench_int8_cpu import macs_of_a_frame
+from benchmarks.runtime_files import (
+    ENTRIES,
+    OPTIONAL,
+    REFERENCE,
+    STACK,
+    Entry,
+    first_frame,
+    last_line,
+    made,
+    path_of,
+    static,
+)
 from benchmarks.subject import Subject
 from me2e_compress import graph
 from me2e_compress.manager.report import versions
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.onnxruntime import int8_layers
-
-STACK = "vad-tiny"
-REFERENCE = "onnxruntime, as exported"
-
-
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """A row: an engine of :mod:`benchmarks.run_one`, and what it runs."""
-
-    engine: str
-    file: str
-    passes: str = ""
-
-
-BEFORE = "import-normalize,fold-constants,eliminate-redundant,hoist-linear"
-FUSED = f"{BEFORE},fuse-operators,eliminate-redundant,fuse-basic"
-INT8 = "quantize-int8{target=onnxruntime}"
-ENTRIES = {
-    "PyTorch, eager": Entry("torch", STACK),
-    "PyTorch, torch.compile": Entry("torch-compile", STACK),
-    REFERENCE: Entry("onnxruntime", "source"),
-    "onnxsim + onnxruntime": Entry("onnxruntime", "onnxsim"),
-    "onnxruntime.quantization": Entry("onnxruntime", "onnxruntime-int8"),
-    "OpenVINO, float32": Entry("openvino-f32", "source"),
-    "OpenVINO, bfloat16": Entry("openvino-bf16", "source"),
-    "OpenVINO, int8": Entry("openvino-f32", "onnxruntime-int8"),
-    "ours, exact": Entry("ours", "exact", f"{BEFORE},fuse-basic"),
-    "ours, fused": Entry("ours", "fused", FUSED),
-    "ours, int8": Entry("ours", "int8", f"{BEFORE},fuse-basic,{INT8}"),
-    "ours, int8 fused": Entry("ours", "int8-fused", f"{FUSED},{INT8}"),
-}
 
 
 @dataclasses.dataclass
@@ -82,63 +70,14 @@ class Row:
     sqnr_db: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
-def path_of(subject: Subject, entry: Entry) -> Path:
-    """Give the file that an entry runs."""
-    return subject.folder / f"{entry.file}.onnx"
-
-
-def made(subject: Subject, entry: Entry, frames: int) -> str | None:
-    """Write the file of an entry, unless it is there; return why that failed."""
-    path = path_of(subject, entry)
-    if entry.file == STACK or path.is_file():
-        return None
-    if entry.passes:
-        command = ["-m", "me2e_compress", "compress", str(subject.source), "--passes"]
-        command += [entry.passes, "--frames", str(subject.frames), "-o", str(path)]
-        command += ["--map", str(subject.map), "--verify-frames", "0"]
-        command += ["--measure-frames", "0"]
-    elif entry.file == "onnxsim":
-        write = (
-            "import onnx, onnxsim, sys; onnx.save(onnxsim.simplify(sys.argv[1])[0],"
-            " sys.argv[2])"
-        )
-        command = ["-c", write, str(subject.source), str(path)]
-    else:
-        tool = "onnxruntime-uint8-tensor"
-        command = ["benchmarks/peer.py", tool, str(subject.model)]
-        command += [str(subject.frames), str(path), "--frames", str(frames)]
-    done = subprocess.run(
-        [sys.executable, *command], capture_output=True, text=True, check=False
-    )
-    return None if path.is_file() else last_line(done)
-
-
-def last_line(done: "subprocess.CompletedProcess[str]") -> str:
-    """Say why a child ended without what it was started for."""
-    lines = done.stderr.strip().splitlines() or [f"exit {done.returncode}"]
-    return lines[-1][:160]
-
-
-def first_frame(subject: Subject) -> Path:
-    """Write the frame that all run: recorded, its state at zeros."""
-    path = subject.folder / "one-frame.npz"
-    if not path.is_file():
-        with np.load(next(iter(sorted(subject.held_out.glob("*.npz"))))) as held:
-            arrays = dict(held)
-        for value in graph.load(subject.source).graph.inputs:
-            shape = graph.static_shape(value) or ()
-            arrays.setdefault(str(value.name), np.zeros(shape, np.float32))
-        np.savez(path, **arrays)
-    return path
-
-
-def run(subject: Subject, name: str, given: argparse.Namespace) -> dict[str, Any] | str:
+def run(
+    subject: Subject, entry: Entry, given: argparse.Namespace
+) -> dict[str, Any] | str:
     """Run an entry in a process of its own; return why it did not, if so."""
-    entry = ENTRIES[name]
     peer = entry.engine.startswith("openvino")
     python = str(given.peer_python if peer else sys.executable)
     target = entry.file if entry.file == STACK else str(path_of(subject, entry))
-    out = subject.folder / f"outputs {name}.npz"
+    out = answers_of(subject, entry)
     command = [python, "-W", "ignore", *(() if peer else ("-m",))]
     command += ["benchmarks/run_one.py" if peer else "benchmarks.run_one"]
     command += [entry.engine, target, str(first_frame(subject)), str(out)]
@@ -150,18 +89,23 @@ def run(subject: Subject, name: str, given: argparse.Namespace) -> dict[str, Any
     return answer
 
 
+def answers_of(subject: Subject, entry: Entry) -> Path:
+    """Give the file of what an entry answered."""
+    return subject.folder / f"outputs {entry.engine} {entry.file}.npz"
+
+
 def measured(
-    subject: Subject, names: list[str], given: argparse.Namespace
+    subject: Subject, entries: Mapping[str, Entry], given: argparse.Namespace
 ) -> tuple[dict[str, Row], dict[str, str]]:
     """Run every entry in turn, round by round."""
-    rows = {name: Row() for name in names}
+    rows = {name: Row() for name in entries}
     failed: dict[str, str] = {}
     for turn in range(given.rounds):
-        for name in names:
+        for name, entry in entries.items():
             if name in failed:
                 continue
             print(f"  round {turn + 1}: {name}", file=sys.stderr, flush=True)
-            found = run(subject, name, given)
+            found = run(subject, entry, given)
             if isinstance(found, str):
                 failed[name] = found
                 continue
@@ -172,11 +116,11 @@ def measured(
     return {name: row for name, row in rows.items() if name not in failed}, failed
 
 
-def fidelity(subject: Subject, name: str) -> dict[str, float]:
+def fidelity(subject: Subject, entry: Entry) -> dict[str, float]:
     """Return the SQNR of every output against the file as exported, dB."""
     with (
-        np.load(subject.folder / f"outputs {REFERENCE}.npz") as reference,
-        np.load(subject.folder / f"outputs {name}.npz") as other,
+        np.load(answers_of(subject, ENTRIES[REFERENCE])) as reference,
+        np.load(answers_of(subject, entry)) as other,
     ):
         return {
             output: sqnr_db(reference[output], other[output]) for output in reference
@@ -222,9 +166,11 @@ def peaks(size: int = 2048) -> dict[str, float]:
     return found
 
 
-def shares(subject: Subject, rates: dict[str, float]) -> Iterator[tuple[str, float]]:
+def shares(
+    subject: Subject, entries: Mapping[str, Entry], rates: dict[str, float]
+) -> Iterator[tuple[str, float]]:
     """Return the least CPU seconds that the MACs of our files and the export take."""
-    for name, entry in ENTRIES.items():
+    for name, entry in entries.items():
         path = path_of(subject, entry)
         if entry.engine not in ("ours", "onnxruntime") or not path.is_file():
             continue
@@ -234,9 +180,14 @@ def shares(subject: Subject, rates: dict[str, float]) -> Iterator[tuple[str, flo
         yield name, (every - int8) / rates["float32"] + int8 / rates["int8"]
 
 
-def table(subject: Subject, rows: dict[str, Row], rates: dict[str, float]) -> str:
-    """Write the table."""
-    plan, floor = "ego_fut_preds", dict(shares(subject, rates))
+def table(rows: dict[str, Row], floor: Mapping[str, float]) -> str:
+    """Write the table.
+
+    Args:
+        rows: what was measured; the others are compared with the first.
+        floor: least CPU seconds that the MACs of a row take, where they are known.
+    """
+    plan = "ego_fut_preds"
     eager = min(next(iter(rows.values())).cpu_s)
     lines = [
         "| | CPU s, least | median | x first row | wall s, least | peak MB"
@@ -254,37 +205,67 @@ def table(subject: Subject, rows: dict[str, Row], rates: dict[str, float]) -> st
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--peer-python", type=Path, default=Path(sys.executable))
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--runs", type=int, default=2)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--frames", type=int, default=1)
-    parser.add_argument("--only", default="", help="rows, joined by ;")
-    given = parser.parse_args()
-    subject = subjects.make(STACK, given.out, given.frames)
-    wanted = [each.strip() for each in given.only.split(";")] if given.only else []
-    names = [name for name in ENTRIES if not wanted or name in (*wanted, REFERENCE)]
-    failed = {
-        name: reason
-        for name in names
-        if (reason := made(subject, ENTRIES[name], given.frames)) is not None
-    }
-    rows, refused = measured(
-        subject, [name for name in names if name not in failed], given
+def parser() -> argparse.ArgumentParser:
+    """Return what reads the command line."""
+    found = argparse.ArgumentParser(description=__doc__)
+    found.add_argument("out", type=Path)
+    found.add_argument("--peer-python", type=Path, default=Path(sys.executable))
+    found.add_argument("--rounds", type=int, default=5)
+    found.add_argument("--runs", type=int, default=2)
+    found.add_argument("--threads", type=int, default=2)
+    found.add_argument("--frames", type=int, default=1)
+    found.add_argument("--only", default="", help="rows, joined by ;")
+    found.add_argument("--static-geometry", action="store_true")
+    found.add_argument(
+        "--with", action="append", choices=OPTIONAL, default=[], dest="optional"
     )
+    found.add_argument("--prepare", action="store_true", help="write files, and end")
+    return found
+
+
+def main() -> None:
+    given = parser().parse_args()
+    subject = subjects.make(STACK, given.out, given.frames)
+    entries = chosen(given)
+    failed: dict[str, str] = {}
+    for name, entry in entries.items():
+        if (reason := made(subject, entry, given.frames)) is not None:
+            failed[name] = reason
+    if not given.prepare:
+        there = {name: each for name, each in entries.items() if name not in failed}
+        failed |= show(subject, there, given)
+    for name, reason in failed.items():
+        print(f"\n{name}: {reason}")
+
+
+def chosen(given: argparse.Namespace) -> dict[str, Entry]:
+    """Return the rows that are asked for, the reference always."""
+    wanted = [each.strip() for each in given.only.split(";")] if given.only else []
+    left_out = set(OPTIONAL.values()) - {OPTIONAL[each] for each in given.optional}
+    entries = static(ENTRIES) if given.static_geometry else ENTRIES
+    return {
+        name: entry
+        for name, entry in entries.items()
+        if (name in (*wanted, REFERENCE) if wanted else name not in left_out)
+    }
+
+
+def show(
+    subject: Subject, entries: dict[str, Entry], given: argparse.Namespace
+) -> dict[str, str]:
+    """Measure rows and print their table; return those that did not run, and why."""
+    rows, refused = measured(subject, entries, given)
+    if not answers_of(subject, ENTRIES[REFERENCE]).is_file():
+        run(subject, ENTRIES[REFERENCE], given)
     for name, row in rows.items():
-        row.sqnr_db = fidelity(subject, name)
+        row.sqnr_db = fidelity(subject, entries[name])
     rates = peaks()
     print(
         f"{processor()}, {given.threads} threads, {given.rounds} rounds; {versions()}"
     )
     print(", ".join(f"{k}: {v / 1e9:.0f} GMAC/CPU s" for k, v in rates.items()) + "\n")
-    print(table(subject, rows, rates))
-    for name, reason in {**failed, **refused}.items():
-        print(f"\n{name}: {reason}")
+    print(table(rows, dict(shares(subject, entries, rates))))
+    return refused
 
 
 if __name__ == "__main__":

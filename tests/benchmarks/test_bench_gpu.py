@@ -12,8 +12,9 @@ import onnxruntime as ort
 import pytest
 
 from benchmarks import bench_gpu
-from benchmarks.bench_gpu import REFERENCE, ROWS, Bench, provider_or_reason
+from benchmarks.bench_gpu import ROWS, Bench, provider_or_reason
 from benchmarks.gpu_table import Found, table
+from benchmarks.runtime_files import REFERENCE
 from benchmarks.subject import Subject
 from me2e_compress.runtime.providers import CPU, CpuProvider, TensorRtProvider
 from tests.frames import record
