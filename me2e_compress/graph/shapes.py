@@ -169,7 +169,8 @@ def without_weights(model: ir.Model) -> onnx.ModelProto:
 
 
 CONVOLUTIONS = ("Conv", "ConvTranspose")
-WEIGHTED = (*CONVOLUTIONS, "Gemm", "MatMul")
+PRODUCTS = ("Gemm", "MatMul")
+WEIGHTED = (*CONVOLUTIONS, *PRODUCTS)
 """Operators of weighted layers: those that have an int8 kernel worth feeding."""
 
 Dims = tuple[int | None, ...]

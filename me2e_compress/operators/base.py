@@ -35,11 +35,14 @@ class Operator(abc.ABC):
         own: the toolkit's own form, in the domain ``me2e``.
         dialects: every plugin library's spelling that is known, the preferred of a
             name first.
+        int8_inputs: which inputs may be int8, of the own form and of every dialect:
+            features alone; positions and attention weights lose too much.
     """
 
     name: ClassVar[str]
     own: ClassVar[Dialect]
     dialects: ClassVar[tuple[Dialect, ...]]
+    int8_inputs: ClassVar[tuple[int, ...]] = ()
 
     @abc.abstractmethod
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:

@@ -87,6 +87,7 @@ class DeformableAggregation(Operator):
     """
 
     name: ClassVar[str] = "deformable-aggregation"
+    int8_inputs: ClassVar[tuple[int, ...]] = (0,)
     own: ClassVar[Dialect] = Dialect(
         "me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, (*FLOAT32, ir.DataType.FLOAT16)),
         "me2e",

@@ -64,6 +64,7 @@ class DeformableAttention(Operator):
     """
 
     name: ClassVar[str] = "deformable-attention"
+    int8_inputs: ClassVar[tuple[int, ...]] = (0,)
     own: ClassVar[Dialect] = Dialect(
         "me2e", "MultiScaleDeformableAttention", OWN_DOMAIN, _operands(INTEGERS), "me2e"
     )

@@ -124,6 +124,20 @@ def score_inputs() -> Mapping[str, int]:
     }
 
 
+def int8_inputs(node: ir.Node) -> tuple[int, ...]:
+    """Return which inputs of a node may be int8, if it is a fused operator."""
+    found = find(node) if node.op_type in int8_op_types() else None
+    return () if found is None else found[0].int8_inputs
+
+
+@functools.cache
+def int8_op_types() -> frozenset[str]:
+    """Return what the fused operators are called of which an input may be int8."""
+    return frozenset(
+        op_type for op_type, rows in _rows().items() if rows[0][0].int8_inputs
+    )
+
+
 @functools.cache
 def _rows() -> dict[str, list[tuple[Operator, Dialect]]]:
     rows: dict[str, list[tuple[Operator, Dialect]]] = {}

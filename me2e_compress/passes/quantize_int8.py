@@ -142,9 +142,11 @@ class QuantizeInt8(Pass):
         overrides = Overrides()
         if self.overrides is not None:
             overrides = Overrides.load(self.overrides)
-        costs = TARGETS.parse(self.target).costs
+        target = TARGETS.parse(self.target)
         rules, scheme = self._rules(), self._scheme(context)
-        plan = make_plan(model, scheme, rules, overrides, costs)
+        plan = make_plan(
+            model, scheme, rules, overrides, target.costs, target.fused_objection
+        )
         return with_weight_only(plan, model) if self.weight_only_gemv else plan
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:

@@ -132,8 +132,15 @@ class Trials:
     def plan(self, choice: Int8Choice) -> QuantPlan:
         """Decide for every node, as ``quantize-int8`` will for the recipe."""
         scheme = QuantScheme.of(choice.modules, self.modules)
-        pins, costs = choice.overrides(), self._target.costs
-        return make_plan(self.model, scheme, self._rules, pins, costs)
+        pins, target = choice.overrides(), self._target
+        return make_plan(
+            self.model,
+            scheme,
+            self._rules,
+            pins,
+            target.costs,
+            target.fused_objection,
+        )
 
     def variant(self, choice: Int8Choice) -> ir.Model:
         """Build the graph of a choice."""

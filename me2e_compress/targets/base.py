@@ -123,6 +123,14 @@ class Target(abc.ABC):
         """List the plan's nodes that stay float in that copy, and why."""
         return ()
 
+    def fused_objection(self, node: ir.Node) -> str | None:
+        """Say why a fused operator reads no int8 here; None where it does.
+
+        Args:
+            node: of an operator that says which of its inputs may be int8.
+        """
+        return f"{self.name} has no int8 kernel for {node.op_type}"
+
     def check_types(self, plan: QuantPlan, model: ir.Model) -> None:
         """Check that int8 can be written into the float type that the graph has.
 

@@ -8,12 +8,10 @@ import onnx_ir as ir
 
 from me2e_compress import graph, recipe
 from me2e_compress.errors import RecipeError
-from me2e_compress.graph import WEIGHTED
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import (
-    INT8,
     Decision,
     PlanDifference,
     QuantPlan,
@@ -95,7 +93,7 @@ class PlanResult(Result):
         rows = [
             (each.node or each.output, _what(each))
             for each in self.plan.decisions
-            if every or each.op in WEIGHTED or each.dtype == INT8
+            if every or each.could_be_int8
         ]
         shown = table("Decisions", ("node", "what, by which rule, why"), rows, words=2)
         return shown, *self._groups()

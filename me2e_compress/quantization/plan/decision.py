@@ -12,6 +12,7 @@ import pydantic
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED
+from me2e_compress.operators import int8_op_types
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.atomic import write_json
 
@@ -36,8 +37,8 @@ class Decision:
         module: its ME2E module; empty if unknown.
         dtype: ``int8``, ``float``, or ``weight-only``: computed in float, its weight
             stored as int8.
-        rule: id of the rule that decided; for int8 ``layer``, ``attention`` or
-            ``residual``; ``override`` where the user did.
+        rule: id of the rule that decided; for int8 ``layer``, ``attention``,
+            ``sampled`` or ``residual``; ``override`` where the user did.
         reason: the same in words.
         shapes: of the first two inputs and the first output; None where open.
         activations: which inputs get an activation scale. Of an Add it is one, the
@@ -60,6 +61,11 @@ class Decision:
     weight: int | None = None
     axis: int | None = None
     borderline: str = ""
+
+    @property
+    def could_be_int8(self) -> bool:
+        """Whether it is int8, or of a kind that may be."""
+        return self.dtype == INT8 or self.op in WEIGHTED or self.op in int8_op_types()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +158,7 @@ class QuantPlan(Displayed):
         found = Counter(
             (each.module, each.dtype, each.rule)
             for each in self.decisions
-            if each.op in WEIGHTED or each.dtype == INT8
+            if each.could_be_int8
         )
         order = dict.fromkeys(module for module, _, _ in found)
         rows = [
@@ -165,11 +171,7 @@ class QuantPlan(Displayed):
 
     def counts(self) -> dict[str, int]:
         """Count the decisions by rule, over the nodes that could be int8 at all."""
-        rules = Counter(
-            each.rule
-            for each in self.decisions
-            if each.op in WEIGHTED or each.dtype == INT8
-        )
+        rules = Counter(each.rule for each in self.decisions if each.could_be_int8)
         return dict(sorted(rules.items()))
 
 

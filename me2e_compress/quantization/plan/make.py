@@ -14,6 +14,7 @@ from me2e_compress.graph import (
     static_shape,
 )
 from me2e_compress.graph.shapes import is_one_matrix
+from me2e_compress.operators import int8_inputs
 from me2e_compress.quantization.costs import CostsOf
 from me2e_compress.quantization.plan.decision import (
     FLOAT,
@@ -31,6 +32,7 @@ from me2e_compress.quantization.rules import (
     RuleFacts,
     RuleSet,
 )
+from me2e_compress.quantization.rules.base import Objection
 from me2e_compress.quantization.scheme import QuantScheme
 
 _EGO = "encodes the ego status {}, sensitive to int8; rules safe keep it float"
@@ -43,6 +45,7 @@ def make_plan(
     rules: RuleSet | None = None,
     overrides: Overrides = NONE,
     costs: CostsOf | None = None,
+    fused: Objection | None = None,
 ) -> QuantPlan:
     """Decide for every node; one look at each, so linear in the graph.
 
@@ -55,13 +58,14 @@ def make_plan(
         rules: asked in order; None for the set ``safe``.
         overrides: what the user has decided; it beats every rule that is not firm.
         costs: estimates what int8 saves and costs on the target, for rules that ask.
+        fused: says why a fused operator reads no int8 on the target.
 
     Raises:
         RecipeError: an override matches no node, or wants int8 where it cannot be.
     """
     asked = RULE_SETS.parse(DEFAULT_RULES) if rules is None else rules
     in_order = asked.rules()
-    facts = RuleFacts(model, scheme.modules, costs)
+    facts = RuleFacts(model, scheme.modules, costs, fused)
     pins = overrides.bind(model)
     main = model.graph
     decided = {
@@ -152,6 +156,9 @@ def _int8(
     node: ir.Node, facts: RuleFacts
 ) -> tuple[str, str, tuple[tuple[int, ...], int | None]]:
     """Return rule, reason, and which inputs become activations and weight."""
+    if reads := int8_inputs(node):
+        reason = f"{node.op_type} samples int8; positions and weights stay float"
+        return "sampled", reason, (reads, None)
     constant = node.inputs[1] in facts.constants
     layout = ((0,), 1) if constant else ((0, 1), None)
     if node in facts.attention:

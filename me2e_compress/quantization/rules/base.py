@@ -3,8 +3,8 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Collection, Mapping
-from typing import ClassVar
+from collections.abc import Callable, Collection, Mapping
+from typing import ClassVar, TypeAlias
 
 import onnx_ir as ir
 
@@ -21,6 +21,9 @@ from me2e_compress.quantization.find_attention import (
 from me2e_compress.quantization.geometry import find_geometry
 from me2e_compress.registry import Registry
 
+Objection: TypeAlias = Callable[[ir.Node], str | None]
+"""Says why a target cannot read int8 in a fused operator; None where it can."""
+
 
 class RuleFacts:
     """What rules may know besides the node; each fact is found when first asked for.
@@ -30,9 +33,11 @@ class RuleFacts:
         modules: which are to be int8.
         costs: estimates what int8 saves and costs on the target; None where no target
             is known, or it says nothing of costs.
+        fused: why fused operators read no int8 on the target; None where no target is
+            known.
 
     Attributes:
-        model, modules, costs: as given.
+        model, modules, costs, fused: as given.
     """
 
     def __init__(
@@ -40,8 +45,10 @@ class RuleFacts:
         model: ir.Model,
         modules: Collection[str],
         costs: CostsOf | None = None,
+        fused: Objection | None = None,
     ) -> None:
         self.model = model
+        self.fused = fused
         self.modules = frozenset(modules)
         self.costs = costs
 
@@ -123,6 +130,7 @@ RULES: Registry[Rule] = Registry(
     RecipeError,
     {
         "operator": f"{_HERE}.paper_rules:WeightedOperator",
+        "fused-operator": f"{_HERE}.paper_rules:FusedOperator",
         "module": f"{_HERE}.paper_rules:ModuleScope",
         "weight": f"{_HERE}.paper_rules:WeightOperand",
         "attention-length": f"{_HERE}.paper_rules:AttentionLength",

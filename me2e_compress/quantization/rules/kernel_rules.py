@@ -12,7 +12,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import CONVOLUTIONS, static_shape
-from me2e_compress.graph.shapes import extent
+from me2e_compress.graph.shapes import PRODUCTS, extent
 from me2e_compress.quantization.rules.base import Rule, RuleFacts
 
 
@@ -29,7 +29,7 @@ class SmallProduct(Rule):
 
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object if K or N is below the minimum."""
-        if node.op_type in CONVOLUTIONS:
+        if node.op_type not in PRODUCTS:
             return None
         size = extent(node, weight=node.inputs[1] in facts.constants)
         for name, found in (("K", size.depth), ("N", size.columns)):

@@ -5,23 +5,26 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, provenance
-from me2e_compress.graph.shapes import extent
+from me2e_compress.graph import WEIGHTED, is_standard, provenance
+from me2e_compress.graph.shapes import PRODUCTS, extent
+from me2e_compress.operators import int8_inputs
 from me2e_compress.quantization.find_attention import is_fused
 from me2e_compress.quantization.rules.base import Rule, RuleFacts, RuleSet
 
 
 @dataclasses.dataclass(frozen=True)
 class WeightedOperator(Rule):
-    """Only convolutions and matrix products are int8."""
+    """Convolutions and matrix products may be int8, and features that are sampled."""
 
     name: ClassVar[str] = "operator"
     firm: ClassVar[bool] = True
 
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Object to every other operator."""
+        """Object to every other operator, and to what the target cannot read."""
         if is_standard(node) and node.op_type in WEIGHTED:
             return None
+        if int8_inputs(node):
+            return None if facts.fused is None else facts.fused(node)
         if node not in facts.attention:
             return f"{node.op_type} is no weighted layer"
         if not is_fused(node):
@@ -31,6 +34,19 @@ class WeightedOperator(Rule):
             f"{node.op_type} is a whole attention of {size.queries} queries and"
             f" {size.keys} keys, its products cannot be reached"
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class FusedOperator(Rule):
+    """Fused operators stay as they are, the features too that they sample."""
+
+    name: ClassVar[str] = "fused-operator"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to every fused operator."""
+        if not int8_inputs(node):
+            return None
+        return f"{node.op_type} is fused: only convolutions and products become int8"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +73,8 @@ class WeightOperand(Rule):
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object to computed weights, constants on the left, other element types."""
         left, right = node.inputs[0], node.inputs[1]
+        if int8_inputs(node):
+            return _no_features(left, facts)
         types = {each.dtype for each in (left, right) if each is not None}
         if not types <= {ir.DataType.FLOAT, ir.DataType.FLOAT16, None}:
             return "neither float32 nor float16"
@@ -73,6 +91,15 @@ class WeightOperand(Rule):
         if node in facts.attention:
             return None
         return "both operands are computed, and no softmax follows: not a layer"
+
+
+def _no_features(value: ir.Value | None, facts: RuleFacts) -> str | None:
+    """Say why what a fused operator samples cannot become int8; None if it can."""
+    if value is None or value in facts.constants:
+        return "what it samples is constant"
+    if value.dtype not in (ir.DataType.FLOAT, None):
+        return "what it samples is not float32"
+    return None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +156,7 @@ class MatrixVector(Rule):
 
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object if one side of the product is a single row or column."""
-        if node.op_type in CONVOLUTIONS:
+        if node.op_type not in PRODUCTS:
             return None
         size = extent(node, weight=node.inputs[1] in facts.constants)
         if not size.is_vector:
@@ -151,9 +178,10 @@ class PaperRules(RuleSet):
     attention_limit: int = 512
 
     def own_rules(self) -> tuple[Rule, ...]:
-        """Return five rules, the stages last."""
+        """Return six rules, the stages last."""
         return (
             WeightedOperator(),
+            FusedOperator(),
             ModuleScope(),
             WeightOperand(),
             AttentionLength(self.attention_limit),

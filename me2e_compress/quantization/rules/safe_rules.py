@@ -97,7 +97,7 @@ class SafeRules(PaperRules):
 
     def own_rules(self) -> tuple[Rule, ...]:
         """Return what is no layer, what a model drives by, stages, kernels, cost."""
-        operator, module, weight, length, vector = super().own_rules()
+        operator, _, module, weight, length, vector = super().own_rules()
         return (
             *(operator, module, weight),
             *(Geometry(), Coordinates(), EgoInput()),

@@ -10,9 +10,15 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import constant_values
+from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.costs import Border, Costs, Join, Layers
+from me2e_compress.rewrite import sole_reader
 from me2e_compress.targets.onnxruntime.kernels import JOINS, end_of
 from me2e_compress.targets.onnxruntime.region import Region, find_region
+
+CACHE_BYTES = 2**21
+"""Feature maps of float32 up to this size are sampled as fast as uint8 ones: so many
+bytes of the second-level cache go to one core."""
 
 Counts: TypeAlias = Mapping[str, int]
 """How often each constant of :class:`CpuSeconds` goes into a time."""
@@ -37,6 +43,11 @@ class CpuSeconds:
         int8_answer: an element that a convolution rounds to uint8.
         int8_product: an element that a matrix product gives in float32.
         int8_weight: a weight.
+        float_sampled_mac: a multiply-accumulate of a fused operator that samples
+            feature maps too large for the cache.
+        int8_sampled_mac: the same with uint8 maps.
+        requantize: an element that a matrix product gives as uint8, on top of what it
+            takes in float32.
         quantize: an element, float32 to uint8.
         dequantize: an element, uint8 to float32.
     """
@@ -54,6 +65,9 @@ class CpuSeconds:
     int8_answer: float
     int8_product: float
     int8_weight: float
+    float_sampled_mac: float
+    int8_sampled_mac: float
+    requantize: float
     quantize: float
     dequantize: float
 
@@ -76,12 +90,16 @@ ZEN5 = CpuSeconds(
     int8_answer=0.06,
     int8_product=0.3,
     int8_weight=0.008,
+    float_sampled_mac=0.1,
+    int8_sampled_mac=0.075,
+    requantize=0.5,
     quantize=0.1,
     dequantize=0.17,
 )
 """Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
-``python -m benchmarks.fit_cpu_costs``. Ratios carry over to other processors with VNNI
-better than the seconds do."""
+``python -m benchmarks.fit_cpu_costs``; those of sampling and ``requantize`` by hand, to
+what ``python -m benchmarks.bench_int8_sampling`` shows. Ratios carry over to other
+processors with VNNI better than the seconds do."""
 
 
 def costs_of(
@@ -95,13 +113,22 @@ def costs_of(
         machine: seconds a piece.
     """
     weights = constant_values(model)
-    names = {str(node.outputs[0].name) for node in chosen if node.inputs[1] in weights}
+    names = {
+        str(node.outputs[0].name)
+        for node in chosen
+        if node.inputs[1] in weights or int8_inputs(node)
+    }
     region = find_region(model.graph, names)
     saved = {}
     for layer in region.layers:
         work = work_of(layer)
         if work is not None:
             saved[layer] = machine.seconds(work[0]) - machine.seconds(work[1])
+    for node in region.sampled.values():
+        macs = sampled_macs(node)
+        if macs is not None:
+            gain = machine.float_sampled_mac - machine.int8_sampled_mac
+            saved[node] = 1e-9 * gain * macs
     flow = _Flow(region)
     borders = tuple(flow.border(value, machine) for value in region.grids)
     return Costs(machine.machine, saved, borders)
@@ -128,6 +155,18 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
     if taps > 1 and not grouped:
         int8["int8_patch"] = taps * outputs // weight[0]
     return float_, int8
+
+
+def sampled_macs(node: ir.Node) -> int | None:
+    """Count the products of a fused operator on maps too large for the cache.
+
+    None where shapes are open.
+    """
+    found, shape = find(node), static_shape(node.inputs[0])
+    macs = None if found is None else found[0].cost(node, found[1]).macs
+    if macs is None or shape is None:
+        return None
+    return macs if 4 * math.prod(shape[1:]) > CACHE_BYTES else 0
 
 
 def _reordered(layer: ir.Node) -> int:
@@ -173,8 +212,9 @@ class _Flow:
         elements = math.prod(static_shape(value) or ())
         direct, carriers, others = self._uses(value)
         joins = [node for node in carriers if node.op_type in JOINS]
+        quantize = "requantize" if self._is_product(value) else "quantize"
         return Border(
-            machine.seconds({"kernel": 1, "quantize": elements}),
+            machine.seconds({"kernel": 1, quantize: elements}),
             machine.seconds({"kernel": 1, "dequantize": elements}),
             self.makers(value),
             frozenset(direct),
@@ -183,6 +223,15 @@ class _Flow:
             ),
             others or value.is_graph_output(),
         )
+
+    def _is_product(self, value: ir.Value) -> bool:
+        """Return whether only sampling makes a product of a region give uint8."""
+        reader, node = sole_reader(value), value.producer()
+        if node is None or reader not in self._region.sampled:
+            return False
+        before = [each.producer() for each in node.inputs if each is not None]
+        products = (node, *before) if node.op_type == "Add" else (node,)
+        return any(each in self._region.layers for each in products)
 
     def makers(self, value: ir.Value) -> Layers:
         """Return the layers that a tensor comes from: the nearest, of a join."""
@@ -220,6 +269,8 @@ class _Flow:
                 others = True
             elif reader in self._region.layers:
                 layers.append(reader)
+            elif reader in self._region.sampled:
+                layers.append(self._region.sampled[reader])
             else:
                 carriers.append(reader)
         return layers, carriers, others

@@ -1,7 +1,7 @@
 """From a draft to a graph that onnxruntime runs in int8: pairs, then layers."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import onnx_ir as ir
@@ -23,11 +23,13 @@ class Draft:
         model: the graph; lowering writes into it.
         weights: of every layer that is to be int8, by the name of its first output.
         reach: max(|low|, |high|) of the activations whose range is known, by name.
+        sampled: the fused operators that sample int8, by the name of their output.
     """
 
     model: ir.Model
     weights: Mapping[str, QuantizedWeight]
     reach: Mapping[str, float]
+    sampled: Collection[str] = ()
 
 
 def lower(draft: Draft) -> ir.Model:
@@ -37,7 +39,7 @@ def lower(draft: Draft) -> ir.Model:
         FramesError: the range of a tensor is not known.
     """
     main = draft.model.graph
-    region = find_region(main, draft.weights)
+    region = find_region(main, {*draft.weights, *draft.sampled})
     if missing := [name for name in region.ranged if name not in draft.reach]:
         raise FramesError(
             f"{len(missing)} tensors have no range, the first is {missing[0]}:"

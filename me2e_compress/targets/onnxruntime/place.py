@@ -7,6 +7,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.operators import int8_inputs, int8_op_types
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
 from me2e_compress.runtime.providers import CPU, Provider
@@ -47,7 +48,8 @@ class OnnxRuntime(Target):
         self.check_types(plan, model)
         weights = weights_of(model, _layers_of(plan))
         reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
-        return lower(Draft(model.clone(), weights, reach))
+        sampled = [each.output for each in _sampling(plan)]
+        return lower(Draft(model.clone(), weights, reach, sampled))
 
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
         """List the plan's nodes that :meth:`place` leaves in float, and why."""
@@ -61,6 +63,10 @@ class OnnxRuntime(Target):
             for each, reason in reasons
             if reason
         )
+
+    def fused_objection(self, node: ir.Node) -> str | None:
+        """Object to none: compiled kernels read uint8 as it is."""
+        return None
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs:
         """Estimate what int8 of some layers saves and costs on one core."""
@@ -85,13 +91,19 @@ def _layers_of(plan: QuantPlan) -> tuple[Decision, ...]:
     return tuple(each for each in plan.chosen if each.weight is not None)
 
 
+def _sampling(plan: QuantPlan) -> tuple[Decision, ...]:
+    """Return the fused operators of a plan that sample int8."""
+    names = int8_op_types()
+    return tuple(each for each in plan.chosen if each.op in names)
+
+
 def _region(plan: QuantPlan, model: ir.Model) -> Region:
-    chosen = {decision.output for decision in _layers_of(plan)}
+    chosen = {each.output for each in (*_layers_of(plan), *_sampling(plan))}
     return find_region(model.graph, chosen)
 
 
 def _objection(node: ir.Node, decision: Decision, region: Region) -> str | None:
-    if node in region.layers or node in region.readers:
+    if node in region.layers or node in region.readers or int8_inputs(node):
         return None
     if decision.weight is not None:
         return objection(node)

@@ -9,6 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.graph import producer_of
+from me2e_compress.operators import int8_inputs
 from me2e_compress.targets.onnxruntime.kernels import (
     JOINS,
     end_of,
@@ -33,12 +34,15 @@ class Region:
             that of the first tensor where elements are only moved.
         born: those that an int8 kernel answers, so that no float one exists.
         readers: what reads uint8 besides the layers.
+        sampled: fused operators that sample uint8, by the first node that reads it:
+            themselves, or a Reshape before them.
     """
 
     layers: dict[ir.Node, ir.Value]
     grids: dict[ir.Value, ir.Value]
     born: frozenset[ir.Value]
     readers: frozenset[ir.Node]
+    sampled: dict[ir.Node, ir.Node] = dataclasses.field(default_factory=dict)
 
     @property
     def ranged(self) -> tuple[str, ...]:
@@ -49,7 +53,7 @@ class Region:
         """Return whether a node takes an input as uint8, wherever that exists."""
         if node in self.readers:
             return index == 0 or node.op_type in JOINS
-        return node in self.layers and index == 0
+        return (node in self.layers or node in self.sampled) and index == 0
 
 
 def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
@@ -61,11 +65,13 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     * An Add or Concat of uint8 tensors stays if a convolution gave one of them and a
       layer reads the result: the residual branches and merges of a backbone or neck.
       The sums around a LayerNorm join two float tensors and stay float.
+    * A fused operator samples uint8, through the Reshapes before it: its kernel reads
+      the integers as they are.
 
     Args:
         graph: read as float everywhere, in topological order.
-        chosen: the layers that are to be int8, by the name of their first output;
-            those without a kernel are left out.
+        chosen: the layers and fused operators that are to be int8, by the name of
+            their first output; layers without a kernel are left out.
     """
     layers = {
         node: node.inputs[0]
@@ -77,6 +83,9 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     grids = {value: value for value in layers.values()}
     born: set[ir.Value] = set()
     readers: set[ir.Node] = set()
+    sampled: dict[ir.Node, ir.Node] = {}
+    sampling = {n for n in graph if n.outputs[0].name in chosen and int8_inputs(n)}
+    wanted = {_sampled(node, ())[0] for node in sampling}
     convolutions = {layer for layer in layers if layer.op_type == "Conv"}
     for node in graph:
         first = node.inputs[0] if node.inputs else None
@@ -88,10 +97,31 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
             grids[node.outputs[0]] = grids[first]
             born.add(node.outputs[0])
             readers.add(node)
-        elif node.op_type in JOINS and end in grids and _joins(node, grids, born):
+        elif (
+            node.op_type in JOINS
+            and (end in grids or end in wanted)
+            and _joins(node, grids, born)
+        ):
+            grids[end] = end
             born.add(end)
             readers.add(node)
-    return Region(layers, grids, frozenset(born), frozenset(readers))
+        elif node in sampling:
+            value, reader = _sampled(node, born)
+            grids.setdefault(value, value)
+            sampled[reader] = node
+    return Region(layers, grids, frozenset(born), frozenset(readers), sampled)
+
+
+def _sampled(node: ir.Node, born: Collection[ir.Value]) -> tuple[ir.Value, ir.Node]:
+    """Return what a fused operator samples as it was made, and who reads that."""
+    value = node.inputs[0]
+    assert value is not None
+    while value not in born and len(value.uses()) == 1:
+        made = value.producer()
+        if made is None or made.op_type != "Reshape" or made.inputs[0] is None:
+            break
+        value, node = made.inputs[0], made
+    return value, node
 
 
 def _joins(

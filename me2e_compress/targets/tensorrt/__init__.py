@@ -20,6 +20,7 @@ from me2e_compress import rewrite
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
+from me2e_compress.operators import find
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import (
     Decision,
@@ -87,6 +88,18 @@ class TensorRT(Target):
             writer.apply(nodes[decision.output], decision, weights.get(decision.output))
         rewrite.sweep(copy)
         return copy
+
+    def fused_objection(self, node: ir.Node) -> str | None:
+        """Say what a plugin takes: in explicit quantization none gets int8 by a pair.
+
+        A pair in front of it would be run by kernels of their own: the plugin reads
+        float. Those with int8 of their own take its scale by implicit quantization
+        (BEVFormer_tensorrt), or as one more input (SparseDriveV2).
+        """
+        found = find(node)
+        if found is None or ir.DataType.INT8 not in found[1].operands[0].types:
+            return f"the plugin {node.op_type} takes float32 or float16 alone"
+        return f"the plugin {node.op_type} gets the scale of int8 otherwise than by QDQ"
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
         """Predict what int8 of some layers saves and costs on the machine."""

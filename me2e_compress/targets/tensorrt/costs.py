@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.graph import CONVOLUTIONS, static_shape
+from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, static_shape
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.quantization.costs import Border, Costs
 
@@ -56,6 +56,7 @@ def costs_of(model: ir.Model, layers: Collection[ir.Node], rates: GpuRates) -> C
         rates: of the GPU.
     """
     constants = constant_values(model)
+    layers = [layer for layer in layers if layer.op_type in WEIGHTED]
     saved: dict[ir.Node, float] = {}
     readers: dict[ir.Value, list[ir.Node]] = {}
     for layer in layers:
