@@ -6,17 +6,18 @@ source, in which frame the control acts, exactly as the evaluator of highway-env
 (`me2e_compress.driving.realtime`).
 """
 
-import importlib
-import importlib.util
+import hashlib
 import re
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
+from me2e_compress.agents.agent_module import (
+    agent_class,
+    agent_module,
+    function_named,
+)
 from me2e_compress.agents.agent_options import AgentOptions, conf_parts, route_folder
 from me2e_compress.agents.carla_interface import (
     CarlaControl,
@@ -28,6 +29,7 @@ from me2e_compress.agents.carla_interface import (
 from me2e_compress.agents.decision_log import DecisionLog, DecisionRecord
 from me2e_compress.agents.forwarding import ForwardingAgent
 from me2e_compress.agents.metric_info import MetricInfo
+from me2e_compress.agents.traffic_around import agents_around
 from me2e_compress.driving.latency import (
     Charge,
     DecisionFacts,
@@ -127,9 +129,11 @@ class RealTimeAgent(ForwardingAgent):
         path, save_name = conf_parts(path_to_conf_file)
         options = RealTimeOptions.load(path)
         source, brake = options.source(), carla_control(0.0, 0.0, 1.0)
-        self._synchronize = _function(options.synchronize)
-        module = _module(options.agent)
-        self.adopt(_agent_class(module))
+        if options.model is not None and not options.model.is_file():
+            raise EvaluationError(f"model {options.model}: no such file")
+        self._synchronize = function_named(options.synchronize)
+        module = agent_module(options.agent)
+        self.adopt(agent_class(module))
         if options.tick and not hasattr(self._inner, options.tick):
             raise EvaluationError(
                 f"agent {options.agent} has no method {options.tick}: name its cheap "
@@ -139,11 +143,11 @@ class RealTimeAgent(ForwardingAgent):
         self._clock: ControlClock[CarlaControl] = control_clock(
             options.latency_model, brake, DT_US
         )
-        self._charge = _but_the_first(source, WALL_CLOCK.sub("", save_name))
+        self._charge = self._clock_of(source, WALL_CLOCK.sub("", save_name))
         self._tick, self._frame, self._began_ns = options.tick, 0, self.now_ns()
         folder = self._folder(options, save_name)
         self._metrics = MetricInfo(self._inner, folder)
-        model = sha256_of(options.model or Path(str(module.__file__)))
+        model = _digest(options.model or Path(str(module.__file__)))
         self._log = DecisionLog(folder, model, options.machine or processor())
 
     def sensors(self) -> SensorSpecs:
@@ -163,9 +167,11 @@ class RealTimeAgent(ForwardingAgent):
 
     def destroy(self) -> None:
         """Write the trace and ``metric_info.json``, then let the wrapped agent go."""
-        self._write()
-        if self._inner is not None:
-            self._inner.destroy()
+        try:
+            self._write()
+        finally:
+            if self._inner is not None:
+                self._inner.destroy()
 
     def _decide(self, input_data: SensorData, timestamp: float) -> None:
         with ExitStack() as failed:
@@ -177,13 +183,33 @@ class RealTimeAgent(ForwardingAgent):
             done = self.now_ns()
             failed.pop_all()
         measured_us = (done - begun) // 1_000
-        latency_us = self._charge(DecisionFacts(measured_us))
+        latency_us = self._charge(self._facts(measured_us))
         self._clock.decide(copy_of(control), latency_us)
         wall_s = round((done - self._began_ns) / 1e9, 6)
         if self._log is not None:
             self._log.note(
                 DecisionRecord(self._frame, timestamp, wall_s, measured_us, latency_us)
             )
+
+    def _facts(self, measured_us: int) -> DecisionFacts:
+        around = agents_around(getattr(self._inner, "hero_actor", None))
+        return DecisionFacts(measured_us, around)
+
+    def _clock_of(self, source: LatencySource, route: str) -> Charge:
+        """Return the route's clock; a first decision that is measured here is free.
+
+        Raises:
+            EvaluationError: The source asks for what nobody tells here.
+        """
+        source.on_route(route)(self._facts(0))  # a clock of its own
+        charge, warm = source.on_route(route), not source.measures
+
+        def charged(facts: DecisionFacts) -> int:
+            nonlocal warm
+            latency_us, warm = (charge(facts) if warm else 0), True
+            return latency_us
+
+        return charged
 
     def _skip(self, input_data: SensorData) -> None:
         """Let the wrapped agent see the frame, and count it, without deciding."""
@@ -209,66 +235,9 @@ class RealTimeAgent(ForwardingAgent):
         return Path(own)
 
 
-def _but_the_first(source: LatencySource, route: str) -> Charge:
-    """Return the route's clock; a first decision that is measured here is free.
-
-    Raises:
-        EvaluationError: The source asks for what nobody tells here.
-    """
-    source.on_route(route)(DecisionFacts(0))  # a clock of its own
-    charge, warm = source.on_route(route), not source.measures
-
-    def charged(facts: DecisionFacts) -> int:
-        nonlocal warm
-        latency_us, warm = (charge(facts) if warm else 0), True
-        return latency_us
-
-    return charged
-
-
-def _module(text: str) -> ModuleType:
-    """Import an agent's module as the leaderboard does: its folder is on the path.
-
-    Raises:
-        EvaluationError: No such file.
-    """
-    if not text.endswith(".py"):
-        return importlib.import_module(text)
-    path = Path(text)
-    if not path.is_file():
-        raise EvaluationError(f"agent {text}: no such file")
-    if str(path.parent) not in sys.path:
-        sys.path.insert(0, str(path.parent))
-    return importlib.import_module(path.stem)
-
-
-def _agent_class(module: ModuleType) -> Any:
-    """Return the class that a module's entry point names.
-
-    Raises:
-        EvaluationError: It names none, or an agent of ROS.
-    """
-    if not hasattr(module, "get_entry_point"):
-        raise EvaluationError(f"agent {module.__name__} has no get_entry_point")
-    found = getattr(module, module.get_entry_point())
-    if found.get_ros_version() != -1:
-        raise EvaluationError(
-            f"agent {module.__name__} is one of ROS: it has no run_step to wait for"
-        )
-    return found
-
-
-def _function(text: str) -> Callable[[], object]:
-    """Import what ``module:function`` names.
-
-    Raises:
-        EvaluationError: There is no such function.
-    """
-    if not text:
-        return lambda: None
-    module, _, name = text.partition(":")
-    try:
-        found: Callable[[], object] = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise EvaluationError(f"synchronize {text!r}: {error}") from error
-    return found
+def _digest(path: Path) -> str:
+    """Hash a file; a graph with its weights, as `profile` does."""
+    if path.suffix == ".onnx":
+        return sha256_of(path)
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

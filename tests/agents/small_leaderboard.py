@@ -64,6 +64,7 @@ class World:
     turn_deg: float = 0.0
     frame: int = 0
     sensors: list[dict[str, Any]] = field(default_factory=list)
+    others: list[SimpleNamespace] = field(default_factory=list)
 
     def tick(self, control: VehicleControl | None) -> None:
         self.frame += 1
@@ -83,18 +84,33 @@ class World:
 
     @property
     def hero(self) -> SimpleNamespace:
+        """The ego's actor; like CARLA's, it tells how things are when it is asked."""
+        return SimpleNamespace(
+            id=1,
+            type_id="vehicle.lincoln.mkz_2020",
+            get_acceleration=lambda: vector(self.acceleration, 0.0, 0.0),
+            get_angular_velocity=lambda: vector(0.0, 0.0, self.turn_deg),
+            get_location=lambda: vector(self.x, self.y, 0.0),
+            get_transform=self._transform,
+            get_world=lambda: SimpleNamespace(
+                get_actors=lambda: [self.hero, *self.others]
+            ),
+        )
+
+    def _transform(self) -> SimpleNamespace:
         yaw = math.radians(self.yaw_deg)
-        transform = SimpleNamespace(
+        return SimpleNamespace(
             location=vector(self.x, self.y, 0.0),
             rotation=SimpleNamespace(roll=0.0, pitch=0.0, yaw=self.yaw_deg),
             get_forward_vector=lambda: vector(math.cos(yaw), math.sin(yaw), 0.0),
             get_right_vector=lambda: vector(-math.sin(yaw), math.cos(yaw), 0.0),
         )
-        return SimpleNamespace(
-            get_acceleration=lambda: vector(self.acceleration, 0.0, 0.0),
-            get_angular_velocity=lambda: vector(0.0, 0.0, self.turn_deg),
-            get_transform=lambda: transform,
-        )
+
+    def put(self, kind: str, x: float, y: float) -> None:
+        """Put another actor there."""
+        place, number = vector(x, y, 0.0), len(self.others) + 2
+        actor = SimpleNamespace(id=number, type_id=kind, get_location=lambda: place)
+        self.others.append(actor)
 
     def sensed(self) -> dict[str, tuple[int, Any]]:
         return {each["id"]: (self.frame, self._sense(each)) for each in self.sensors}

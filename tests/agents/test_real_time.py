@@ -1,3 +1,4 @@
+import hashlib
 import json
 import re
 import sys
@@ -112,6 +113,20 @@ def test_the_trace_is_one_that_evaluate_takes(
     source = parse_latency(f"trace:{agent.save_path / 'latency.json'}")
 
     assert source.on_route("any")(DecisionFacts(0)) >= 0
+
+
+@pytest.mark.parametrize("name", ["vad.onnx", "vad.pth"])
+def test_the_trace_names_the_model(
+    board: Leaderboard, tmp_path: Path, name: str
+) -> None:
+    model = written(tmp_path / name, "")
+    options = config(tmp_path, model=str(model), machine="Orin, 30 W")
+
+    agent = board.drive(real_time, options, 3)
+
+    found = LatencyTrace.load(agent.save_path / "latency.json")
+    assert found.model_sha256 == hashlib.sha256(b"").hexdigest()
+    assert found.machine == "Orin, 30 W"
 
 
 def test_every_decision_is_a_line(board: Leaderboard, tmp_path: Path) -> None:
@@ -261,13 +276,13 @@ def test_routes_without_a_save_name_are_numbered(
 
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"latency": "fps:0"}, "not a positive number"),
-    ({"latency": "agents{source=none, per_agent_us=9}"}, "does not tell where"),
     ({"latency": "trace:none.json"}, "none.json: No such file"),
     ({"agent": "no_agent.py"}, "agent no_agent.py: no such file"),
     ({"agent": "json"}, "agent json has no get_entry_point"),
     ({"tick": "see"}, "has no method see"),
     ({"synchronize": "json:wait"}, "synchronize 'json:wait'"),
     ({"colour": "red"}, "colour"),
+    ({"model": "none.pth"}, "model none.pth: no such file"),
     ({"latency_model": "guess"}, "latency_model"),
 ]
 
@@ -309,6 +324,35 @@ def test_without_carla_the_message_says_so(
 
     with pytest.raises(MissingPackageError, match="carla is not installed"):
         agent.setup(config(tmp_path))
+
+
+CROWD = "agents{source=none, per_agent_us=100000, range_m=30.0, fov_deg=90.0}"
+
+
+def test_a_latency_may_depend_on_who_is_there(
+    board: Leaderboard, tmp_path: Path
+) -> None:
+    board.world.yaw_deg = 90.0  # facing CARLA's +y
+    board.world.put("vehicle.audi.tt", 0.0, 20.0)
+    board.world.put("walker.pedestrian.0001", 5.0, 10.0)
+    board.world.put("vehicle.audi.tt", 20.0, 0.0)  # to the left
+    board.world.put("vehicle.audi.tt", 0.0, 40.0)  # far ahead
+    board.world.put("traffic.traffic_light", 0.0, 10.0)
+
+    agent = board.drive(real_time, config(tmp_path, latency=CROWD), 1)
+
+    line = json.loads((agent.save_path / "decisions.jsonl").read_text())
+    assert line["latency_us"] == 200_000
+
+
+def test_without_a_hero_such_a_latency_is_refused(
+    board: Leaderboard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = NUMBERED.read_text().replace("fails_at = -1", "hero_actor = None")
+    agent = str(written(tmp_path / "plain_agent.py", source))
+
+    with pytest.raises(EvaluationError, match="does not tell where others are"):
+        board.make(real_time, config(tmp_path, latency=CROWD, agent=agent))
 
 
 def test_the_world_goes_on_meanwhile(board: Leaderboard, tmp_path: Path) -> None:
