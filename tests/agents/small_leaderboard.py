@@ -88,7 +88,7 @@ class World:
         return SimpleNamespace(
             id=1,
             type_id="vehicle.lincoln.mkz_2020",
-            get_acceleration=lambda: vector(self.acceleration, 0.0, 0.0),
+            get_acceleration=lambda: vector(*self._pushed(), 0.0),
             get_angular_velocity=lambda: vector(0.0, 0.0, self.turn_deg),
             get_location=lambda: vector(self.x, self.y, 0.0),
             get_transform=self._transform,
@@ -96,6 +96,10 @@ class World:
                 get_actors=lambda: [self.hero, *self.others]
             ),
         )
+
+    def _pushed(self) -> tuple[float, float]:
+        yaw = math.radians(self.yaw_deg)
+        return self.acceleration * math.cos(yaw), self.acceleration * math.sin(yaw)
 
     def _transform(self) -> SimpleNamespace:
         yaw = math.radians(self.yaw_deg)
@@ -207,6 +211,10 @@ def _gps(x: float, y: float) -> dict[str, float]:
     return {"lat": latitude, "lon": longitude}
 
 
+def _listed(found: SimpleNamespace) -> list[float]:
+    return [found.x, found.y, found.z]
+
+
 class SensorInterface:
     read: Callable[[], dict[str, tuple[int, Any]]]
 
@@ -248,7 +256,16 @@ def modules(board: Leaderboard) -> dict[str, ModuleType]:
 
         def get_metric_info(self) -> dict[str, list[float]]:
             hero = board.world.hero
-            return {"location": [hero.get_transform().location.x, 0.0, 0.0]}
+            at = hero.get_transform()
+            turned = at.rotation
+            return {
+                "acceleration": _listed(hero.get_acceleration()),
+                "angular_velocity": _listed(hero.get_angular_velocity()),
+                "forward_vector": _listed(at.get_forward_vector()),
+                "right_vector": _listed(at.get_right_vector()),
+                "location": _listed(at.location),
+                "rotation": [turned.roll, turned.pitch, turned.yaw],
+            }
 
     carla = ModuleType("carla")
     carla.VehicleControl = VehicleControl  # type: ignore[attr-defined]

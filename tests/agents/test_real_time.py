@@ -17,6 +17,7 @@ from me2e_compress.agents import real_time
 from me2e_compress.driving.latency import DecisionFacts, parse_latency
 from me2e_compress.driving.realtime import DT_US, LatencyModel, control_clock
 from me2e_compress.errors import EvaluationError, MissingPackageError
+from me2e_compress.evaluators.bench2drive.evaluator import Bench2DriveResults
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from tests.agents.small_leaderboard import (
     SAVE_NAME,
@@ -26,6 +27,7 @@ from tests.agents.small_leaderboard import (
     installed,
     written,
 )
+from tests.evaluators.bench2drive.files import checkpoint, record, write
 
 NUMBERED = Path(__file__).with_name("numbered_agent.py")
 BRAKING = (0.0, 0.0, 1.0)
@@ -171,6 +173,20 @@ def test_metric_info_has_every_frame(board: Leaderboard, tmp_path: Path) -> None
     places = [each["location"][0] for each in found.values()]
     assert places == sorted(places)
     assert places[-1] == pytest.approx(board.world.x)
+
+
+def test_the_reader_of_real_results_takes_what_is_left(
+    board: Leaderboard, tmp_path: Path
+) -> None:
+    board.drive(real_time, config(tmp_path, latency="fps:5"), 60)
+    route = record(1711, duration_s=3.0)
+    assert route["save_name"] == SAVE_NAME
+    write(tmp_path / "eval.json", checkpoint(route))
+
+    found = Bench2DriveResults(tmp_path).collect()
+
+    assert (found.unrecorded, dict(found.off_rate), dict(found.broken)) == ((), {}, {})
+    assert len(found.episodes[0].frames) == 60
 
 
 def test_an_agent_without_a_cheap_part_has_its_steps_counted(
