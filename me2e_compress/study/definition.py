@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.policies import driver_named
@@ -11,6 +12,7 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route
+from me2e_compress.study.blocks import Block, FramesToRecord
 from me2e_compress.study.condition import Condition, check_conditions
 from me2e_compress.study.names import check_name, check_unique
 
@@ -100,6 +102,11 @@ class Study:
         timing: How latencies are measured.
         seed: Of bootstraps, of passes and of draws from traces.
         provider: What runs the models, wherever one is run.
+        to_record: Frames that it records itself; None takes folders.
+        blocks: Which variants drive under which conditions; none is all under all.
+            Under each condition the baseline drives too.
+        report: What is made of the results: a comparison, or the paper's tables, one
+            a block.
 
     Raises:
         StudyError: Nothing to drive, a name twice, a baseline that is not a variant, a
@@ -118,6 +125,9 @@ class Study:
     timing: Timing = field(default_factory=Timing)
     seed: int = 0
     provider: Provider = CPU
+    to_record: FramesToRecord | None = None
+    blocks: tuple[Block, ...] = ()
+    report: Literal["comparison", "paper"] = "comparison"
 
     def __post_init__(self) -> None:
         """Refuse what could not be finished."""
@@ -134,7 +144,10 @@ class Study:
             raise StudyError(f"{self.title}: there is no route to drive")
         if self.seed < 0:
             raise StudyError(f"seed {self.seed}: must be 0 or more")
-        self._check_frames()
+        for block in self.blocks:
+            block.check(names, [each.name for each in self.conditions])
+        if self.to_record is None:
+            self._check_frames()
 
     def _check_frames(self) -> None:
         needy = [
@@ -178,6 +191,17 @@ class Study:
                 CalibrationSet(folder)
             except FramesError as error:
                 raise StudyError(f"{name}: {error}") from error
+
+    def driven_under(self, condition: Condition) -> tuple[Variant, ...]:
+        """Return the variants that drive under a condition; none under one of no block.
+
+        Where any drives, the baseline does.
+        """
+        if not self.blocks:
+            return self.variants
+        blocks = [each for each in self.blocks if condition.name in each.conditions]
+        wanted = {name for each in blocks for name in (*each.variants, self.baseline)}
+        return tuple(each for each in self.variants if each.name in wanted)
 
     @property
     def reference(self) -> Variant:

@@ -10,13 +10,14 @@ from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import Engine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
-from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.evaluators.highway.results import ResultsFolder, fingerprint
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
@@ -80,11 +81,15 @@ class DriveSetup:
     def under(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
     ) -> tuple[Drive, ...]:
-        """Drive all variants under one condition, the baseline first.
+        """Drive the variants of one condition, the baseline first.
 
         Raises:
             EvaluationError: A folder is of another evaluation or cannot be written.
         """
+        driven = self.study.driven_under(condition)
+        prepared = [each for each in prepared if each.variant in driven]
+        if not prepared:
+            return ()
         names = [each.variant.name for each in prepared]
         baseline = prepared[names.index(self.study.baseline)]
         reference = self._episodes(baseline, condition)
@@ -99,7 +104,9 @@ class DriveSetup:
         )
 
     def job(self, prepared: PreparedVariant, condition: Condition) -> Job | None:
-        """Return who drives under what; None if its latency is not known."""
+        """Return who drives under what; None if that, or its latency, is not known."""
+        if prepared.failure:
+            return None
         latency = self._latency(prepared, condition)
         if latency is None:
             return None
@@ -120,7 +127,12 @@ class DriveSetup:
         variant, under = condition.mean_cell
         by_name = {each.name: each for each in self.study.variants}
         conditions = {each.name: each for each in self.study.conditions}
-        path = self.workspace.results(by_name[variant], conditions[under])
+        cell = by_name[variant], conditions[under]
+        if self.workspace.record(*cell).is_file():
+            kept = DriveRecord.load(self.workspace.record(*cell)).mean_latency_us
+            if kept is not None:
+                return kept
+        path = self.workspace.results(*cell)
         driven = ResultsFolder.open(path).episodes().values() if path.exists() else ()
         taken = [each.latency_us for episode in driven for each in episode.decisions]
         if not taken:
@@ -128,6 +140,34 @@ class DriveSetup:
                 f"condition {condition.name}: {condition.mean_of} took no decision"
             )
         return round(fmean(taken))
+
+    def record(self, prepared: PreparedVariant, condition: Condition) -> DriveRecord:
+        """Drive, and keep it without its frames; what is kept is not driven again.
+
+        Raises:
+            EvaluationError: A folder is of another evaluation or cannot be written, or
+                a process was killed.
+            StudyError: It cannot be driven, or what is kept is of another evaluation.
+        """
+        variant, job = prepared.variant, self.job(prepared, condition)
+        if job is None:
+            raise StudyError(self._why_not(prepared))
+        study, path = self.study, self.workspace.record(variant, condition)
+        made_by = fingerprint(job, study.routes, study.set_size)
+        if path.is_file():
+            kept = DriveRecord.load(path)
+            if other := kept.difference_from(made_by):
+                raise StudyError(f"{path}: of another evaluation: {other}")
+            return kept
+        episodes = self._episodes(prepared, condition) or ()
+        record = DriveRecord.of(variant.name, condition.name, made_by, episodes)
+        record.save(path)
+        return record
+
+    def _why_not(self, prepared: PreparedVariant) -> str:
+        if prepared.failure or prepared.model is None:
+            return prepared.failure or "no model: it has no latency of its own"
+        return f"its latency was not measured: {self.clock.reason}"
 
     def _episodes(
         self, prepared: PreparedVariant, condition: Condition
@@ -155,9 +195,7 @@ class DriveSetup:
     ) -> Drive:
         name, seed = prepared.variant.name, self.study.seed
         if episodes is None:
-            why = "no model: it has no latency of its own"
-            if prepared.model is not None:
-                why = f"its latency was not measured: {self.clock.reason}"
+            why = self._why_not(prepared)
             return Drive(name, condition.name, None, reason=why)
         return Drive(
             name,

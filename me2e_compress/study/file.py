@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
@@ -12,10 +13,21 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.study.blocks import Block, FramesToRecord
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.zoo.shipped import SHIPPED
+
+STUDIES = Path(__file__).parent / "shipped"
+"""Studies that ship, one TOML file each."""
+
+
+def study_path(study: str | Path) -> Path:
+    """Find a study: a file, or, where there is none, one that ships by its name."""
+    path = Path(study)
+    shipped = STUDIES / f"{path}.toml"
+    return shipped if not path.exists() and shipped.is_file() else path
 
 
 def load_study(
@@ -30,7 +42,7 @@ def load_study(
     is a model that ships.
 
     Args:
-        path: The TOML file.
+        path: The TOML file, or the name of a study that ships.
         routes: Drive these instead of the study's.
         provider: What runs the models, instead of the study's, as a text.
         plugins: Libraries of operators or plugins, besides the study's.
@@ -43,7 +55,7 @@ def load_study(
         EvaluationError: Unknown routes or latency.
         ProviderError: A provider or library that is not there.
     """
-    path = Path(path)
+    path = study_path(path)
     try:
         content = documents.from_toml(documents.content(path))
     except OSError as error:
@@ -94,6 +106,18 @@ class _Latency(_Table):
     baseline_median_s: float | None = None
 
 
+class _Block(_Table):
+    name: str
+    variants: list[str]
+    conditions: list[str]
+
+
+class _Record(_Table):
+    frames: int
+    held_out: int
+    seed: int = 0
+
+
 class _Study(_Table):
     title: str
     baseline: str
@@ -103,10 +127,13 @@ class _Study(_Table):
     held_out: str | None = None
     provider: str = "cpu"
     plugins: list[str] = Field(default_factory=list)
+    record: _Record | None = None
+    report: Literal["comparison", "paper"] = "comparison"
     latency: _Latency = Field(default_factory=_Latency)
     variant: list[_Variant] = Field(validation_alias=AliasChoices("variant", "scheme"))
     """Files written before variants had their name say ``[[scheme]]``."""
     condition: list[_Condition]
+    block: list[_Block] = Field(default_factory=list)
 
 
 _KINDS: dict[object, type[_Table]] = {
@@ -114,6 +141,8 @@ _KINDS: dict[object, type[_Table]] = {
     "scheme": _Variant,
     "condition": _Condition,
     "latency": _Latency,
+    "block": _Block,
+    "record": _Record,
 }
 
 
@@ -153,7 +182,23 @@ class _Reader:
             timing=Timing(timing.samples, timing.threads, timing.baseline_median_s),
             seed=table.seed,
             provider=provider_named(table.provider, libraries),
+            to_record=self._to_record(table),
+            blocks=tuple(
+                Block(each.name, tuple(each.variants), tuple(each.conditions))
+                for each in table.block
+            ),
+            report=table.report,
         )
+
+    def _to_record(self, table: _Study) -> FramesToRecord | None:
+        asked = table.record
+        if asked is None:
+            return None
+        if table.frames is not None or table.held_out is not None:
+            raise StudyError(
+                f"{self.path}: give folders of frames, or what to record, not both"
+            )
+        return FramesToRecord(asked.frames, asked.held_out, asked.seed)
 
     def _variant(self, table: _Variant) -> Variant:
         policy, adapter = table.policy, table.adapter

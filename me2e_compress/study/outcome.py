@@ -49,12 +49,13 @@ class VariantOutcome:
         """Collect what was found."""
         size = prepared.size_bytes
         name = prepared.variant.name
-        why = "no model" if prepared.model is None else clock.reason
+        why = prepared.failure or "no model"
+        late = why if prepared.model is None else clock.reason
         return cls(
             prepared,
-            Measure(None, "MB", "no model") if size is None else _mb(size),
+            Measure(None, "MB", why) if size is None else _mb(size),
             {
-                percent: _ms(clock.milliseconds(name, percent), why)
+                percent: _ms(clock.milliseconds(name, percent), late)
                 for percent in LATENCY_PERCENTILES
             },
             fidelity,
@@ -117,6 +118,14 @@ class StudyResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return none: the tables say it."""
         return ()
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return the variants that failed, and why."""
+        failed = [each.prepared for each in self.variants if each.prepared.failure]
+        return tuple(
+            f"variant {each.variant.name} was left out: {each.failure}"
+            for each in failed
+        )
 
     def tables(self) -> tuple[Table, ...]:
         """Return every table, in the order of reading."""

@@ -69,6 +69,8 @@ def judge(
     if study.held_out is None:
         return PlanFidelity.unknown("no held-out frames were given")
     if prepared.model is None or baseline.model is None:
+        if prepared.failure:
+            return PlanFidelity.unknown(prepared.failure)
         lacks = prepared if prepared.model is None else baseline
         return PlanFidelity.unknown(f"{lacks.variant.name} is not a model")
     if prepared is baseline:

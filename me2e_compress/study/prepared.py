@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.errors import StudyError
+from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.modules import ModuleMap
 from me2e_compress.recipe import to_text
@@ -36,6 +36,7 @@ class PreparedVariant:
         pipeline: The passes, as text; empty if the model is its own source.
         sha256: Of the model.
         size_bytes: Of the model with its weights.
+        failure: Why there is no model that can drive; empty if there is one.
     """
 
     variant: Variant
@@ -45,6 +46,33 @@ class PreparedVariant:
     pipeline: str = ""
     sha256: str | None = None
     size_bytes: int | None = None
+    failure: str = ""
+
+
+def prepare_all(
+    study: Study, workspace: Workspace, listener: Listener
+) -> list[PreparedVariant]:
+    """Find or make every variant's driver; one that fails leaves the others.
+
+    Raises:
+        Me2eError: The baseline's failed: there is nothing to hold the others against.
+    """
+    return [
+        _prepared_or_failed(study, each, workspace, listener) for each in study.variants
+    ]
+
+
+def _prepared_or_failed(
+    study: Study, variant: Variant, workspace: Workspace, listener: Listener
+) -> PreparedVariant:
+    try:
+        return prepare_variant(study, variant, workspace, listener)
+    except Me2eError as error:
+        if variant is study.reference:
+            raise
+        listener.on_warning(f"variant {variant.name} is left out: {error}")
+        driver = driver_named(variant.policy, variant.adapter)
+        return PreparedVariant(variant, driver, failure=str(error))
 
 
 def prepare_variant(

@@ -9,7 +9,8 @@ from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import StudyResult, VariantOutcome, this_machine
 from me2e_compress.study.plan_fidelity import judge
-from me2e_compress.study.prepared import PreparedVariant, prepare_variant
+from me2e_compress.study.prepared import PreparedVariant, prepare_all
+from me2e_compress.study.recorded import recorded
 from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
@@ -42,8 +43,9 @@ def run_study(
 
     Raises:
         GraphError: The folder is a file or an input.
-        Me2eError: A model cannot drive, a pass refused its graph, frames do not fit,
-            or the folder is of another study; one line that names the culprit.
+        Me2eError: The baseline cannot drive, frames do not fit, or the folder is of
+            another study; one line that names the culprit. Another variant that fails
+            is left out, with a warning.
     """
     study, folder = _read(study), Path(folder)
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
@@ -56,10 +58,8 @@ def _run(
     study: Study, folder: Path, engine: Engine, listener: Listener, pictures: int
 ) -> StudyResult:
     workspace = Workspace(folder)
-    prepared = [
-        prepare_variant(study, variant, workspace, listener)
-        for variant in study.variants
-    ]
+    study = recorded(study, workspace, listener)
+    prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
     variants = _variants(study, prepared, clock, listener)
     setup = DriveSetup(study, clock, workspace, engine, listener)

@@ -25,6 +25,10 @@ class Workspace:
         """Return the folder of results of one variant under one condition."""
         return self._made("results") / f"{variant.name}.{condition.name}"
 
+    def record(self, variant: Variant, condition: Condition) -> Path:
+        """Return the file that keeps a finished drive without its frames."""
+        return self.folder / "records" / f"{variant.name}.{condition.name}.jsonl"
+
     def model(self, variant: Variant, key: str) -> Path:
         """Return where the model goes that passes make: a key is a recipe's hash."""
         return self._made("models") / f"{variant.name}.{key[:16]}.onnx"

@@ -1,0 +1,199 @@
+"""What the tables need of a drive, without its frames: one line a route.
+
+A drive of 220 routes is 30 MB of episodes and 0.1 MB of these: small enough to keep in
+a repository, and quick to read.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter, with_config
+
+from me2e_compress import documents
+from me2e_compress.errors import StudyError
+from me2e_compress.metrics.comfort import comfort
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.efficiency import efficiency
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.infraction import COLLISIONS
+from me2e_compress.runtime.atomic import write_bytes
+
+PERCENTS = (50, 90, 99, 100)
+"""Of the latencies of a route's decisions."""
+DIGITS = 6
+
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True)
+class RouteRecord:
+    """One route of one drive.
+
+    Attributes:
+        route: Its id.
+        scenario: Its type.
+        driving_score: Percent.
+        completion: Percent of the route.
+        succeeded: The whole route without an infraction.
+        ending: Why it was over, in words.
+        infractions: Kind, microseconds, and with whom or against what.
+        efficiency: Percent; None where no traffic moved, or the ego did not.
+        comfort: Share of smooth segments; None where there was no whole one.
+        duration_us: Until the last frame.
+        decisions: How many.
+        latency_us: What they cost on the vehicle: `PERCENTS` of them.
+    """
+
+    route: str
+    scenario: str
+    driving_score: float
+    completion: float
+    succeeded: bool
+    ending: str
+    infractions: tuple[tuple[str, int, str], ...]
+    efficiency: float | None
+    comfort: float | None
+    duration_us: int
+    decisions: int
+    latency_us: tuple[int, ...]
+
+    @property
+    def collisions(self) -> tuple[tuple[str, str], ...]:
+        """Kind and partner of each collision."""
+        return tuple(
+            (kind, detail) for kind, _, detail in self.infractions if kind in COLLISIONS
+        )
+
+    @classmethod
+    def of(cls, episode: Episode) -> Self:
+        """Sum up an episode."""
+        charged = [each.latency_us for each in episode.decisions]
+        percentiles = (
+            np.percentile(charged, PERCENTS, method="higher") if charged else []
+        )
+        return cls(
+            episode.route,
+            episode.scenario,
+            route_score(episode).composed,
+            episode.completion_percent,
+            episode.succeeded,
+            episode.ending.value,
+            tuple((e.kind.value, e.time_us, e.detail) for e in episode.infractions),
+            _rounded(efficiency(episode).value),
+            _rounded(comfort(episode).value),
+            episode.frames[-1].time_us if episode.frames else 0,
+            len(charged),
+            tuple(int(each) for each in latency_us) if charged else (),
+        )
+
+
+_ROUTE = TypeAdapter(RouteRecord)
+
+
+@dataclass(frozen=True)
+class DriveRecord:
+    """One variant under one condition over routes.
+
+    Attributes:
+        variant: Its name.
+        condition: Its name.
+        set_size: How many routes the whole set has.
+        made_by: What decided it: version, digests of the policy and of the routes,
+            latency and the like, as `evaluate` keeps them.
+        routes: One a route.
+    """
+
+    variant: str
+    condition: str
+    set_size: int
+    made_by: Mapping[str, Any]
+    routes: tuple[RouteRecord, ...]
+
+    @classmethod
+    def of(
+        cls,
+        variant: str,
+        condition: str,
+        made_by: Mapping[str, Any],
+        episodes: Iterable[Episode],
+    ) -> Self:
+        """Sum up the episodes of a drive.
+
+        Args:
+            variant: Its name.
+            condition: Its name.
+            made_by: The fingerprint of the evaluation; its list of routes is left out,
+                the lines name them.
+            episodes: One a route.
+        """
+        kept = {key: value for key, value in made_by.items() if key != "routes"}
+        routes = tuple(map(RouteRecord.of, episodes))
+        return cls(variant, condition, int(made_by["set_size"]), kept, routes)
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON lines: what made it, then a line a route.
+
+        Raises:
+            StudyError: The file cannot be written.
+        """
+        head = {
+            "variant": self.variant,
+            "condition": self.condition,
+            "made_by": self.made_by,
+        }
+        rows = [_ROUTE.dump_python(each, mode="json") for each in self.routes]
+        lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, ("\n".join(lines) + "\n").encode())
+        except OSError as error:
+            raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            StudyError: It cannot be read, is none or was cut off, or names a route
+                twice.
+        """
+        try:
+            head, *rows = map(documents.from_json, _lines(path))
+            routes = tuple(_ROUTE.validate_python(row) for row in rows)
+            made_by, set_size = head["made_by"], int(head["made_by"]["set_size"])
+            record = cls(head["variant"], head["condition"], set_size, made_by, routes)
+        except OSError as error:
+            raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
+        except (ValueError, KeyError, TypeError) as error:
+            words = " ".join(str(error).split())[:200]
+            raise StudyError(f"{path}: not a record of a drive: {words}") from error
+        names = [each.route for each in routes]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise StudyError(f"{path}: names route {twice} twice")
+        return record
+
+    def difference_from(self, made_by: Mapping[str, Any]) -> str:
+        """Say what made it otherwise than this; empty if nothing did."""
+        for key in sorted({*made_by, *self.made_by} - {"routes"}):
+            old, new = self.made_by.get(key), made_by.get(key)
+            if old != new:
+                return f"its {key} is {str(old)[:60]}, this one's {str(new)[:60]}"
+        return ""
+
+
+def _lines(path: Path) -> list[str]:
+    text = documents.content(path).decode("utf-8")
+    if not text.endswith("\n"):
+        raise ValueError("its last line was cut off")
+    return text.splitlines()
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, DIGITS)

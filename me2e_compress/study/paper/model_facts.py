@@ -1,0 +1,164 @@
+"""What is known of a variant's file apart from how it drives."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
+
+from me2e_compress import documents, graph
+from me2e_compress.errors import StudyError
+from me2e_compress.graph import WEIGHTED
+from me2e_compress.quantization.plan import plan_of
+from me2e_compress.runtime.atomic import write_json
+from me2e_compress.study.prepared import PreparedVariant
+from me2e_compress.study.timing import Clock
+from me2e_compress.workflows.inspect import inspect
+
+FILE = "variants.json"
+
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True)
+class Int8Counts:
+    """What of a graph is int8.
+
+    Attributes:
+        tensors: Activations with a scale of their own: nodes that quantize.
+        operators: Nodes that read int8: layers, attention products, residual Adds.
+        compute_intensive: Those of them that are convolutions or matrix products.
+    """
+
+    tensors: int
+    operators: int
+    compute_intensive: int
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True)
+class ModelFacts:
+    """A variant's file.
+
+    Attributes:
+        variant: Its name.
+        sha256: Of the file; None where there is none.
+        pipeline: The passes that made it, as text; empty if none did.
+        size_bytes: Of the file with its weights.
+        parameters: Elements of its weights.
+        macs: Multiply-accumulates of one inference.
+        int8: What of it is int8; None for a file without a plan.
+        latency_us: Of inferences alone, warm, on the device imagined.
+        modules_us: Of inferences under a profiler, module by module, on the device.
+        failure: Why there is no file that can drive; empty if there is one.
+    """
+
+    variant: str
+    sha256: str | None = None
+    pipeline: str = ""
+    size_bytes: int | None = None
+    parameters: int | None = None
+    macs: int | None = None
+    int8: Int8Counts | None = None
+    latency_us: tuple[int, ...] = ()
+    modules_us: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    failure: str = ""
+
+    def latency_ms(self, percent: float) -> float | None:
+        """Return a percentile of the latencies; None where none were measured."""
+        if not self.latency_us:
+            return None
+        return float(np.percentile(self.latency_us, percent, method="higher")) / 1e3
+
+    @property
+    def fps(self) -> float | None:
+        """Inferences a second at the mean latency, as the paper's FPS column."""
+        if not self.latency_us:
+            return None
+        return 1e6 / float(np.mean(self.latency_us))
+
+
+_FACTS = TypeAdapter(tuple[ModelFacts, ...])
+
+
+def facts_of(
+    prepared: PreparedVariant, clock: Clock, known: Mapping[str, ModelFacts]
+) -> ModelFacts:
+    """Weigh a variant's file, unless that was done before.
+
+    Args:
+        prepared: The variant.
+        clock: Latencies of the variants.
+        known: What was found before, by the variant's name.
+    """
+    name = prepared.variant.name
+    trace = clock.traces.get(name)
+    latency_us = () if trace is None else _scaled(trace.samples_us, clock.scale)
+    before = known.get(name)
+    if before is not None and before.sha256 == prepared.sha256 is not None:
+        if before.latency_us == latency_us:
+            return before
+    if prepared.model is None:
+        return ModelFacts(name, failure=prepared.failure)
+    found = inspect(prepared.model, prepared.variant.module_map)
+    return ModelFacts(
+        name,
+        prepared.sha256,
+        prepared.pipeline,
+        prepared.size_bytes,
+        sum(each.parameters for each in found.modules),
+        found.macs,
+        int8_counts(prepared.model),
+        latency_us,
+    )
+
+
+def int8_counts(path: Path) -> Int8Counts | None:
+    """Count what of a file is int8; None for one that carries no plan."""
+    loaded = graph.load(path)
+    plan = plan_of(loaded)
+    if plan is None:
+        return None
+    ops = [each.op for each in plan.placed]
+    return Int8Counts(
+        sum(node.op_type == "QuantizeLinear" for node in loaded.graph.all_nodes()),
+        len(ops),
+        sum(op in WEIGHTED for op in ops),
+    )
+
+
+def save_facts(path: Path, facts: Sequence[ModelFacts], about: Mapping[str, object]) -> None:
+    """Write facts and what they were found on.
+
+    Raises:
+        StudyError: The file cannot be written.
+    """
+    rows = _FACTS.dump_python(tuple(facts), mode="json")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, {**about, "variants": rows})
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def load_facts(path: Path) -> tuple[dict[str, object], dict[str, ModelFacts]]:
+    """Read what `save_facts` wrote: what it was found on, and the facts by variant.
+
+    Raises:
+        StudyError: The file cannot be read, or holds something else.
+    """
+    try:
+        content = documents.from_json(documents.content(path))
+        facts = _FACTS.validate_python(content.pop("variants"))
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, ValidationError, KeyError, AttributeError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise StudyError(f"{path}: not facts of variants: {words}") from error
+    return content, {each.variant: each for each in facts}
+
+
+def _scaled(samples_us: Iterable[int], scale: float) -> tuple[int, ...]:
+    return tuple(round(each * scale) for each in samples_us)

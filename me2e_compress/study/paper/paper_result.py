@@ -1,0 +1,120 @@
+"""What the paper's study found so far."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from me2e_compress.study.definition import Study
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.paper.model_facts import ModelFacts
+from me2e_compress.study.paper.paper_tables import all_paper_tables
+from me2e_compress.study.paper.route_columns import COLUMNS, mean_of
+from me2e_compress.workflows.result import Result, Table
+
+CellKey = tuple[str, str]
+"""A variant and a condition, by their names."""
+
+
+@dataclass(frozen=True, repr=False)
+class PaperResult(Result):
+    """The cells that were driven, and what is known of the files that drove.
+
+    Attributes:
+        study: What was asked.
+        facts: One a variant, in the study's order.
+        cells: What was driven.
+        failures: Why a cell was not.
+        device_scale: How many times slower the device is than the machine timed on.
+        machine: What it was made on, in words.
+    """
+
+    study: Study
+    facts: tuple[ModelFacts, ...]
+    cells: Mapping[CellKey, DriveRecord]
+    failures: Mapping[CellKey, str]
+    device_scale: float
+    machine: str
+
+    @property
+    def title(self) -> str:
+        """The study's, and whether not all routes were driven."""
+        return f"{self.study.title}{self.preview}"
+
+    @property
+    def preview(self) -> str:
+        """What every title says of a part of the routes; empty for all of them."""
+        driven, whole = len(self.study.routes), self.study.set_size
+        return "" if driven == whole else f" (preview: {driven} of {whole} routes)"
+
+    @property
+    def headline(self) -> str:
+        """Title and cells."""
+        wanted = sum(
+            len(self.study.driven_under(each)) for each in self.study.conditions
+        )
+        return f"{self.title}: {len(self.cells)} of {wanted} drives"
+
+    def fact(self, variant: str) -> ModelFacts:
+        """Return what is known of a variant; nothing where it was not prepared."""
+        found = (each for each in self.facts if each.variant == variant)
+        return next(found, ModelFacts(variant))
+
+    def cell(self, variant: str, condition: str) -> DriveRecord | None:
+        """Return a drive; None where it was not driven."""
+        return self.cells.get((variant, condition))
+
+    def why_not(self, variant: str, condition: str) -> str:
+        """Say why a cell is empty."""
+        reason = self.failures.get((variant, condition))
+        return reason or f"{variant} under {condition}: not driven"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the paper's tables, in its order."""
+        return all_paper_tables(self)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return the cells that failed, and why."""
+        return tuple(
+            f"{variant} under {condition} was left out: {why}"
+            for (variant, condition), why in self.failures.items()
+        )
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a drive."""
+        return [
+            {
+                "variant": variant,
+                "condition": condition,
+                "routes": len(cell.routes),
+                **{each.name: mean_of(cell, each).value for each in COLUMNS},
+            }
+            for (variant, condition), cell in self.cells.items()
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return scores of every drive, and what is known of the files."""
+        seed = self.study.seed
+        return {
+            "title": self.title,
+            "baseline": self.study.baseline,
+            "seed": seed,
+            "routes": {"driven": len(self.study.routes), "set": self.study.set_size},
+            "device_scale": self.device_scale,
+            "machine": self.machine,
+            "drives": [
+                {
+                    "scheme": variant,
+                    "condition": condition,
+                    "routes": len(cell.routes),
+                    "scores": {
+                        each.name: mean_of(cell, each, seed).to_json()
+                        for each in COLUMNS
+                    },
+                }
+                for (variant, condition), cell in self.cells.items()
+            ],
+            "failures": [
+                {"scheme": variant, "condition": condition, "reason": why}
+                for (variant, condition), why in self.failures.items()
+            ],
+        }

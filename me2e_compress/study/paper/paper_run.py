@@ -1,0 +1,193 @@
+"""The paper's study: cells driven one by one, and kept without their frames."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from me2e_compress.errors import Me2eError, StudyError
+from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.study.blocks import Block
+from me2e_compress.study.definition import Study
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.drives import DriveSetup
+from me2e_compress.study.outcome import this_machine
+from me2e_compress.study.paper.model_facts import (
+    FILE,
+    ModelFacts,
+    facts_of,
+    load_facts,
+    save_facts,
+)
+from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.prepared import PreparedVariant, prepare_all
+from me2e_compress.study.recorded import recorded
+from me2e_compress.study.timing import Clock, time_all
+from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
+from me2e_compress.workflows.checks import check_folder
+from me2e_compress.workflows.claims import check_ours, writing
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.profile import ProfileOptions, profile
+
+PROFILED = 100
+"""Inferences under a profiler, for the figure of modules."""
+
+
+def run_paper(
+    study: Study,
+    folder: str | Path,
+    engine: Engine | None = None,
+    listener: Listener = SILENT,
+    on_block: Callable[[PaperResult], None] = lambda result: None,
+    *,
+    force: bool = False,
+) -> PaperResult:
+    """Make the models, time them and drive every cell, block by block.
+
+    Run again with the same folder it goes on: models, traces, routes and finished
+    cells (``records/``) that are there are not made again. A variant that fails, or a
+    cell that cannot be driven, is reported, and the rest goes on.
+
+    Args:
+        study: Whose blocks are the paper's tables.
+        folder: Where models, traces and results go.
+        engine: Where routes are driven; None for one process of this machine.
+        listener: Is called with progress and warnings.
+        on_block: Is called with all there is after each block.
+        force: Replace a report that is not as we left it, too.
+
+    Raises:
+        GraphError: The folder is a file or an input.
+        Me2eError: The baseline cannot drive, or frames do not fit.
+    """
+    folder = Path(folder)
+    check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
+    check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
+    with writing(folders=[folder]):
+        return _run(study, folder, engine or LocalEngine(), listener, on_block)
+
+
+def read_paper(study: Study, records: str | Path) -> PaperResult:
+    """Read what was driven before, here or elsewhere; nothing is made or driven.
+
+    Args:
+        study: Whose blocks are the paper's tables.
+        records: Folder of finished cells, as ``records/`` of a run.
+
+    Raises:
+        StudyError: It holds no such files, or one that cannot be read.
+    """
+    folder = Path(records)
+    about, facts = load_facts(folder / FILE)
+    found = [DriveRecord.load(path) for path in sorted(folder.glob("*.jsonl"))]
+    cells = {(each.variant, each.condition): each for each in found}
+    scale = about.get("device_scale")
+    if not isinstance(scale, float | int):
+        raise StudyError(f"{folder / FILE}: no device_scale")
+    return PaperResult(
+        _of_these_routes(study, found, folder),
+        tuple(facts[each.name] for each in study.variants if each.name in facts),
+        cells,
+        {},
+        float(scale),
+        str(about.get("machine", "")),
+    )
+
+
+def _of_these_routes(
+    study: Study, found: Sequence[DriveRecord], folder: Path
+) -> Study:
+    """Return the study over the routes that were driven, the same by all."""
+    sets = {each.made_by.get("routes_sha256") for each in found}
+    if len(sets) > 1:
+        raise StudyError(f"{folder}: drives of different sets of routes")
+    if not found:
+        return study
+    names = {each.route for each in found[0].routes}
+    routes = tuple(each for each in study.routes if each.id in names)
+    if len(routes) < len(names):
+        raise StudyError(f"{folder}: drives of routes that this study has not")
+    return replace(study, routes=routes, set_size=found[0].set_size)
+
+
+def _run(
+    study: Study,
+    folder: Path,
+    engine: Engine,
+    listener: Listener,
+    on_block: Callable[[PaperResult], None],
+) -> PaperResult:
+    workspace = Workspace(folder)
+    study = recorded(study, workspace, listener)
+    prepared = prepare_all(study, workspace, listener)
+    clock = time_all(study, prepared, workspace, listener)
+    facts = _facts(study, prepared, clock, workspace, listener)
+    result = PaperResult(study, facts, {}, {}, clock.scale, this_machine())
+    setup = DriveSetup(study, clock, workspace, engine, listener)
+    for block in study.blocks:
+        result = _driven(block, setup, prepared, result)
+        on_block(result)
+    return result
+
+
+def _driven(
+    block: Block,
+    setup: DriveSetup,
+    prepared: Sequence[PreparedVariant],
+    result: PaperResult,
+) -> PaperResult:
+    """Drive what a block has and no other had; a cell that fails leaves the others."""
+    cells, failures = dict(result.cells), dict(result.failures)
+    wanted = (*block.variants, setup.study.baseline)
+    for condition in setup.study.conditions:
+        for each in prepared:
+            key = each.variant.name, condition.name
+            of_block = key[0] in wanted and key[1] in block.conditions
+            if not of_block or key in cells or key in failures:
+                continue
+            try:
+                cells[key] = setup.record(each, condition)
+            except Me2eError as error:
+                failures[key] = str(error)
+                setup.listener.on_warning(f"{', '.join(key)}: {error}")
+    return replace(result, cells=cells, failures=failures)
+
+
+def _facts(
+    study: Study,
+    prepared: Sequence[PreparedVariant],
+    clock: Clock,
+    workspace: Workspace,
+    listener: Listener,
+) -> tuple[ModelFacts, ...]:
+    """Weigh every variant, and profile the baseline by module; what is known is kept."""
+    path = workspace.folder / "records" / FILE
+    known = load_facts(path)[1] if path.is_file() else {}
+    found = list[ModelFacts]()
+    for done, each in enumerate(prepared):
+        listener.on_progress("weigh", done, len(prepared), each.variant.name)
+        facts = facts_of(each, clock, known)
+        if each.variant is study.reference and not facts.modules_us:
+            facts = replace(facts, modules_us=_by_module(study, each, clock, listener))
+        found.append(facts)
+    about = {"machine": this_machine(), "device_scale": clock.scale}
+    save_facts(path, found, about)
+    return tuple(found)
+
+
+def _by_module(
+    study: Study, prepared: PreparedVariant, clock: Clock, listener: Listener
+) -> dict[str, tuple[int, ...]]:
+    """Profile a model, on the scale of the device."""
+    if prepared.model is None or study.held_out is None:
+        return {}
+    options = ProfileOptions(
+        samples=PROFILED,
+        by_module=True,
+        module_map=prepared.variant.module_map,
+        threads=study.timing.threads,
+    )
+    trace = profile(prepared.model, study.held_out, None, options, listener).trace
+    return {
+        module: tuple(round(each * clock.scale) for each in samples)
+        for module, samples in trace.modules_us.items()
+    }

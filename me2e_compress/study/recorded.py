@@ -1,0 +1,36 @@
+"""The frames of a study that records its own."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from me2e_compress.study.definition import Study
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.listener import Listener
+
+
+def recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
+    """Return the study with folders of frames, recorded unless they are there.
+
+    The held-out ones are of the next seed, so of other routes.
+
+    Raises:
+        EvaluationError: The baseline is not a model that drives.
+        FramesError: One of the folders holds something else.
+    """
+    asked = study.to_record
+    if asked is None:
+        return study
+    model = Path(study.reference.policy)
+    folders = list[Path]()
+    for name, count, seed in (
+        ("frames", asked.frames, asked.seed),
+        ("frames-held-out", asked.held_out, asked.seed + 1),
+    ):
+        folder = workspace.folder / name
+        if not (folder / "scenes.json").is_file():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            record_frames(model, folder, FramesOptions(count, seed), listener)
+        folders.append(folder)
+    frames, held_out = folders
+    return replace(study, frames=frames, held_out=held_out, to_record=None)

@@ -1,0 +1,173 @@
+"""What a study has yet to drive, and about how long that takes."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from me2e_compress.driving.latency import parse_latency
+from me2e_compress.driving.realtime import skipped_decisions
+from me2e_compress.evaluators.highway.durations import EXPERT_S
+from me2e_compress.metrics.episode import FRAME_US
+from me2e_compress.simulator.routes import Route
+from me2e_compress.study.definition import Condition, Study, Variant
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.workflows.result import Cell, Result, Table, number
+
+FRAME_S, DECISION_S = 0.0024, 0.021
+"""CPU seconds of a frame of the world, and of a decision: six pictures and one
+inference of the driver that ships on one core of a Xeon (two routes, at every frame
+and at every eighth)."""
+ENOUGH = 20
+"""Routes in the logs of a folder that make its own speed known."""
+
+
+@dataclass(frozen=True)
+class PlannedDrive:
+    """One variant under one condition, before it is driven.
+
+    Attributes:
+        variant: Its name.
+        condition: Its name.
+        done: Routes that are driven.
+        routes: All of them.
+        hours: For those that are left, on the workers.
+    """
+
+    variant: str
+    condition: str
+    done: int
+    routes: int
+    hours: float
+
+
+@dataclass(frozen=True, repr=False)
+class Workload(Result):
+    """What a study drives.
+
+    Attributes:
+        title: The study's.
+        drives: Condition by condition.
+        set_size: How many routes the whole set has.
+        workers: Routes at a time.
+        measured: Whether hours follow from what the folder's own routes took.
+    """
+
+    title: str
+    drives: tuple[PlannedDrive, ...]
+    set_size: int
+    workers: int
+    measured: bool
+
+    @property
+    def hours(self) -> float:
+        """Of all drives."""
+        return sum(each.hours for each in self.drives)
+
+    @property
+    def headline(self) -> str:
+        """Drives, routes, hours."""
+        routes = sum(each.routes for each in self.drives)
+        done = sum(each.done for each in self.drives)
+        how = "by this folder's logs" if self.measured else "an estimate"
+        return (
+            f"{self.title}: {len(self.drives)} drives, {number(routes)} routes,"
+            f" {number(done)} of them driven; about {self.hours:.1f} hours"
+            f" on {self.workers} worker{'s' * (self.workers > 1)} ({how})"
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return a row a drive."""
+        rows = [
+            (
+                Cell(each.variant),
+                Cell(each.condition),
+                Cell(f"{each.done} of {each.routes}"),
+                Cell(f"{each.hours:.2f}"),
+            )
+            for each in self.drives
+        ]
+        columns = ("variant", "condition", "routes driven", "hours left")
+        return (Table("Drives", columns, tuple(rows), words=2),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a drive."""
+        return [dict(vars(each)) for each in self.drives]
+
+    def to_json(self) -> object:
+        """Return the drives and the hours."""
+        return {
+            "title": self.title,
+            "hours": self.hours,
+            "workers": self.workers,
+            "drives": self.records(),
+        }
+
+
+def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
+    """Count what is left to drive, and estimate the hours.
+
+    Frames of the world and decisions are what a route costs, and a condition decides
+    how many frames there are to a decision.
+
+    Args:
+        study: What is asked.
+        folder: Where it goes.
+        workers: Routes at a time.
+    """
+    place = Workspace(Path(folder))
+    known = _logged(place.folder)
+    frame_s, decision_s = known or (FRAME_S, DECISION_S)
+    drives = list[PlannedDrive]()
+    for condition in study.conditions:
+        period = _period(study, condition)
+        for variant in study.driven_under(condition):
+            left = _left(study, place, variant, condition)
+            frames = sum(EXPERT_S[route.scenario] for route in left) * 1e6 / FRAME_US
+            hours = frames * (frame_s + decision_s / period) / 3600 / workers
+            total = len(study.routes)
+            done = total - len(left)
+            drives.append(
+                PlannedDrive(variant.name, condition.name, done, total, hours)
+            )
+    return Workload(
+        study.title, tuple(drives), study.set_size, workers, known is not None
+    )
+
+
+def _left(
+    study: Study, place: Workspace, variant: Variant, condition: Condition
+) -> Sequence[Route]:
+    if place.record(variant, condition).is_file():
+        return ()
+    folder = place.results(variant, condition) / "routes"
+    return [
+        route for route in study.routes if not (folder / f"{route.id}.json").is_file()
+    ]
+
+
+def _period(study: Study, condition: Condition) -> int:
+    """Return how many frames a decision is held; a trace's by the baseline's median."""
+    if condition.traced:
+        latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
+    else:
+        latency_us = parse_latency(condition.latency).on_route("")(0)
+    return skipped_decisions(latency_us) + 1
+
+
+def _logged(folder: Path) -> tuple[float, float] | None:
+    """Fit seconds a frame and a decision to the logs; None where they are too few."""
+    rows = [
+        json.loads(line)
+        for log in sorted(folder.glob("results/*.log"))
+        for line in log.read_text("utf-8").splitlines()
+    ]
+    if len(rows) < ENOUGH:
+        return None
+    from scipy.optimize import nnls  # takes a second to import
+
+    costs = np.array([(row["frames"], row["decisions"]) for row in rows], np.float64)
+    found, _ = nnls(costs, np.array([row["seconds"] for row in rows], np.float64))
+    return float(found[0]), float(found[1])
