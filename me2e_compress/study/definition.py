@@ -1,7 +1,7 @@
 """What a study is: variants, the conditions they drive under, the one they face."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -202,6 +202,32 @@ class Study:
         blocks = [each for each in self.blocks if condition.name in each.conditions]
         wanted = {name for each in blocks for name in (*each.variants, self.baseline)}
         return tuple(each for each in self.variants if each.name in wanted)
+
+    def of_blocks(self, names: Sequence[str]) -> "Study":
+        """Return the part of it that some blocks need.
+
+        Args:
+            names: Of the blocks; ``2`` is ``table-2``.
+
+        Raises:
+            StudyError: No such block.
+        """
+        there = {each.name: each for each in self.blocks}
+        chosen = list[Block]()
+        for name in names:
+            block = there.get(name) or there.get(f"table-{name}")
+            if block is None:
+                known = ", ".join(there) or "none"
+                raise StudyError(f"no block {name}; there are {known}")
+            chosen.append(block)
+        drive = {self.baseline, *(name for each in chosen for name in each.variants)}
+        under = {name for each in chosen for name in each.conditions}
+        return replace(
+            self,
+            blocks=tuple(chosen),
+            variants=tuple(each for each in self.variants if each.name in drive),
+            conditions=tuple(each for each in self.conditions if each.name in under),
+        )
 
     @property
     def reference(self) -> Variant:

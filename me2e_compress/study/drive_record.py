@@ -42,12 +42,13 @@ class RouteRecord:
         completion: Percent of the route.
         succeeded: The whole route without an infraction.
         ending: Why it was over, in words.
-        infractions: Kind, microseconds, and with whom or against what.
+        infractions: Kind, microseconds if known, and with whom or against what.
         efficiency: Percent; None where no traffic moved, or the ego did not.
         comfort: Share of smooth segments; None where there was no whole one.
         duration_us: Until the last frame.
         decisions: How many.
         latency_us: What they cost on the vehicle: `PERCENTS` of them.
+        latency_sum_us: All of it.
     """
 
     route: str
@@ -56,12 +57,13 @@ class RouteRecord:
     completion: float
     succeeded: bool
     ending: str
-    infractions: tuple[tuple[str, int, str], ...]
+    infractions: tuple[tuple[str, int | None, str], ...]
     efficiency: float | None
     comfort: float | None
     duration_us: int
     decisions: int
     latency_us: tuple[int, ...]
+    latency_sum_us: int
 
     @property
     def collisions(self) -> tuple[tuple[str, str], ...]:
@@ -74,9 +76,7 @@ class RouteRecord:
     def of(cls, episode: Episode) -> Self:
         """Sum up an episode."""
         charged = [each.latency_us for each in episode.decisions]
-        percentiles = (
-            np.percentile(charged, PERCENTS, method="higher") if charged else []
-        )
+        latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
         return cls(
             episode.route,
             episode.scenario,
@@ -90,6 +90,7 @@ class RouteRecord:
             episode.frames[-1].time_us if episode.frames else 0,
             len(charged),
             tuple(int(each) for each in latency_us) if charged else (),
+            sum(charged),
         )
 
 
@@ -135,6 +136,13 @@ class DriveRecord:
         kept = {key: value for key, value in made_by.items() if key != "routes"}
         routes = tuple(map(RouteRecord.of, episodes))
         return cls(variant, condition, int(made_by["set_size"]), kept, routes)
+
+    @property
+    def mean_latency_us(self) -> int | None:
+        """What a decision cost on average; None where none was taken."""
+        decisions = sum(each.decisions for each in self.routes)
+        taken = sum(each.latency_sum_us for each in self.routes)
+        return round(taken / decisions) if decisions else None
 
     def save(self, path: Path) -> None:
         """Write it as JSON lines: what made it, then a line a route.

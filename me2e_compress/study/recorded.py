@@ -30,7 +30,8 @@ def recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
         folder = workspace.folder / name
         if not (folder / "scenes.json").is_file():
             folder.parent.mkdir(parents=True, exist_ok=True)
-            record_frames(model, folder, FramesOptions(count, seed), listener)
+            options = FramesOptions(count, seed, provider=study.provider)
+            record_frames(model, folder, options, listener)
         folders.append(folder)
     frames, held_out = folders
     return replace(study, frames=frames, held_out=held_out, to_record=None)

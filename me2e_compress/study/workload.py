@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.driving.latency import parse_latency
+from me2e_compress.driving.latency_source import DecisionFacts
 from me2e_compress.driving.realtime import skipped_decisions
+from me2e_compress.evaluators.highway.conditions import step_us
 from me2e_compress.evaluators.highway.durations import EXPERT_S
-from me2e_compress.metrics.episode import FRAME_US
 from me2e_compress.simulator.routes import Route
-from me2e_compress.study.definition import Condition, Study, Variant
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Cell, Result, Table, number
 
@@ -72,10 +73,11 @@ class Workload(Result):
         routes = sum(each.routes for each in self.drives)
         done = sum(each.done for each in self.drives)
         how = "by this folder's logs" if self.measured else "an estimate"
+        drives = _count(len(self.drives), "drive")
         return (
-            f"{self.title}: {len(self.drives)} drives, {number(routes)} routes,"
+            f"{self.title}: {drives}, {_count(routes, 'route')},"
             f" {number(done)} of them driven; about {self.hours:.1f} hours"
-            f" on {self.workers} worker{'s' * (self.workers > 1)} ({how})"
+            f" on {_count(self.workers, 'worker')} ({how})"
         )
 
     def tables(self) -> tuple[Table, ...]:
@@ -122,10 +124,11 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
     frame_s, decision_s = known or (FRAME_S, DECISION_S)
     drives = list[PlannedDrive]()
     for condition in study.conditions:
-        period = _period(study, condition)
+        period = held_frames(study, condition)
         for variant in study.driven_under(condition):
             left = _left(study, place, variant, condition)
-            frames = sum(EXPERT_S[route.scenario] for route in left) * 1e6 / FRAME_US
+            driven_s = sum(EXPERT_S[route.scenario] for route in left)
+            frames = 1e6 * driven_s / step_us(condition.dt_ms)
             hours = frames * (frame_s + decision_s / period) / 3600 / workers
             total = len(study.routes)
             done = total - len(left)
@@ -142,19 +145,23 @@ def _left(
 ) -> Sequence[Route]:
     if place.record(variant, condition).is_file():
         return ()
-    folder = place.results(variant, condition) / "routes"
+    folder = place.folder / "results" / place.drive(variant, condition) / "routes"
     return [
         route for route in study.routes if not (folder / f"{route.id}.json").is_file()
     ]
 
 
-def _period(study: Study, condition: Condition) -> int:
-    """Return how many frames a decision is held; a trace's by the baseline's median."""
-    if condition.traced:
-        latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
-    else:
-        latency_us = parse_latency(condition.latency).on_route("")(0)
-    return skipped_decisions(latency_us) + 1
+def held_frames(study: Study, condition: Condition) -> int:
+    """Return how many frames a decision is held: n + 1 of equation 4.
+
+    Frames are the condition's steps. Under a trace, or a mean of one, it is that of the
+    baseline's median on the device, so far as the study says it.
+    """
+    latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
+    if not condition.mean_of:
+        source = condition.source(study.seed).with_trace((latency_us,), 1.0)
+        latency_us = source.on_route("")(DecisionFacts(latency_us))
+    return skipped_decisions(latency_us, step_us(condition.dt_ms)) + 1
 
 
 def _logged(folder: Path) -> tuple[float, float] | None:
@@ -171,3 +178,7 @@ def _logged(folder: Path) -> tuple[float, float] | None:
     costs = np.array([(row["frames"], row["decisions"]) for row in rows], np.float64)
     found, _ = nnls(costs, np.array([row["seconds"] for row in rows], np.float64))
     return float(found[0]), float(found[1])
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{number(n)} {noun}{'' if n == 1 else 's'}"

@@ -21,13 +21,18 @@ class Workspace:
 
     folder: Path
 
+    @staticmethod
+    def drive(variant: Variant, condition: Condition) -> str:
+        """Return what the files of one variant under one condition are called."""
+        return f"{variant.name}.{condition.name}"
+
     def results(self, variant: Variant, condition: Condition) -> Path:
         """Return the folder of results of one variant under one condition."""
-        return self._made("results") / f"{variant.name}.{condition.name}"
+        return self._made("results") / self.drive(variant, condition)
 
     def record(self, variant: Variant, condition: Condition) -> Path:
         """Return the file that keeps a finished drive without its frames."""
-        return self.folder / "records" / f"{variant.name}.{condition.name}.jsonl"
+        return self.folder / "records" / f"{self.drive(variant, condition)}.jsonl"
 
     def model(self, variant: Variant, key: str) -> Path:
         """Return where the model goes that passes make: a key is a recipe's hash."""

@@ -84,6 +84,12 @@ def _recipes() -> tuple[Entry, ...]:
     return tuple(_file(folder / f"{name}.toml") for name in recipe.shipped())
 
 
+def _studies() -> tuple[Entry, ...]:
+    folder = resources.files("me2e_compress") / "study" / "shipped"
+    files = sorted(folder.iterdir(), key=lambda path: path.name)
+    return tuple(_file(path) for path in files if path.name.endswith(".toml"))
+
+
 def _module_maps() -> tuple[Entry, ...]:
     """Describe the presets: a map by its modules."""
     maps = [modules.ModuleMap.load(name) for name in (*modules.presets(), "whole")]
@@ -123,6 +129,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     **{kind: partial(_registered, kind) for kind in REGISTRIES},
     "recipes": _recipes,
+    "studies": _studies,
     "module-maps": _module_maps,
     "stacks": _stacks,
 }

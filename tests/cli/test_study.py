@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import me2e_compress.study
+import me2e_compress.study.reported
 from me2e_compress.cli.commands.study import study
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import evaluation_options
@@ -133,7 +133,7 @@ def test_a_model_that_ships_is_not_one_where_you_are(
         asked.append(found)
         raise StudyError("seen")
 
-    monkeypatch.setattr(me2e_compress.study, "run_study", noted)
+    monkeypatch.setattr(me2e_compress.study.reported, "run_study", noted)
     with pytest.raises(StudyError, match="seen"):
         study(toml, tmp_path / "out")
 
@@ -151,3 +151,62 @@ def test_an_engine_nobody_knows(
 
     assert command("study", toml, "-o", tmp_path / "out", "--engine", "cloud") == 1
     assert "engine 'cloud'" in capsys.readouterr().err
+
+
+PAPER = (
+    STUDY.replace('"Try"', '"Again"\nreport = "paper"')
+    + """
+[[block]]
+name = "table-3"
+variants = ["float"]
+conditions = ["device"]
+"""
+)
+
+
+def test_the_papers_tables_are_written_and_read_again(
+    command: Command,
+    toml: Path,
+    tmp_path: Path,
+    here: Here,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    toml.write_text(PAPER)
+    out, again = tmp_path / "out", tmp_path / "again"
+    assert command("study", toml, "-o", out, "--json") == 0
+    shown = json.loads(capsys.readouterr().out)
+    driven = list(here.driven)
+
+    assert command("study", toml, "-o", again, "--records", out / "records") == 0
+
+    assert faults("study", shown) == []
+    assert [each["scheme"] for each in shown["drives"]] == ["float"]
+    assert here.driven == driven
+    assert (again / "tables.md").read_bytes() == (out / "tables.md").read_bytes()
+
+
+def test_a_dry_run_drives_nothing(
+    command: Command,
+    toml: Path,
+    tmp_path: Path,
+    here: Here,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    assert command("study", toml, "-o", out, "--dry-run", "--json") == 0
+
+    shown = json.loads(capsys.readouterr().out)
+    assert faults("study", shown) == []
+    assert len(shown["drives"]) == 2
+    assert here.driven == []
+    assert not out.exists()
+
+
+def test_the_study_that_ships_is_found_by_its_name(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("study", "paper", "-o", tmp_path / "out", "--routes", "44", "--dry-run")
+    assert command(*words) == 0
+
+    shown = capsys.readouterr().out
+    assert "The paper, re-tested: 28 drives, 1,232 routes, 0 of them driven" in shown

@@ -15,6 +15,7 @@ from me2e_compress.errors import (
 from me2e_compress.runtime.providers import CPU, CpuProvider
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
+from me2e_compress.study.blocks import FramesToRecord
 from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
@@ -203,15 +204,37 @@ def test_no_such_file(tmp_path: Path) -> None:
 
 def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
     page = Path(__file__).parents[2] / "docs" / "study.md"
-    (block,) = re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+    found = re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+    whole, *parts = found
 
     for name in ("frames", "held-out"):
         write_frames(tmp_path / name, command=np.array([3]))
 
-    study = load_study(write(tmp_path, block))
+    study = load_study(write(tmp_path, whole))
 
     assert [variant.name for variant in study.variants] == ["expert", "float", "int8"]
     assert study.conditions[1].traced
+
+    folders = re.compile(r"^(frames|held_out) = .*$", re.MULTILINE)
+    of_parts = load_study(write(tmp_path, "\n".join((folders.sub("", whole), *parts))))
+
+    assert [each.name for each in of_parts.blocks] == ["table-3"]
+    assert of_parts.to_record == FramesToRecord(256, 64)
+
+
+def test_a_study_that_ships_is_found_where_no_file_is() -> None:
+    study = load_study("paper")
+
+    assert study.report == "paper"
+    assert len(study.variants) == 13
+    assert [each.name for each in study.blocks][:2] == ["table-2", "table-3"]
+
+
+def test_frames_are_given_or_recorded(models: Path) -> None:
+    both = f"{GOOD}\n[record]\nframes = 4\nheld_out = 4\n"
+
+    with pytest.raises(StudyError, match="folders of frames, or what to record, not b"):
+        load_study(write(models, both))
 
 
 def test_all_routes_is_what_a_study_drives_if_it_says_nothing(models: Path) -> None:

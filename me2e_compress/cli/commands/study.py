@@ -6,18 +6,32 @@ from typing import Annotated
 import typer
 
 from me2e_compress.cli import arguments as given
-from me2e_compress.cli.console import listening, say, show
+from me2e_compress.cli.console import listening, say, show, tell
 
+STUDY = "STUDY.toml, or a shipped study's name: paper"
 Provider = Annotated[
     str | None, typer.Option(help="runs the models: cpu, cuda, ...; not the study's")
 ]
 Routes = Annotated[str | None, typer.Option(help=f"{given.ROUTES}; not the study's")]
+Tables = Annotated[
+    str | None, typer.Option(help="of its blocks only these: 2,3 or names")
+]
+Records = Annotated[
+    Path | None,
+    typer.Option(help="the paper's tables from finished drives: drives nothing"),
+]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="count drives and hours, drive nothing")
+]
 
 
 def study(
-    definition: Annotated[Path, typer.Argument(help="STUDY.toml")],
+    definition: Annotated[Path, typer.Argument(help=STUDY)],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     routes: Routes = None,
+    tables: Tables = None,
+    records: Records = None,
+    dry_run: DryRun = False,
     provider: Provider = None,
     plugins: given.Plugins = None,
     workers: given.Workers = 1,
@@ -29,21 +43,38 @@ def study(
     """Drive variants under conditions and compare them; run it again to go on."""
     # takes highway-env and matplotlib two seconds to import
     from me2e_compress.evaluators.highway.evaluation_options import engine_of
-    from me2e_compress.study import load_study, run_study
+    from me2e_compress.study import load_study, study_path
+    from me2e_compress.study.reported import run_and_report
+    from me2e_compress.study.workload import workload
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-    from me2e_compress.study.write import write_study
     from me2e_compress.workflows.checks import check_folder
 
     asked = load_study(definition, routes, provider, plugins or ())
-    check_folder(output, (definition,), (JSON, MARKDOWN, HTML))
+    if tables is not None:
+        asked = asked.of_blocks(tables.split(","))
+    inputs = (study_path(definition), *asked.inputs())
+    check_folder(output, inputs, (JSON, MARKDOWN, HTML))
+    ahead = workload(asked, output, workers)
+    if dry_run:
+        show(ahead, as_json)
+        return
+    options: list[tuple[str, str | Path | None]] = [
+        ("--routes", routes),
+        ("--tables", tables),
+        ("--records", records),
+        ("--provider", provider),
+        *(("--plugins", each) for each in plugins or ()),
+    ]
+    chosen = [str(word) for each in options if each[1] is not None for word in each]
+    words = ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
+    if records is None:
+        tell(ahead.headline)
     with listening() as listener:
         chosen_engine = engine_of(engine, workers, address)
-        found = run_study(asked, output, chosen_engine, listener, force=force)
-    chosen = [] if routes is None else ["--routes", routes]
-    chosen += [] if provider is None else ["--provider", provider]
-    chosen += [word for each in plugins or () for word in ("--plugins", str(each))]
-    words = ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
-    written = write_study(found, output, words, force=force)
+        found, files = run_and_report(
+            asked, output, words, chosen_engine, listener, records, force=force
+        )
     show(found, as_json)
     if not as_json:
-        say(f"{written.report}, {written.tables} and {written.record} are yours.")
+        *first, last = map(str, files)
+        say(f"{', '.join(first)} and {last} are yours.")

@@ -1,7 +1,7 @@
 """What is known of a variant's file apart from how it drives."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -97,11 +97,14 @@ def facts_of(
     trace = clock.traces.get(name)
     latency_us = () if trace is None else _scaled(trace.samples_us, clock.scale)
     before = known.get(name)
-    if before is not None and before.sha256 == prepared.sha256 is not None:
-        if before.latency_us == latency_us:
-            return before
     if prepared.model is None:
         return ModelFacts(name, failure=prepared.failure)
+    if before is not None and before.sha256 == prepared.sha256:
+        return (
+            before
+            if before.latency_us == latency_us
+            else replace(before, latency_us=latency_us, modules_us={})
+        )
     found = inspect(prepared.model, prepared.variant.module_map)
     return ModelFacts(
         name,
@@ -129,7 +132,9 @@ def int8_counts(path: Path) -> Int8Counts | None:
     )
 
 
-def save_facts(path: Path, facts: Sequence[ModelFacts], about: Mapping[str, object]) -> None:
+def save_facts(
+    path: Path, facts: Sequence[ModelFacts], about: Mapping[str, object]
+) -> None:
     """Write facts and what they were found on.
 
     Raises:

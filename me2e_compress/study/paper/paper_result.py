@@ -66,7 +66,8 @@ class PaperResult(Result):
     def why_not(self, variant: str, condition: str) -> str:
         """Say why a cell is empty."""
         reason = self.failures.get((variant, condition))
-        return reason or f"{variant} under {condition}: not driven"
+        failed = reason or self.fact(variant).failure
+        return failed or f"{variant} under {condition}: not driven"
 
     def tables(self) -> tuple[Table, ...]:
         """Return the paper's tables, in its order."""

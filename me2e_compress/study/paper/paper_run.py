@@ -6,6 +6,7 @@ from pathlib import Path
 
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.blocks import Block
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
@@ -93,9 +94,7 @@ def read_paper(study: Study, records: str | Path) -> PaperResult:
     )
 
 
-def _of_these_routes(
-    study: Study, found: Sequence[DriveRecord], folder: Path
-) -> Study:
+def _of_these_routes(study: Study, found: Sequence[DriveRecord], folder: Path) -> Study:
     """Return the study over the routes that were driven, the same by all."""
     sets = {each.made_by.get("routes_sha256") for each in found}
     if len(sets) > 1:
@@ -159,7 +158,7 @@ def _facts(
     workspace: Workspace,
     listener: Listener,
 ) -> tuple[ModelFacts, ...]:
-    """Weigh every variant, and profile the baseline by module; what is known is kept."""
+    """Weigh every variant, and profile the baseline by module, unless it is known."""
     path = workspace.folder / "records" / FILE
     known = load_facts(path)[1] if path.is_file() else {}
     found = list[ModelFacts]()
@@ -170,7 +169,9 @@ def _facts(
             facts = replace(facts, modules_us=_by_module(study, each, clock, listener))
         found.append(facts)
     about = {"machine": this_machine(), "device_scale": clock.scale}
-    save_facts(path, found, about)
+    names = [each.variant for each in found]
+    others = [each for name, each in known.items() if name not in names]
+    save_facts(path, (*found, *others), about)
     return tuple(found)
 
 
@@ -178,7 +179,8 @@ def _by_module(
     study: Study, prepared: PreparedVariant, clock: Clock, listener: Listener
 ) -> dict[str, tuple[int, ...]]:
     """Profile a model, on the scale of the device."""
-    if prepared.model is None or study.held_out is None:
+    on_cpu = study.provider.native == CPU.native  # elsewhere nodes are not timed
+    if prepared.model is None or study.held_out is None or not on_cpu:
         return {}
     options = ProfileOptions(
         samples=PROFILED,

@@ -1,0 +1,44 @@
+"""What the paper's study leaves on disk."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from me2e_compress.display import in_markdown
+from me2e_compress.errors import StudyError
+from me2e_compress.runtime.atomic import write_bytes, write_json
+from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.workspace import JSON, MARKDOWN
+from me2e_compress.workflows.claims import writing
+
+
+def write_paper(
+    result: PaperResult,
+    folder: str | Path,
+    command: Sequence[str] = (),
+    *,
+    force: bool = False,
+) -> tuple[Path, ...]:
+    """Write JSON and Markdown, each whole or not at all; return the files.
+
+    Args:
+        result: What was found.
+        folder: It is made when needed.
+        command: What makes it again, word by word.
+        force: Replace files that are not as we left them, too.
+
+    Raises:
+        StudyError: The folder cannot be written.
+        GraphError: One of the files is not as we left it.
+    """
+    folder = Path(folder)
+    record, tables = folder / JSON, folder / MARKDOWN
+    heading = f"# {in_markdown(result.title)}\n\n"
+    text = heading + "\n".join(table.markdown() for table in result.tables())
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with writing([record, tables], force=force):
+            write_json(record, result.to_json(), indent=1)
+            write_bytes(tables, text.encode())
+    except OSError as error:
+        raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
+    return record, tables

@@ -1,0 +1,61 @@
+"""A study from its definition to the files that report it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from me2e_compress.errors import StudyError
+from me2e_compress.evaluators.highway.engine import Engine
+from me2e_compress.study.definition import Study
+from me2e_compress.study.outcome import StudyResult
+from me2e_compress.study.paper.paper_files import write_paper
+from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.paper.paper_run import read_paper, run_paper
+from me2e_compress.study.run import run_study
+from me2e_compress.study.write import write_study
+from me2e_compress.workflows.listener import SILENT, Listener
+
+
+def run_and_report(
+    study: Study,
+    folder: str | Path,
+    command: Sequence[str] = (),
+    engine: Engine | None = None,
+    listener: Listener = SILENT,
+    records: Path | None = None,
+    *,
+    force: bool = False,
+) -> tuple[StudyResult | PaperResult, tuple[Path, ...]]:
+    """Run a study and write what it found; the paper's tables land block by block.
+
+    Args:
+        study: What is asked; its ``report`` says what is made of the results.
+        folder: Where models, traces, results and the report go.
+        command: What makes it again, word by word.
+        engine: Where routes are driven; None for one process of this machine.
+        listener: Is called with progress and warnings.
+        records: Folder of finished drives that the paper's tables are made of, and
+            nothing is driven.
+        force: Replace a report that is not as we left it, too.
+
+    Returns:
+        What was found, and the files: report, tables, record.
+
+    Raises:
+        StudyError: Records for a study that is not the paper's.
+        Me2eError: See `run_study` and `run_paper`.
+    """
+    if study.report == "comparison":
+        if records is not None:
+            raise StudyError("--records is for a study with the paper's tables")
+        found = run_study(study, folder, engine, listener, force=force)
+        written = write_study(found, folder, command, force=force)
+        return found, (written.report, written.tables, written.record)
+    if records is not None:
+        read = read_paper(study, records)
+        return read, write_paper(read, folder, command, force=force)
+
+    def land(so_far: PaperResult) -> None:
+        write_paper(so_far, folder, command, force=force)
+
+    driven = run_paper(study, folder, engine, listener, land, force=force)
+    return driven, write_paper(driven, folder, command, force=force)

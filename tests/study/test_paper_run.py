@@ -1,0 +1,191 @@
+"""The paper's study on drivers that need no images."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import StudyError
+from me2e_compress.study import Condition, Listener, Study, Timing, Variant
+from me2e_compress.study.blocks import Block, FramesToRecord
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.paper.paper_run import read_paper, run_paper
+from me2e_compress.study.workload import workload
+from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here
+
+FASTER = Variant("faster", "blind:9")
+BROKEN = Variant("broken", "gone.onnx")
+ASKED = Study(
+    "Asked again",
+    (BLIND, FASTER, BROKEN),
+    (IDEAL, SLOW),
+    "blind",
+    ROUTES,
+    220,
+    blocks=(
+        Block("table-2", ("blind",), ("ideal", "slow")),
+        Block("table-3", ("blind", "faster", "broken"), ("ideal",)),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paper")
+    run_paper(ASKED, folder, Here())
+    return folder
+
+
+def test_a_block_drives_what_no_other_has_driven(tmp_path: Path) -> None:
+    engine, landed = Here(), list[int]()
+
+    run_paper(ASKED, tmp_path, engine, on_block=lambda r: landed.append(len(r.cells)))
+
+    assert landed == [2, 3]
+    assert len(engine.driven) == 3 * len(ROUTES)
+
+
+def test_a_variant_that_fails_leaves_the_others(driven: Path) -> None:
+    warned = list[str]()
+    listener = Listener(lambda *_: None, warned.append)
+
+    found = run_paper(ASKED, driven, Here(), listener)
+
+    assert set(found.cells) == {
+        ("blind", "ideal"),
+        ("blind", "slow"),
+        ("faster", "ideal"),
+    }
+    why = "variant broken: gone.onnx: no such model"
+    assert found.failures == {("broken", "ideal"): why}
+    assert warned[0] == f"variant broken is left out: {why}"
+    assert found.alerts() == (f"broken under ideal was left out: {why}",)
+
+
+def test_a_finished_cell_needs_no_frames_to_go_on(driven: Path) -> None:
+    engine = Here()
+    first = run_paper(ASKED, driven, engine)
+    for path in (driven / "results").glob("*/routes/*.json"):
+        path.unlink()
+
+    assert run_paper(ASKED, driven, engine) == first
+    assert engine.driven == []
+
+
+def test_tables_follow_from_the_records_alone(driven: Path) -> None:
+    run = run_paper(ASKED, driven, Here())
+
+    read = read_paper(ASKED, driven / "records")
+
+    assert read.tables() == run.tables()
+    assert read.machine == run.machine
+
+
+def test_a_record_of_another_evaluation_is_not_taken(driven: Path) -> None:
+    other = replace(ASKED, variants=(BLIND, Variant("faster", "blind:7"), BROKEN))
+
+    found = run_paper(other, driven, Here())
+
+    assert "of another evaluation: its policy is" in found.failures["faster", "ideal"]
+
+
+def test_the_blocks_of_a_study_can_be_chosen() -> None:
+    part = ASKED.of_blocks(["2"])
+
+    assert [each.name for each in part.variants] == ["blind"]
+    assert [each.name for each in part.conditions] == ["ideal", "slow"]
+    with pytest.raises(StudyError, match=r"^no block 4; there are table-2, table-3$"):
+        ASKED.of_blocks(["4"])
+
+
+def test_a_dry_run_counts_what_is_left(driven: Path, tmp_path: Path) -> None:
+    ahead, after = workload(ASKED, tmp_path, 2), workload(ASKED, driven, 2)
+
+    drives = [(each.variant, each.condition) for each in ahead.drives]
+    assert drives == [
+        ("blind", "ideal"),
+        ("faster", "ideal"),
+        ("broken", "ideal"),
+        ("blind", "slow"),
+    ]
+    assert ahead.headline.startswith("Asked again: 4 drives, 8 routes, 0 of them driv")
+    assert ahead.drives[0].hours > ahead.drives[-1].hours > 0.0
+    assert [each.done for each in after.drives] == [2, 2, 0, 2]
+
+
+def test_a_record_keeps_what_the_tables_need(driven: Path) -> None:
+    path = driven / "records" / "blind.slow.jsonl"
+    record = DriveRecord.load(path)
+
+    assert [each.route for each in record.routes] == [each.id for each in ROUTES]
+    assert record.routes[0].latency_us == (500_000,) * 4
+    assert path.stat().st_size < 2_000
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda text: text[: len(text) // 2], "its last line was cut off"),
+        (lambda text: text + text.splitlines()[-1] + "\n", "names route .* twice"),
+        (lambda text: text.replace("completion", "finish"), "not a record of a drive"),
+        (lambda text: "", "its last line was cut off"),
+    ],
+)
+def test_a_spoilt_record_is_named(
+    driven: Path, tmp_path: Path, spoil: object, message: str
+) -> None:
+    text = (driven / "records" / "blind.slow.jsonl").read_text()
+    path = tmp_path / "blind.slow.jsonl"
+    path.write_text(spoil(text))  # type: ignore[operator]
+
+    with pytest.raises(StudyError, match=rf"^{path}: .*{message}"):
+        DriveRecord.load(path)
+
+
+def test_records_of_other_routes_do_not_stand_together(
+    driven: Path, tmp_path: Path
+) -> None:
+    for path in (driven / "records").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    path = tmp_path / "faster.ideal.jsonl"
+    head, *rows = path.read_text().splitlines()
+    made = json.loads(head)
+    made["made_by"]["routes_sha256"] = "0"
+    path.write_text("\n".join([json.dumps(made), *rows]) + "\n")
+
+    with pytest.raises(StudyError, match="drives of different sets of routes"):
+        read_paper(ASKED, tmp_path)
+
+
+def test_what_a_block_or_a_recording_cannot_be() -> None:
+    with pytest.raises(StudyError, match="block table-9: no variant gone; there are b"):
+        replace(ASKED, blocks=(Block("table-9", ("gone",), ("ideal",)),))
+    with pytest.raises(StudyError, match="block a: there is nothing to drive"):
+        Block("a", (), ("ideal",))
+    with pytest.raises(StudyError, match="record: 0 frames and 4 held out"):
+        FramesToRecord(0, 4)
+
+
+def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
+    slow = Variant("slow", str(models / "slow.onnx"))
+    study = Study(
+        "Timed",
+        (slow,),
+        (IDEAL, Condition("device", "trace")),
+        "slow",
+        ROUTES[:1],
+        220,
+        held_out=models / "frames",
+        timing=Timing(10, baseline_median_s=0.2),
+        blocks=(Block("table-3", ("slow",), ("device",)),),
+    )
+
+    found = run_paper(study, tmp_path, Here())
+
+    [fact] = found.facts
+    assert fact.latency_ms(50) == pytest.approx(200.0, rel=0.3)
+    assert fact.parameters is not None
+    assert sum(map(len, fact.modules_us.values())) > 0
+    assert found.preview == " (preview: 1 of 220 routes)"
+    assert all("preview" in table.title for table in found.tables())
