@@ -72,16 +72,15 @@ def table_2(result: "PaperResult", block: "Block") -> Table:
             )
         )
     own = published.RATES_RT["UniAD"]
-    for condition in conditions:
-        if condition.traced or condition.name == "constant":
-            given_cells = _given(own if condition.traced else None)
+    for each in conditions:
+        if each.traced or each.mean_of:
             rows.append(
                 (
-                    Cell("own"),
-                    Cell(condition.name),
-                    *_rate(held_frames(study, condition)),
-                    *_scores(result, name, condition.name),
-                    *given_cells,
+                    Cell("own" if each.traced else "own mean"),
+                    Cell(each.name),
+                    *_rate(held_frames(study, each)),
+                    *_scores(result, name, each.name),
+                    *_given(own if each.traced else None),
                 )
             )
     return Table(
