@@ -1,5 +1,6 @@
 """What this machine can do, and what to install for the rest."""
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import importlib.util
@@ -12,6 +13,9 @@ import pynvml
 
 from me2e_compress.manager.report import versions
 from me2e_compress.operators.kernels import KERNELS, why_not
+from me2e_compress.runtime.energy.counter import open_counter
+from me2e_compress.runtime.energy.reader import Absent
+from me2e_compress.runtime.energy.recording import EnergyRecording
 from me2e_compress.workflows.result import Result, Table, table
 
 _EXTRAS = (
@@ -73,7 +77,7 @@ class DoctorResult(Result):
 
 def doctor() -> DoctorResult:
     """Look for everything that the toolkit can make use of."""
-    return DoctorResult((*_machine(), *_packages(), _kernels(), _gpu()))
+    return DoctorResult((*_machine(), *_packages(), _kernels(), _gpu(), _energy()))
 
 
 def _machine() -> list[Checkup]:
@@ -107,11 +111,24 @@ def _kernels() -> Checkup:
     return Checkup(what, ", ".join(each.op_type for each in KERNELS))
 
 
+def _energy() -> Checkup:
+    """Say which counter of energy answers here."""
+    found = open_counter()
+    if isinstance(found, Absent):
+        advice = f"joules are not measured here: {found.reason}; docs/energy.md"
+        return Checkup("energy counter", None, advice)
+    if isinstance(found, EnergyRecording):
+        return Checkup("energy counter", found.counter)
+    with contextlib.closing(found):
+        what = f"{found.counter} of {found.device}: {found.scope}"
+        return Checkup("energy counter", what)
+
+
 def _gpu() -> Checkup:
     try:
         pynvml.nvmlInit()
     except pynvml.NVMLError as error:
-        return Checkup("NVIDIA GPU", None, f"energy is not measured here ({error})")
+        return Checkup("NVIDIA GPU", None, f"no GPU is used ({error})")
     try:
         handle = pynvml.nvmlDeviceGetHandleByIndex(0)
         return Checkup("NVIDIA GPU", str(pynvml.nvmlDeviceGetName(handle)))

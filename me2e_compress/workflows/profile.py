@@ -1,4 +1,4 @@
-"""Latency of a model alone and warm, as a trace."""
+"""Latency of a model alone and warm, as a trace; and its energy, if asked."""
 
 import dataclasses
 from importlib import util
@@ -8,9 +8,13 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import EvaluationError, MissingExtraError
+from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.modules import assign
 from me2e_compress.runtime.breakdown import Breakdown, break_down
+from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.runtime.energy.counter import check_counter
+from me2e_compress.runtime.energy.models import measure_energy
+from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.latency_trace import (
     LatencyTrace,
     Microseconds,
@@ -56,9 +60,13 @@ class ProfileOptions:
         module_map: preset or TOML file; None finds the preset.
         figure: draw modules over inferences as PNG, SVG or PDF; measures them.
         force: replace outputs that are not as we left them, too.
+        energy: then measure joules by ``auto`` or a counter; None does not.
+        energy_output: file of these; None is beside the trace, ``.energy.json``.
+        schedule: how long energy is measured, and how often; None takes the defaults.
 
     Raises:
-        RecipeError: a number below 0, or beyond all measure.
+        RecipeError: a number below 0, or beyond all measure; or a file of joules
+            that nobody measures.
     """
 
     samples: int | None = None
@@ -69,9 +77,14 @@ class ProfileOptions:
     module_map: str | Path | None = None
     figure: str | Path | None = None
     force: bool = False
+    energy: str | None = None
+    energy_output: str | Path | None = None
+    schedule: EnergySchedule | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        if self.energy is None and self.energy_output is not None:
+            raise RecipeError("--energy-out: there is no --energy to write")
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
         check_count("--warm-up", self.warm_up, most=MOST_SAMPLES)
@@ -89,6 +102,8 @@ class ProfileResult(Result):
         figure: the picture that was drawn; None if none was.
         others_cores: how many cores other processes kept busy; None: not measured.
         cores: of the machine.
+        energy: joules, or why there are none; None: not asked for.
+        energy_output: the file they were written to; None if they were not.
     """
 
     model: Path
@@ -98,6 +113,8 @@ class ProfileResult(Result):
     cores: int = 1
     operators_us: Microseconds = dataclasses.field(default_factory=dict)
     figure: Path | None = None
+    energy: EnergyResult | None = None
+    energy_output: Path | None = None
 
     @property
     def headline(self) -> str:
@@ -105,20 +122,24 @@ class ProfileResult(Result):
         return f"{self.output or self.model.name}: {self.trace.headline}"
 
     def lines(self) -> tuple[str, ...]:
-        """Return how far the last percentile can be trusted."""
+        """Return how far the last percentile can be trusted, and the joules."""
+        energy = () if self.energy is None else (self.energy.headline,)
         count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
         if count >= needed:
-            return ()
+            return energy
         return (
+            *energy,
             f"p99 rests on too few samples: {count}, and {needed} are needed for"
             f" {BEYOND_P99} beyond it (--samples {needed})",
         )
 
     def alerts(self) -> tuple[str, ...]:
-        """Return whether the machine was busy with something else."""
+        """Return whether the machine was busy, and what puts joules in doubt."""
+        energy = () if self.energy is None else self.energy.alerts()
         if self.others_cores is None or not is_busy(self.others_cores, self.cores):
-            return ()
+            return energy
         return (
+            *energy,
             f"the machine was busy: other processes took {self.others_cores:.1f} of"
             f" {self.cores} cores, and more than {BUSY:.0%} moves latencies; measure"
             " again when it is idle",
@@ -127,7 +148,8 @@ class ProfileResult(Result):
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds, by module and operator too."""
         whole, *modules = self.trace.tables()
-        found = (dataclasses.replace(whole, title=self.headline), *modules)
+        energy = () if self.energy is None else self.energy.tables()
+        found = (dataclasses.replace(whole, title=self.headline), *modules, *energy)
         if not self.operators_us:
             return found
         rest = len(self.operators_us) - _SHOWN
@@ -140,11 +162,12 @@ class ProfileResult(Result):
         return [{"latency_us": sample} for sample in self.trace.samples_us]
 
     def to_json(self) -> object:
-        """Return what the trace file holds, shares, and how busy the machine was."""
+        """Return what the trace holds, shares, joules, how busy the machine was."""
         return {
             **self.trace.to_json(),
             "modules": shares(self.trace.modules_us),
             "operators": shares(self.operators_us),
+            "energy": None if self.energy is None else self.energy.to_json(),
             "others_cores": self.others_cores,
             "cores": self.cores,
         }
@@ -157,7 +180,7 @@ def profile(
     options: ProfileOptions | None = None,
     listener: Listener = SILENT,
 ) -> ProfileResult:
-    """Measure a model alone and warm; by module and operator too, if asked.
+    """Measure a model alone and warm; by module and operator, and joules, if asked.
 
     Args:
         model: the graph, or the name of one that ships.
@@ -169,6 +192,8 @@ def profile(
     Raises:
         GraphError: no such model, it cannot be run, or the output would harm an input.
         EvaluationError: there is nothing to measure, or no such kind of picture.
+        EnergyError: no such counter, or it goes back, stands still or cannot be read;
+            that there is none is a result.
         FramesError: a frame does not fit.
         ModuleMapError: no such map.
         ProviderError: the provider is not there.
@@ -176,8 +201,11 @@ def profile(
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
     figure = None if options.figure is None else figure_path(options.figure)
+    joules = _energy_path(options, written)
+    if options.energy is not None:
+        check_counter(options.energy)
     inputs = (source, frames, options.module_map)
-    with writing([written, figure], inputs, force=options.force):
+    with writing([written, figure, joules], inputs, force=options.force):
         loaded, recording = graph.load(source), CalibrationSet(Path(frames))
         trace, load = _measured(source, loaded, recording, options, listener)
         operators: Microseconds = {}
@@ -185,11 +213,49 @@ def profile(
             found = _broken_down(loaded, recording, options, listener)
             trace = dataclasses.replace(trace, modules_us=found.modules_us)
             operators = found.operators_us
+        energy = _energy(source, recording, options, listener)
         if figure is not None:
             draw(trace, source.stem, figure)
         if written is not None:
             trace.save(written)
-    return ProfileResult(source, trace, written, load.cores, load.of, operators, figure)
+        if energy is not None and joules is not None:
+            energy.save(joules)
+    return ProfileResult(
+        *(source, trace, written, load.cores, load.of, operators, figure),
+        energy=energy,
+        energy_output=joules,
+    )
+
+
+def _energy_path(options: ProfileOptions, trace: Path | None) -> Path | None:
+    """Return the file of the joules: as named, or beside the trace."""
+    if options.energy_output is not None:
+        return Path(options.energy_output)
+    if options.energy is None or trace is None:
+        return None
+    return trace.with_suffix(".energy.json")
+
+
+def _energy(
+    source: Path,
+    recording: CalibrationSet,
+    options: ProfileOptions,
+    listener: Listener,
+) -> EnergyResult | None:
+    if options.energy is None:
+        return None
+    found = measure_energy(
+        {source.name: source},
+        recording,
+        options.energy,
+        options.schedule,
+        threads=options.threads,
+        provider=options.provider,
+        on_window=lambda done, total, name: listener.on_progress(
+            "energy", done, total, "windows"
+        ),
+    )
+    return found[source.name]
 
 
 def figure_path(named: str | Path) -> Path:

@@ -25,6 +25,13 @@ def profile(
     figure: Annotated[
         Path | None, typer.Option(help="draw modules over inferences: PNG, SVG, PDF")
     ] = None,
+    energy: Annotated[
+        str | None,
+        typer.Option(help="then joules: auto, nvml, ina3221, rapl, recorded:FILE"),
+    ] = None,
+    energy_out: Annotated[
+        Path | None, typer.Option(help="joules as JSON; beside the trace if not named")
+    ] = None,
     module_map: given.ModuleMap = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
@@ -34,10 +41,14 @@ def profile(
     """Measure a model alone and warm, and write its latencies as a trace."""
     device = provider_named(provider, plugins or ())
     options = workflow.ProfileOptions(
-        samples, warm_up, threads, device, by_module, module_map, figure, force
+        *(samples, warm_up, threads, device, by_module, module_map, figure, force),
+        energy=energy,
+        energy_output=energy_out,
     )
     with listening() as listener:
         found = workflow.profile(model, frames, output, options, listener)
     show(found, as_json)
     if found.figure is not None:
         tell(f"wrote {found.figure}")
+    if found.energy_output is not None:
+        tell(f"wrote {found.energy_output}")

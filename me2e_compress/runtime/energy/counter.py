@@ -16,6 +16,7 @@ from me2e_compress.runtime.energy.recording import EnergyRecording
 __all__ = [
     "ENERGY_COUNTERS",
     "EnergyCounter",
+    "check_counter",
     "open_counter",
 ]
 
@@ -81,6 +82,18 @@ def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
         return _first([ENERGY_COUNTERS.parse(text)])
     kinds = [ENERGY_COUNTERS.get(name) for name in ENERGY_COUNTERS.usable()]
     return _first([ENERGY_COUNTERS.make(kind, {}) for kind in kinds if kind.automatic])
+
+
+def check_counter(text: str) -> None:
+    """Open a counter and leave it: what it is named by is right, be it there or not.
+
+    Raises:
+        EnergyError: No such counter, an option that it has not, or a file that is not
+            usable.
+    """
+    found = open_counter(text)
+    if isinstance(found, Reader):
+        found.close()
 
 
 def _first(counters: Sequence[EnergyCounter]) -> Reader | EnergyRecording | Absent:
