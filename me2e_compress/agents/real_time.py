@@ -49,6 +49,9 @@ from me2e_compress.runtime.profile import processor
 WALL_CLOCK = re.compile(r"(_\d\d){5}$")
 """The end of a save name: month, day, hour, minute, second of the start."""
 
+RATE_SLACK_S = 1e-3
+"""Simulated time is a sum of floating-point steps."""
+
 
 def get_entry_point() -> str:
     """Name the class that the leaderboard makes."""
@@ -115,6 +118,7 @@ class RealTimeAgent(ForwardingAgent):
 
     now_ns: Callable[[], int] = staticmethod(time.perf_counter_ns)
     _log: DecisionLog | None = None
+    _last_s: float | None = None
 
     def setup(self, path_to_conf_file: str) -> None:
         """Make the wrapped agent and set it up.
@@ -156,12 +160,22 @@ class RealTimeAgent(ForwardingAgent):
         return specs
 
     def run_step(self, input_data: SensorData, timestamp: float) -> CarlaControl:
-        """Return the control that acts in this frame, a copy of its own."""
-        if self._clock.decision_is_due:
-            self._decide(input_data, timestamp)
-        else:
-            self._skip(input_data)
-        self._metrics.note(self._frame)
+        """Return the control that acts in this frame, a copy of its own.
+
+        Whatever the wrapped agent raises leaves trace and ``metric_info.json`` behind.
+
+        Raises:
+            EvaluationError: The world does not tick at 20 Hz.
+        """
+        with ExitStack() as failed:
+            failed.callback(self._write)
+            self._check_rate(timestamp)
+            if self._clock.decision_is_due:
+                self._decide(input_data, timestamp)
+            else:
+                self._skip(input_data)
+            self._metrics.note(self._frame)
+            failed.pop_all()
         self._frame += 1
         return copy_of(self._clock.advance())
 
@@ -173,15 +187,20 @@ class RealTimeAgent(ForwardingAgent):
             if self._inner is not None:
                 self._inner.destroy()
 
+    def _check_rate(self, timestamp: float) -> None:
+        before, self._last_s = self._last_s, timestamp
+        if before is not None and abs(timestamp - before - DT_US / 1e6) > RATE_SLACK_S:
+            raise EvaluationError(
+                f"frame {self._frame}: the world ticked {timestamp - before:.3f} s: "
+                f"equation 4 is charged at {DT_US / 1e6:g} s"
+            )
+
     def _decide(self, input_data: SensorData, timestamp: float) -> None:
-        with ExitStack() as failed:
-            failed.callback(self._write)
-            self._synchronize()
-            begun = self.now_ns()
-            control = self._inner.run_step(input_data, timestamp)
-            self._synchronize()
-            done = self.now_ns()
-            failed.pop_all()
+        self._synchronize()
+        begun = self.now_ns()
+        control = self._inner.run_step(input_data, timestamp)
+        self._synchronize()
+        done = self.now_ns()
         measured_us = (done - begun) // 1_000
         latency_us = self._charge(self._facts(measured_us))
         self._clock.decide(copy_of(control), latency_us)

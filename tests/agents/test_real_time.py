@@ -19,6 +19,7 @@ from me2e_compress.driving.realtime import DT_US, LatencyModel, control_clock
 from me2e_compress.errors import EvaluationError, MissingPackageError
 from me2e_compress.evaluators.bench2drive.evaluator import Bench2DriveResults
 from me2e_compress.runtime.latency_trace import LatencyTrace
+from tests.agents import small_leaderboard
 from tests.agents.small_leaderboard import (
     SAVE_NAME,
     Leaderboard,
@@ -259,6 +260,28 @@ def test_a_run_step_that_raises_leaves_trace_and_metrics(
     assert len(json.loads((agent.save_path / "metric_info.json").read_text())) == 3
     agent.destroy()
     assert agent.gone
+
+
+def test_a_cheap_part_that_raises_leaves_metrics(
+    board: Leaderboard, tmp_path: Path
+) -> None:
+    agent = board.make(real_time, f"{config(tmp_path, latency='fps:5')}+{SAVE_NAME}")
+    board.run(agent, 2)
+    agent._inner.tick = lambda data: 1 / 0
+
+    with pytest.raises(ZeroDivisionError):
+        board.run(agent, 1)
+
+    assert len(json.loads((agent.save_path / "metric_info.json").read_text())) == 2
+
+
+def test_another_rate_is_refused(
+    board: Leaderboard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(small_leaderboard, "DT_S", 0.1)
+
+    with pytest.raises(EvaluationError, match=r"ticked 0.100 s"):
+        board.drive(real_time, config(tmp_path), 2)
 
 
 def test_an_agent_of_the_official_leaderboard_has_no_metrics(
