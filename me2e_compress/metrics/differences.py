@@ -2,42 +2,77 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import fmean
 from typing import Any
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.intervals import paired_interval
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.intervals import mean_estimate, unseen_share
+from me2e_compress.metrics.measure import Estimate
 
 POINTS = "points"
 """Difference of two percentages."""
 
+WIDEST = (-100.0, 100.0)
+"""What a route can differ by, in points."""
+
 
 @dataclass(frozen=True, slots=True)
 class PairedDifference:
-    """Means over routes of "this one minus the reference", each with its interval.
+    """Means over routes of "this one minus the reference", each with its intervals.
+
+    What makes a route hard for both cancels out, so the intervals are narrower than
+    those of the two means suggest. Where no route differs they are what so many
+    routes leave open (`metrics.intervals.unseen_share`), never of no width.
 
     Attributes:
         driving_score: Percentage points.
         success_rate: Percentage points.
         better: Routes with a higher driving score than the reference's.
         worse: Routes with a lower one.
+        gained: Routes that succeed with this one alone.
+        lost: Routes that succeed with the reference alone.
     """
 
     driving_score: Estimate
     success_rate: Estimate
     better: int
     worse: int
+    gained: int = 0
+    lost: int = 0
+
+    @property
+    def differ(self) -> int:
+        """Routes of another driving score."""
+        return self.better + self.worse
+
+    @property
+    def unseen_percent(self) -> float:
+        """Share of routes that could differ, with 95 %, if none of these does."""
+        return 100.0 * unseen_share(self.driving_score.n)
+
+    @property
+    def p_value(self) -> float:
+        """Of McNemar's exact test that success is equally frequent (two-sided).
+
+        Only routes on which the two part count; with none of them it is 1. As if
+        routes were independent of each other.
+        """
+        from scipy.stats import binomtest  # takes a second to import
+
+        parted = self.gained + self.lost
+        return float(binomtest(self.gained, parted).pvalue) if parted else 1.0
 
     def to_json(self) -> dict[str, Any]:
-        """Return both estimates and both counts."""
+        """Return both estimates, all counts and the p-value."""
         return {
             "driving_score": self.driving_score.to_json(),
             "success_rate": self.success_rate.to_json(),
             "routes_better": self.better,
             "routes_worse": self.worse,
+            "success_gained": self.gained,
+            "success_lost": self.lost,
+            "mcnemar_p": self.p_value,
         }
 
 
@@ -62,20 +97,29 @@ def difference(
             "taken over the same routes"
         )
     pairs = [(one, others[one.route]) for one in episodes]
-    scores = [
-        (route_score(one).composed, route_score(other).composed) for one, other in pairs
-    ]
-    rates = [(100.0 * one.succeeded, 100.0 * other.succeeded) for one, other in pairs]
+    types = [one.scenario for one in episodes]
+    scores = [route_score(one).composed - route_score(o).composed for one, o in pairs]
+    turns = [int(one.succeeded) - int(other.succeeded) for one, other in pairs]
     return PairedDifference(
-        _estimate(scores, seed),
-        _estimate(rates, seed),
-        sum(one > other for one, other in scores),
-        sum(one < other for one, other in scores),
+        mean_estimate(scores, types, POINTS, seed, WIDEST),
+        mean_estimate([100.0 * turn for turn in turns], types, POINTS, seed, WIDEST),
+        sum(score > 0 for score in scores),
+        sum(score < 0 for score in scores),
+        turns.count(1),
+        turns.count(-1),
     )
 
 
-def _estimate(pairs: Sequence[tuple[float, float]], seed: int) -> Estimate:
-    values, reference = zip(*pairs, strict=True)
-    low, high = paired_interval(values, reference, seed)
-    mean = fmean(one - other for one, other in pairs)
-    return Estimate(Measure(mean, POINTS), low, high, len(pairs))
+def holm(p_values: Sequence[float]) -> tuple[float, ...]:
+    """Return p-values corrected for how many were looked at (Holm 1979).
+
+    With them, the chance that any of the comparisons is called different though none
+    is stays below the level of one. In the order given: the smallest of m is
+    multiplied by m, the next by m - 1, and so on, and none falls below the one before.
+    """
+    order = sorted(range(len(p_values)), key=lambda i: p_values[i])
+    found, least = [1.0] * len(p_values), 0.0
+    for rank, i in enumerate(order):
+        least = max(least, min(1.0, p_values[i] * (len(p_values) - rank)))
+        found[i] = least
+    return tuple(found)

@@ -11,7 +11,7 @@ the order of the variants hangs on that choice. A score belongs to its weights a
 scales: compare scores of one call, or of calls that share an `EerScale`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.critic import critic_weights
-from me2e_compress.metrics.intervals import bootstrap_interval
+from me2e_compress.metrics.intervals import mean_estimate
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_measures import RouteMeasures
 
@@ -90,6 +90,7 @@ def eer(
     variants: Mapping[str, RouteMeasures],
     scale: EerScale | None = None,
     normalization: Normalization = Normalization.MIN_MAX,
+    types: Sequence[str] | None = None,
     seed: int = 0,
 ) -> EerResult:
     """Score variants that drove the same routes.
@@ -113,6 +114,8 @@ def eer(
         scale: Weights and scales that are fixed already; else they follow from the
             routes.
         normalization: How, where no scale is given.
+        types: Scenario type of every route, for the intervals; None: each is one of
+            its own.
         seed: Of the bootstrap.
 
     Raises:
@@ -137,10 +140,9 @@ def eer(
             scores[name] = Estimate(Measure(None, POINTS, why), None, None, 0)
             continue
         routes[name] = route_eer(tables[name], measures.crashed[kept], scale)
-        values = routes[name].tolist()
-        low, high = bootstrap_interval(values, seed)
-        mean = Measure(float(np.mean(values)), POINTS)
-        scores[name] = Estimate(mean, low, high, len(values))
+        kinds = types or [str(i) for i in range(len(kept))]
+        kinds = [kind for kind, keep in zip(kinds, kept, strict=True) if keep]
+        scores[name] = mean_estimate(routes[name].tolist(), kinds, POINTS, seed)
     return EerResult(scores, routes, None if reason else scale, left_out)
 
 

@@ -29,15 +29,21 @@ class Estimate:
 
     Attributes:
         measure: The mean, or None with the reason.
-        low: Lower bound of the 95 % interval; None where n is too small for one.
+        low: Lower bound of the 95 % interval over these scenario types; None where n
+            is too small for one.
         high: Upper bound.
         n: How many routes the mean was taken over.
+        anew_low: Lower bound over scenario types drawn anew, which is wider
+            (`metrics.intervals`); None where it was not computed.
+        anew_high: Upper bound.
     """
 
     measure: Measure
     low: float | None
     high: float | None
     n: int
+    anew_low: float | None = None
+    anew_high: float | None = None
 
     @property
     def value(self) -> float | None:
@@ -45,11 +51,13 @@ class Estimate:
         return self.measure.value
 
     def to_json(self) -> dict[str, float | int | str | None]:
-        """Return a flat object: value, low, high, n, unit, reason (null if none)."""
+        """Return a flat object of all fields, value, unit and reason at their side."""
         return {
             "value": self.measure.value,
             "low": self.low,
             "high": self.high,
+            "anew_low": self.anew_low,
+            "anew_high": self.anew_high,
             "n": self.n,
             "unit": self.measure.unit,
             "reason": self.measure.reason or None,

@@ -1,26 +1,30 @@
 """All scores of a set of driven routes."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from me2e_compress.metrics import bench2drive, comfort, efficiency, surrogate_safety
 from me2e_compress.metrics.abilities import ABILITIES, successes
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.intervals import (
+    Bounds,
+    Floats,
     binomial_interval,
-    bootstrap_interval,
-    resampled_interval,
+    intervals,
+    mean_estimate,
 )
 from me2e_compress.metrics.measure import Estimate, Measure
 
 FULL_SET = 220
 """Routes of a whole benchmark: 44 scenario types with 5 variants each."""
+
+PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)
+"""Bounds of what a route can have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,19 +126,26 @@ def score(
         expected: How many routes the whole set has.
         seed: Of the bootstrap.
     """
-    driving = [route_score(episode).composed for episode in episodes]
+    in_motion = comfort.comfort_in_motion
     return Scores(
-        driving_score=_mean([Measure(value, "%") for value in driving], "%", seed),
-        success_rate=_rate([episode.succeeded for episode in episodes]),
+        driving_score=_over(episodes, _driving_score, "%", seed, PERCENT),
+        success_rate=_rate(
+            [episode.succeeded for episode in episodes], _types(episodes), seed
+        ),
         efficiency=_over(episodes, efficiency.efficiency, "%", seed),
-        comfort=_over(episodes, comfort.comfort, "ratio", seed),
-        comfort_in_motion=_over(episodes, comfort.comfort_in_motion, "ratio", seed),
+        comfort=_over(episodes, comfort.comfort, "ratio", seed, SHARE),
+        comfort_in_motion=_over(episodes, in_motion, "ratio", seed, SHARE),
         abilities=_abilities(episodes, seed),
         each_ability={
-            name: _rate(mastered) for name, mastered in successes(episodes).items()
+            name: _rate(
+                mastered, _types(e for e in episodes if name in e.abilities), seed
+            )
+            for name, mastered in successes(episodes).items()
         },
         bench2drive_efficiency=_over(episodes, bench2drive.efficiency, "%", seed),
-        bench2drive_smoothness=_over(episodes, bench2drive.smoothness, "ratio", seed),
+        bench2drive_smoothness=_over(
+            episodes, bench2drive.smoothness, "ratio", seed, SHARE
+        ),
         safety=_safety(episodes, seed),
         routes=len(episodes),
         expected=expected,
@@ -144,13 +155,13 @@ def score(
 def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
     faults = [surrogate_safety.at_fault_collision(episode) for episode in episodes]
     known = [fault for fault in faults if fault is not None]
-    at_fault = _rate(known)
+    at_fault = _rate(known, _types(episodes)[: len(known)], seed)
     if len(known) < len(faults):
         # routes without a collision alone would make a rate of nothing but zeros
         reason = f"whose fault {len(faults) - len(known)} collisions were is not known"
         at_fault = Estimate(Measure(None, "%", reason), None, None, 0)
     return SafetyScores(
-        _over(episodes, surrogate_safety.ttc_exposure, "%", seed),
+        _over(episodes, surrogate_safety.ttc_exposure, "%", seed, PERCENT),
         _over(episodes, surrogate_safety.smallest_ttc, "s", seed),
         _over(episodes, surrogate_safety.smallest_pet, "s", seed),
         _over(episodes, surrogate_safety.smallest_distance, "m", seed),
@@ -158,31 +169,40 @@ def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
     )
 
 
+def _driving_score(episode: Episode) -> Measure:
+    return Measure(route_score(episode).composed, "%")
+
+
+def _types(episodes: Iterable[Episode]) -> list[str]:
+    return [episode.scenario for episode in episodes]
+
+
 def _over(
     episodes: Sequence[Episode],
     metric: Callable[[Episode], Measure],
     unit: str,
     seed: int,
+    bounds: Bounds | None = None,
 ) -> Estimate:
-    return _mean([metric(episode) for episode in episodes], unit, seed)
-
-
-def _mean(measures: Sequence[Measure], unit: str, seed: int) -> Estimate:
-    values = [measure.value for measure in measures if measure.value is not None]
-    if not values:
-        reason = measures[0].reason if measures else "no route was driven"
+    found = [(metric(episode), episode.scenario) for episode in episodes]
+    known = [(each.value, kind) for each, kind in found if each.value is not None]
+    if not known:
+        reason = found[0][0].reason if found else "no route was driven"
         return Estimate(Measure(None, unit, reason), None, None, 0)
-    low, high = bootstrap_interval(values, seed)
-    return Estimate(Measure(fmean(values), unit), low, high, len(values))
+    values, types = zip(*known, strict=True)
+    return mean_estimate(values, types, unit, seed, bounds)
 
 
-def _rate(outcomes: Sequence[bool]) -> Estimate:
+def _rate(outcomes: Sequence[bool], types: Sequence[str], seed: int) -> Estimate:
+    """Return a rate with its exact interval, and the one over types drawn anew."""
     n, good = len(outcomes), sum(outcomes)
     if n == 0:
         return Estimate(Measure(None, "%", "no such route was driven"), None, None, 0)
+    percents = [100.0 * outcome for outcome in outcomes]
+    found = mean_estimate(percents, types, "%", seed, PERCENT)
     low, high = binomial_interval(good, n)
     bounds = [None if bound is None else 100.0 * bound for bound in (low, high)]
-    return Estimate(Measure(100.0 * good / n, "%"), bounds[0], bounds[1], n)
+    return replace(found, low=bounds[0], high=bounds[1])
 
 
 def _abilities(episodes: Sequence[Episode], seed: int) -> Estimate:
@@ -197,12 +217,12 @@ def _abilities(episodes: Sequence[Episode], seed: int) -> Estimate:
     for column, name in enumerate(ABILITIES):
         good[tests[:, column], column] = outcomes[name]
 
-    def mean_rate(picked: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-        n = tests[picked].sum(axis=1)
+    def mean_rate(weights: Floats) -> Floats:
+        n = weights @ tests
         rates = np.full(n.shape, np.nan)
-        np.divide(good[picked].sum(axis=1), n, out=rates, where=n > 0)
+        np.divide(weights @ good, n, out=rates, where=n > 0)
         return np.asarray(100.0 * np.nanmean(rates, axis=1))
 
-    low, high = resampled_interval(mean_rate, len(episodes), seed)
     value = fmean(100.0 * sum(each) / len(each) for each in outcomes.values())
-    return Estimate(Measure(value, "%"), low, high, len(episodes))
+    here, anew = intervals(mean_rate, _types(episodes), seed, value, PERCENT)
+    return Estimate(Measure(value, "%"), *here, len(episodes), *anew)

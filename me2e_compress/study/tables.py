@@ -1,10 +1,10 @@
 """The tables of a study: one content for the terminal, Markdown and HTML."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from me2e_compress.metrics.abilities import ABILITIES
-from me2e_compress.metrics.differences import PairedDifference
+from me2e_compress.metrics.differences import PairedDifference, holm
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.condition import Condition
@@ -55,20 +55,48 @@ def _scoreboard(outcome: "StudyResult", condition: Condition) -> Table:
 
 def differences(outcome: "StudyResult") -> Table:
     """Show every variant minus the baseline, paired by route."""
-    baseline, rows = outcome.study.baseline, []
+    baseline = outcome.study.baseline
     several = len(outcome.study.conditions) > 1
+    names, found = list[str](), list[PairedDifference]()
     for drive in outcome.drives:
-        if drive.difference is None:
-            continue
-        name = f"{drive.variant}, {drive.condition}" if several else drive.variant
-        rows.append((Cell(name), *_difference(drive.difference)))
+        if drive.difference is not None:
+            found.append(drive.difference)
+            name = f"{drive.variant}, {drive.condition}"
+            names.append(name if several else drive.variant)
+    corrected = holm([each.p_value for each in found])
     return Table(
         f"Difference to {baseline} on the same routes",
-        ("variant", "DS, points", "SR, points", "routes better", "routes worse"),
-        tuple(rows),
-        "Mean over routes with its 95 % interval, paired bootstrap: an interval that "
-        "holds zero shows no difference.",
+        (
+            *("variant", "DS, points", "DS, other types", "SR, points", "SR p"),
+            *("routes better", "routes worse"),
+        ),
+        tuple(
+            (Cell(name), *_difference(each, p))
+            for name, each, p in zip(names, found, corrected, strict=True)
+        ),
+        _differences_note(found),
     )
+
+
+def _differences_note(found: Sequence[PairedDifference]) -> str:
+    notes = [
+        "Mean over routes with its 95 % interval, paired: an interval that holds zero "
+        'shows no difference. It is for routes of these scenario types; "DS, other '
+        "types\" for types drawn anew. SR p: McNemar's exact test",
+        ".",
+    ]
+    if len(found) > 1:
+        notes[1] = (
+            f", corrected for {len(found)} comparisons (Holm). The intervals are each "
+            f"of 95 %: of {len(found)}, one in twenty would miss zero by chance."
+        )
+    alike = [each for each in found if not each.differ]
+    if alike:
+        routes, share = alike[0].driving_score.n, alike[0].unseen_percent
+        notes.append(
+            f" Where 0 of {routes} routes differ, with 95 % at most {share:.1f} % do."
+        )
+    return "".join(notes)
 
 
 def abilities(outcome: "StudyResult") -> tuple[Table, ...]:
@@ -134,10 +162,13 @@ def _costs(variant: "VariantOutcome") -> tuple[Cell, ...]:
     )
 
 
-def _difference(found: PairedDifference) -> tuple[Cell, ...]:
+def _difference(found: PairedDifference, p_value: float) -> tuple[Cell, ...]:
+    score = found.driving_score
     return (
-        estimate_cell(found.driving_score, signed=True),
+        estimate_cell(score, signed=True),
+        between_cell(score.anew_low, score.anew_high, "+.1f"),
         estimate_cell(found.success_rate, signed=True),
+        Cell(f"{p_value:.2g}"),
         Cell(str(found.better)),
         Cell(str(found.worse)),
     )
@@ -154,7 +185,8 @@ def _routes_note(outcome: "StudyResult") -> str:
     share = f"{driven} routes" if driven == whole else f"{driven} of {whole} routes"
     return (
         f"{share}. DS driving score, SR success rate, DE efficiency, DC comfort, each "
-        f"with its 95 % interval. {MISSING} means not measured."
+        f"with its 95 % interval over these scenario types. {MISSING} means not "
+        "measured."
     )
 
 
@@ -185,6 +217,13 @@ def estimate_cell(
         return Cell(text)
     low, high = (number(each, form) for each in (estimate.low, estimate.high))
     return Cell(text, f"{low} to {high}")
+
+
+def between_cell(low: float | None, high: float | None, form: str) -> Cell:
+    """Show an interval alone."""
+    if low is None or high is None:
+        return Cell(MISSING, reason="too few scenario types")
+    return Cell(f"{number(low, form)} to {number(high, form)}")
 
 
 def measure_cell(measure: Measure, form: str) -> Cell:

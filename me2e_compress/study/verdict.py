@@ -37,7 +37,7 @@ def smallest_shown(found: PairedDifference) -> float:
 
     Half the width of the interval that the mean would have if routes scattered as
     those of `SCATTER`, or of its own where that is wider: on few routes nothing may
-    differ by chance, and an interval of no width promises too much.
+    differ by chance.
     """
     score = found.driving_score
     usual = _shown_by(score.n)
@@ -59,6 +59,9 @@ def _road(found: PairedDifference, outcome: StudyResult) -> str:
         said += f" (95 %: {low} to {high})"
         differs = not score.low <= 0 <= score.high
     routes, whole = score.n, outcome.study.set_size
+    if not found.differ:
+        most = f"{found.unseen_percent:.0f} %"
+        said += f"; 0 of {routes} routes differ, with 95 % at most {most} of all do"
     shown = "a difference" if differs else "no difference shown"
     limit = f"{routes} route{'s' * (routes > 1)} cannot show one below"
     said += f": {shown}; {limit} {smallest_shown(found):.0f} points"

@@ -136,7 +136,7 @@ def scores_table(name: str, scores: Scores) -> Table:
     routes = f"{scores.routes} of {scores.expected} routes"
     partial = ", PARTIAL: no comparison with a whole set" if scores.partial else ""
     rows = [(label, *_cells(estimate)) for label, estimate in _each(scores)]
-    columns = ("score", "mean", "95 %", "n", "unit")
+    columns = ("score", "mean", "95 %", "95 %, other types", "n", "unit")
     return table(f"{name}: {routes}{partial}", columns, rows)
 
 
@@ -169,6 +169,13 @@ def _cells(estimate: Estimate) -> Sequence[str]:
     measure = estimate.measure
     form = ".2f" if measure.unit == "%" else ".3f"
     if measure.value is None:
-        return "-", "-", str(estimate.n), f"not measured: {measure.reason}"
-    between = f"{number(estimate.low, form)} to {number(estimate.high, form)}"
-    return number(measure.value, form), between, str(estimate.n), measure.unit
+        return "-", "-", "-", str(estimate.n), f"not measured: {measure.reason}"
+    here = _between(estimate.low, estimate.high, form)
+    anew = _between(estimate.anew_low, estimate.anew_high, form)
+    return number(measure.value, form), here, anew, str(estimate.n), measure.unit
+
+
+def _between(low: float | None, high: float | None, form: str) -> str:
+    if low is None or high is None:
+        return "-"
+    return f"{number(low, form)} to {number(high, form)}"

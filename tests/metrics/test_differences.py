@@ -1,12 +1,10 @@
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.differences import difference
+from me2e_compress.metrics.differences import difference, holm
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.intervals import bootstrap_interval, paired_interval
 from tests.metrics.drives import drive, infraction
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
@@ -34,10 +32,44 @@ def test_the_other_way_round_has_the_other_sign() -> None:
     assert (one.better, one.worse) == (other.worse, other.better)
 
 
-def test_a_drive_does_not_differ_from_itself() -> None:
-    found = difference(BAD, BAD).driving_score
+def test_where_nothing_differs_the_interval_is_what_may_be_unseen() -> None:
+    found = difference(BAD, BAD)
 
-    assert (found.value, found.low, found.high) == (0.0, 0.0, 0.0)
+    # with 95 % at most 1 - 0.05 ** (1 / 4) of all routes differ, by 100 points each
+    share = 100.0 * (1.0 - 0.05**0.25)
+    score = found.driving_score
+    assert score.value == 0.0
+    assert (score.low, score.high) == pytest.approx((-share, share))
+    assert found.unseen_percent == pytest.approx(share)
+    assert found.differ == 0
+
+
+def test_success_is_compared_by_mcnemars_exact_test() -> None:
+    names = [str(i) for i in range(20)]
+    one = [drive(*[CRASH] * (k < 1), route=name) for k, name in enumerate(names)]
+    other = [drive(*[CRASH] * (k > 11), route=name) for k, name in enumerate(names)]
+
+    found = difference(one, other)
+
+    # 8 routes gained, 1 lost: 2 * (1 + 9) / 2 ** 9
+    assert (found.gained, found.lost) == (8, 1)
+    assert found.p_value == pytest.approx(20 / 512)
+    assert difference(one, one).p_value == 1.0
+
+
+def test_holm_by_hand() -> None:
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx((0.03, 0.06, 0.06))
+    assert holm([0.9, 0.6]) == (1.0, 1.0)
+    assert holm([]) == ()
+
+
+@given(st.lists(st.floats(0, 1), max_size=6))
+def test_holm_only_raises_and_keeps_the_order(p_values: list[float]) -> None:
+    found = holm(p_values)
+
+    assert all(p <= new <= 1.0 for p, new in zip(p_values, found, strict=True))
+    ranked = [new for _, new in sorted(zip(p_values, found, strict=True))]
+    assert ranked == sorted(ranked)
 
 
 def test_one_route_has_no_interval() -> None:
@@ -49,38 +81,3 @@ def test_one_route_has_no_interval() -> None:
 def test_other_routes_are_named() -> None:
     with pytest.raises(EvaluationError, match="route d was driven by one"):
         difference(BAD[:3], GOOD)
-
-
-def test_what_is_hard_for_both_cancels_out() -> None:
-    random = np.random.default_rng(5)
-    hard = random.normal(50.0, 20.0, 60)
-    one, other = hard + random.normal(0.0, 1.0, 60) + 2.0, hard
-
-    low, high = paired_interval(one.tolist(), other.tolist())
-    assert low is not None
-    assert high is not None
-    wide_low, wide_high = bootstrap_interval(one.tolist())
-    assert wide_low is not None
-    assert wide_high is not None
-    assert 0.0 < low < 2.0 < high
-    assert high - low < (wide_high - wide_low) / 5
-
-
-def test_unequal_lengths_are_no_pairs() -> None:
-    with pytest.raises(ValueError, match="zip"):
-        paired_interval([1.0, 2.0], [1.0])
-
-
-@given(
-    st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), min_size=2, max_size=12),
-    st.integers(0, 2**32 - 1),
-)
-def test_the_interval_turns_with_the_sign(
-    pairs: list[tuple[float, float]], seed: int
-) -> None:
-    one, other = (list(column) for column in zip(*pairs, strict=True))
-
-    low, high = paired_interval(one, other, seed)
-    back_low, back_high = paired_interval(other, one, seed)
-
-    assert (low, high) == pytest.approx((-(back_high or 0.0), -(back_low or 0.0)))

@@ -64,7 +64,17 @@ def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
         for condition in ("ideal", "slow")
         for variant in ("blind", "again", "fast")
     ]
-    assert table.rows[1][1] == Cell("+0.0", "+0.0 to +0.0")
+    # nothing differed: what two routes leave open, 1 - 0.05 ** (1 / 2)
+    assert table.rows[1][1] == Cell("+0.0", f"{MINUS}77.6 to +77.6")
+
+
+def test_the_note_says_how_many_were_compared_and_what_may_be_unseen(
+    found: StudyResult,
+) -> None:
+    note = differences(found).note
+
+    assert "corrected for 6 comparisons (Holm)" in note
+    assert "Where 0 of 2 routes differ, with 95 % at most 77.6 % do." in note
 
 
 def test_abilities_have_their_mean_last(found: StudyResult) -> None:
