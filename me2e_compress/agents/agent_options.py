@@ -12,7 +12,7 @@ from me2e_compress.errors import EvaluationError
 class AgentOptions(BaseModel):
     """The contents of a TOML file; relative paths start where the leaderboard runs."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -32,7 +32,7 @@ class CarlaCamera(BaseModel):
         fov: Horizontal field of view, degrees.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     id: str
     x: float

@@ -49,24 +49,24 @@ class PidOptions(BaseModel):
             VAD's no such limit.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     turn_kp: float = 0.75
     turn_ki: float = 0.75
     turn_kd: float = 0.3
-    turn_window: int = Field(default=40, ge=2)
+    turn_window: int = Field(default=40, ge=2, le=4000)
     speed_kp: float = 5.0
     speed_ki: float = 0.5
     speed_kd: float = 1.0
-    speed_window: int = Field(default=40, ge=2)
-    max_throttle: float = 0.75
+    speed_window: int = Field(default=40, ge=2, le=4000)
+    max_throttle: float = Field(default=0.75, ge=0.0, le=1.0)
     brake_speed_mps: float = 0.4
     brake_ratio: float = 1.1
     clip_delta_mps: float = 0.25
     aim_m: float = 4.0
     angle_threshold: float = 0.3
     node_within_m: float = 10.0
-    coast_above_mps: float = math.inf
+    coast_above_mps: float = Field(default=math.inf, gt=0.0, allow_inf_nan=True)
 
 
 class PedalsAndWheel(NamedTuple):

@@ -28,8 +28,8 @@ def test_straight_ahead_at_the_right_speed_does_nothing() -> None:
 
 
 def test_missing_speed_presses_the_throttle() -> None:
-    # 5 x 0.2 + 0.5 x 0.2 / 40 + 1 x 0.2, at most 0.75
-    assert first(straight(4.0), 3.8, max_throttle=2.0).throttle == pytest.approx(1.2025)
+    # 5 x 0.1 + 0.5 x 0.1 / 40 + 1 x 0.1, at most 0.75
+    assert first(straight(4.0), 3.9).throttle == pytest.approx(0.60125)
     assert first(straight(4.0), 0.0) == PedalsAndWheel(0.75, 0.0, 0.0)
 
 
