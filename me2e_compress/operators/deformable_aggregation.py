@@ -104,6 +104,7 @@ class DeformableAggregation(Operator):
                 Operand("feat_scale", "C", FLOAT32, optional=True),
             ),
             "SparseDriveV2",
+            int8_scale=5,
         ),
         Dialect(
             "sparseend2end", "DeformableAttentionAggrPlugin", "custom",

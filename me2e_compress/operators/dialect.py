@@ -99,6 +99,8 @@ class Dialect:
             ``plugin_namespace``.
         version: ``plugin_version`` that TensorRT looks for.
         namespace: ``plugin_namespace`` that TensorRT looks for.
+        int8_scale: which input holds the scales of int8 features, float32, one a
+            channel; None where no input does.
     """
 
     name: str
@@ -109,6 +111,7 @@ class Dialect:
     attributes: tuple[Attribute, ...] = ()
     version: str = "1"
     namespace: str = ""
+    int8_scale: int | None = None
 
     def inputs_to_own(
         self, call: FusedCall, inputs: Values, attributes: Attributes

@@ -59,6 +59,7 @@ def test_the_paper_quantizes_weighted_layers_alone() -> None:
     found = decided(sampled(), "paper")
 
     assert (found.dtype, found.rule) == ("float", "fused-operator")
+    assert found.could_be_int8  # so that `plan --nodes` shows it
     assert decided(sampled(), "paper{without=[fused-operator]}").dtype == "int8"
     assert decided(sampled(), "paper", overrides=TO_INT8).rule == "override"
 
@@ -74,7 +75,7 @@ def test_modules_outside_the_scheme_stay() -> None:
     [
         ("trt.plugins", "MultiscaleDeformableAttnPlugin_TRT", "float32 or float16"),
         ("mmdeploy", "MMCVMultiScaleDeformableAttention", "float32 or float16"),
-        ("trt.plugins", "MultiScaleDeformableAttnTRT", "otherwise than by QDQ"),
+        ("trt.plugins", "MultiScaleDeformableAttnTRT", "not by QDQ"),
     ],
 )
 def test_plugins_of_tensorrt_stay_whatever_is_asked(

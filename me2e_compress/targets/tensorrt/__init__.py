@@ -19,8 +19,8 @@ import onnx_ir as ir
 from me2e_compress import rewrite
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.graph import provenance
-from me2e_compress.operators import find
+from me2e_compress.graph import input_at, provenance, static_shape
+from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.plan import (
     Decision,
@@ -90,16 +90,21 @@ class TensorRT(Target):
         return copy
 
     def fused_objection(self, node: ir.Node) -> str | None:
-        """Say what a plugin takes: in explicit quantization none gets int8 by a pair.
+        """Say why a plugin gets no int8: most take float alone.
 
-        A pair in front of it would be run by kernels of their own: the plugin reads
-        float. Those with int8 of their own take its scale by implicit quantization
-        (BEVFormer_tensorrt), or as one more input (SparseDriveV2).
+        A pair in front of those would be run by kernels of its own. In explicit
+        quantization int8 reaches a plugin as it is, and its scale as an input
+        (SparseDriveV2); BEVFormer_tensorrt's want it by implicit quantization.
         """
         found = find(node)
         if found is None or ir.DataType.INT8 not in found[1].operands[0].types:
             return f"the plugin {node.op_type} takes float32 or float16 alone"
-        return f"the plugin {node.op_type} gets the scale of int8 otherwise than by QDQ"
+        scale, shape = found[1].int8_scale, static_shape(node.inputs[0])
+        if scale is None:
+            return f"the plugin {node.op_type} gets the scale of int8 not by QDQ"
+        if shape is None or input_at(node, scale) is not None:
+            return "its features are int8 already, or of open size"
+        return None
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
         """Predict what int8 of some layers saves and costs on the machine."""
@@ -127,6 +132,9 @@ class _Writer:
         self, node: ir.Node, decision: Decision, weight: QuantizedWeight | None
     ) -> None:
         """Rewrite one node to read int8."""
+        if reads := int8_inputs(node):
+            self._feed(node, reads[0])
+            return
         for index in decision.activations:
             value = node.inputs[index]
             if value is not None:
@@ -135,6 +143,22 @@ class _Writer:
         like = None if at is None else node.inputs[at]
         if weight is not None and at is not None and like is not None:
             node.replace_input_with(at, self._weight(weight, like, node))
+
+    def _feed(self, plugin: ir.Node, index: int) -> None:
+        """Give a plugin integers as they are, and their scale for every channel."""
+        value, found = plugin.inputs[index], find(plugin)
+        at = None if found is None else found[1].int8_scale
+        channels = (static_shape(value) or ())[-1:]
+        if value is None or at is None or not channels:
+            return
+        dequantize = self._activation(value, plugin).producer()
+        if dequantize is None:
+            return
+        plugin.replace_input_with(index, dequantize.inputs[0])
+        step = scale_of(*self._ranges.tensors[str(value.name)])
+        scales = self._constant(np.full(channels, step), f"{value.name}_scales")
+        plugin.resize_inputs(at + 1)
+        plugin.replace_input_with(at, scales)
 
     def _activation(self, value: ir.Value, reader: ir.Node) -> ir.Value:
         name = str(value.name)

@@ -13,6 +13,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, nodes_of
 from me2e_compress.graph.shapes import extent
+from me2e_compress.operators import find, int8_inputs
 from me2e_compress.targets.base import LintFinding, error, warning
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
@@ -75,7 +76,10 @@ def scalars(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def completeness(model: ir.Model) -> Iterator[LintFinding]:
-    """Check that only DequantizeLinears of the same scale read a QuantizeLinear."""
+    """Check that only DequantizeLinears of the same scale read a QuantizeLinear.
+
+    Or a plugin that takes int8, and its scale as another input.
+    """
     for node in pairs_of(model):
         if node.op_type == QUANTIZE:
             yield from _readers(node)
@@ -91,12 +95,21 @@ def _readers(node: ir.Node) -> Iterator[LintFinding]:
         yield error("unpaired", node, "its integers are a graph output")
     readers = list(result.consumers())
     for reader in readers:
+        if _takes_integers(reader):
+            continue
         if reader.op_type != DEQUANTIZE or not is_standard(reader):
             yield error("unpaired", node, f"its integers are read by {reader.op_type}")
         elif not _same_scale(node, reader):
             yield error("unpaired", node, "quantized and dequantized on two scales")
     if not readers and not result.is_graph_output():
         yield error("unpaired", node, "nothing reads its integers")
+
+
+def _takes_integers(plugin: ir.Node) -> bool:
+    """Return whether a plugin takes int8 features and has their scale."""
+    found = find(plugin) if int8_inputs(plugin) else None
+    at = None if found is None else found[1].int8_scale
+    return at is not None and graph.input_at(plugin, at) is not None
 
 
 def integers(model: ir.Model) -> Iterator[LintFinding]:
