@@ -47,6 +47,7 @@ __all__ = [
     "Policy",
     "RouteInfo",
     "SceneView",
+    "SizedEvaluator",
     "WorldView",
 ]
 
@@ -222,4 +223,14 @@ class Evaluator(Protocol):
         Raises:
             EvaluationError: It cannot go on: one line that names the culprit.
         """
+        ...
+
+
+@runtime_checkable
+class SizedEvaluator(Evaluator, Protocol):
+    """An evaluator whose whole set has more routes than it may yield."""
+
+    @property
+    def set_size(self) -> int:
+        """How many routes the whole set has: fewer are a partial result."""
         ...

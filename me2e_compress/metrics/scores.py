@@ -1,6 +1,6 @@
 """All scores of a set of driven routes."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
@@ -19,6 +19,7 @@ from me2e_compress.metrics.intervals import (
     mean_estimate,
 )
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.traffic_signs import MEAN, ability_rates
 
 FULL_SET = 220
 """Routes of a whole benchmark: 44 scenario types with 5 variants each."""
@@ -127,6 +128,7 @@ def score(
         seed: Of the bootstrap.
     """
     in_motion = comfort.comfort_in_motion
+    mean_ability, each_ability = _abilities(episodes, seed)
     return Scores(
         driving_score=_over(episodes, _driving_score, "%", seed, PERCENT),
         success_rate=_rate(
@@ -135,13 +137,8 @@ def score(
         efficiency=_over(episodes, efficiency.efficiency, "%", seed),
         comfort=_over(episodes, comfort.comfort, "ratio", seed, SHARE),
         comfort_in_motion=_over(episodes, in_motion, "ratio", seed, SHARE),
-        abilities=_abilities(episodes, seed),
-        each_ability={
-            name: _rate(
-                mastered, _types(e for e in episodes if name in e.abilities), seed
-            )
-            for name, mastered in successes(episodes).items()
-        },
+        abilities=mean_ability,
+        each_ability=each_ability,
         bench2drive_efficiency=_over(episodes, bench2drive.efficiency, "%", seed),
         bench2drive_smoothness=_over(
             episodes, bench2drive.smoothness, "ratio", seed, SHARE
@@ -205,9 +202,28 @@ def _rate(outcomes: Sequence[bool], types: Sequence[str], seed: int) -> Estimate
     return replace(found, low=bounds[0], high=bounds[1])
 
 
-def _abilities(episodes: Sequence[Episode], seed: int) -> Estimate:
-    """Return the mean of the abilities' success rates, if all five were driven."""
+def _abilities(
+    episodes: Sequence[Episode], seed: int
+) -> tuple[Estimate, dict[str, Estimate]]:
+    """Return the mean of the abilities' success rates, and each of them.
+
+    Real runs do not tell where junctions are, which Traffic_Signs asks for.
+    """
+    if any(episode.given is not None for episode in episodes):
+        rates = ability_rates(episodes, "0.0.4", {})
+        return rates.pop(MEAN), rates
     outcomes = successes(episodes)
+    each = {
+        name: _rate(mastered, _types(e for e in episodes if name in e.abilities), seed)
+        for name, mastered in outcomes.items()
+    }
+    return _mean_ability(episodes, outcomes, seed), each
+
+
+def _mean_ability(
+    episodes: Sequence[Episode], outcomes: Mapping[str, tuple[bool, ...]], seed: int
+) -> Estimate:
+    """Return the mean of the abilities' success rates, if all five were driven."""
     missing = [name for name in ABILITIES if not outcomes[name]]
     if missing:
         reason = f"no route for {', '.join(missing)} was driven"

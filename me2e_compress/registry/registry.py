@@ -118,7 +118,12 @@ class Registry(Generic[T]):
         values = {each.name: getattr(item, each.name) for each in fields_of(type(item))}
         return self.make(type(item), {**values, **options})
 
-    def parse(self, text: str, cls: type[T] | None = None) -> T:
+    def parse(
+        self,
+        text: str,
+        cls: type[T] | None = None,
+        more: Mapping[str, object] | None = None,
+    ) -> T:
         """Make an item from ``name``, ``name{option=value, ...}`` or ``name:value``.
 
         What follows a colon is the value of the first option.
@@ -127,9 +132,11 @@ class Registry(Generic[T]):
             text: of the item.
             cls: what to make of it, where that need not be registered; None finds the
                 class by the name.
+            more: options that the text is not to give.
 
         Raises:
-            error: the text is not of that form, or see :meth:`build`.
+            error: the text is not of that form or gives one of these options, or see
+                :meth:`build`.
         """
         try:
             item = read_one(text)
@@ -137,7 +144,7 @@ class Registry(Generic[T]):
             if not name_in(text):
                 raise self._unknown(text) from error
             raise self.error(f"{self.kind}: {error}") from error
-        return self._built(item, cls or self.get(item.name))
+        return self._built(item, cls or self.get(item.name), more)
 
     def parse_all(self, text: str) -> tuple[T, ...]:
         """Make the items that a text lists, parted by commas.
@@ -190,13 +197,20 @@ class Registry(Generic[T]):
         there = ", ".join(self.names()) or "none"
         return self.error(f"no {self.kind} {name!r}; there are {there}")
 
-    def _built(self, item: ParsedItem, cls: type[T]) -> T:
+    def _built(
+        self, item: ParsedItem, cls: type[T], more: Mapping[str, object] | None = None
+    ) -> T:
+        more = more or {}
         if item.value is None:
-            return self.make(cls, item.options)
+            if twice := [option for option in more if option in item.options]:
+                raise self.error(f"{item.name}: option {twice[0]} is given twice")
+            return self.make(cls, {**item.options, **more})
         first = next((each for each in fields_of(cls) if not each.kw_only), None)
         if first is None:
             raise self.error(f"{item.name} takes no value, found {item.value!r}")
-        return self.make(cls, {first.name: item.value})
+        if first.name in more:
+            raise self.error(f"{item.name}: option {first.name} is given twice")
+        return self.make(cls, {first.name: item.value, **more})
 
     def _claims(self, name: str) -> tuple[EntryPoint, ...]:
         """List what is to be loaded for a name; more than one is a conflict."""

@@ -1,11 +1,14 @@
 """Check that an evaluator yields what scores are computed from."""
 
+import itertools
+import json
 from collections import Counter
 
 from me2e_compress.driving.contract import Evaluator
 from me2e_compress.errors import VerificationError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.simulator.routes import is_route_id
 from me2e_compress.testing.form import check_form
 
 
@@ -15,7 +18,9 @@ def check_evaluator(
     """Check that an evaluator yields each route once, and always the same.
 
     It has the form of :func:`check_form`; it yields at least one episode, no route
-    twice; and a second evaluation yields equal episodes in the same order.
+    twice; a second evaluation yields equal episodes in the same order; and what it
+    yields can be kept: a route's name is that of a file, its numbers are finite and in
+    their bounds, its frames are in order of time.
 
     Args:
         evaluator: the evaluator.
@@ -40,6 +45,8 @@ def check_evaluator(
     route, count = Counter(each.route for each in first).most_common(1)[0]
     if count > 1:
         raise VerificationError(f"{name} yields route {route} {count} times")
+    for each in first:
+        _check_kept(name, each)
     second = tuple((evaluator if again is None else again).episodes())
     if [each.route for each in second] != [each.route for each in first]:
         raise VerificationError(f"{name} yields other routes, or in another order")
@@ -47,3 +54,22 @@ def check_evaluator(
         if one != other:
             raise VerificationError(f"{name} yields two episodes for {one.route}")
     return first
+
+
+def _check_kept(name: str, episode: Episode) -> None:
+    route = episode.route
+    if not is_route_id(route):
+        raise VerificationError(
+            f"{name} yields route {route!r}: a name is made of letters, digits, '_' "
+            "and '-'"
+        )
+    try:
+        again = Episode.from_json(json.loads(json.dumps(episode.to_json())))
+    except (TypeError, ValueError) as error:
+        line = " ".join(str(error).split())[:200]
+        raise VerificationError(f"{name}: {route} cannot be kept: {line}") from error
+    if again != episode:
+        raise VerificationError(f"{name}: {route} is read back as another episode")
+    times = [frame.time_us for frame in episode.frames]
+    if any(later <= earlier for earlier, later in itertools.pairwise(times)):
+        raise VerificationError(f"{name}: the frames of {route} are not in their order")

@@ -28,9 +28,21 @@ from me2e_compress.workflows.checks import check_folder, check_number, model_pat
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.other_evaluators import (
+    HIGHWAY,
+    driven_episodes,
+    evaluator_named,
+    expected_of,
+    files_of,
+    is_highway,
+    keep,
+)
 from me2e_compress.workflows.result import Result, Table, number
 from me2e_compress.workflows.score import driving_score, score_records, scores_table
 from me2e_compress.zoo.shipped import SHIPPED
+
+_FLAGS = {"frame_limit_s": "frame-limit"}
+"""Options of the command that are called otherwise in Python."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +68,8 @@ class EvaluateOptions:
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
         provider: what runs the model; one of other policies is not asked.
         force: replace outputs that are not as we left them, too.
+        evaluator: ``highway``, whose options are those above; or another by name,
+            ``name{option=value}``, which gets the policy as its option ``policy``.
 
     Raises:
         RecipeError: a number that is not positive and finite.
@@ -77,11 +91,27 @@ class EvaluateOptions:
     render: str | None = None
     provider: Provider = CPU
     force: bool = False
+    evaluator: str = HIGHWAY
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         check_number("--dt-ms", self.dt_ms)
         check_number("--frame-limit", self.frame_limit_s)
+
+    def check_for_others(self) -> None:
+        """Refuse what highway alone understands.
+
+        Raises:
+            EvaluationError: an option is not at its default.
+        """
+        for field in dataclasses.fields(self):
+            known = field.name in ("evaluator", "force")
+            if not known and getattr(self, field.name) != field.default:
+                option = _FLAGS.get(field.name, field.name.replace("_", "-"))
+                raise EvaluationError(
+                    f"--{option} is highway's: give {self.evaluator} options of its "
+                    "own, name{option=value}; `list evaluators` names them"
+                )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -89,7 +119,7 @@ class EvaluateResult(Result):
     """How a policy drives.
 
     Attributes:
-        policy: as it was named.
+        policy: as it was named; the evaluator, where that drives none.
         output: the folder of results.
         scores: over the routes.
         pictures: that were drawn.
@@ -123,32 +153,56 @@ class EvaluateResult(Result):
 
 
 def evaluate(
-    policy: str | Path,
+    policy: str | Path | None,
     output: str | Path,
     options: EvaluateOptions | None = None,
     listener: Listener = SILENT,
 ) -> EvaluateResult:
     """Drive a policy over routes of highway-env; run again, it goes on.
 
+    Another evaluator is asked for all of its episodes, which are then kept.
+
     Args:
         policy: an ONNX file, the name of a model that ships, ``expert``, ``blind`` or
-            ``blind:MPS``.
+            ``blind:MPS``; None for an evaluator that drives none.
         output: the folder of results.
         options: None takes the defaults.
         listener: is called with progress and warnings.
 
     Raises:
-        EvaluationError: no such policy, route, latency, weather or engine; the policy
-            cannot drive; the folder is of another evaluation.
+        EvaluationError: no such policy, evaluator, route, latency, weather or engine;
+            an option that the evaluator has not; the policy cannot drive; the folder
+            is of another evaluation.
         GraphError: the folder is a file or an input.
         ProviderError: the provider is not there.
     """
-    options, output, policy = options or EvaluateOptions(), Path(output), str(policy)
+    options, output = options or EvaluateOptions(), Path(output)
+    named = None if policy is None else str(policy)
+    if not is_highway(options.evaluator):
+        return _by_another(named, output, options)
+    if named is None:
+        raise EvaluationError("highway drives a policy: name one, M.onnx or highway")
+    policy = named
     trace = options.latency.removeprefix("trace:")
     check_folder(output, (policy, options.routes, trace, options.adapter), (MANIFEST,))
     logs = [log_beside(output)]
     with writing(logs, folders=[output], force=options.force):
         return _evaluated(policy, output, options, listener)
+
+
+def _by_another(
+    policy: str | None, output: Path, options: EvaluateOptions
+) -> EvaluateResult:
+    options.check_for_others()
+    if policy in SHIPPED:
+        policy = str(model_path(policy))
+    evaluator = evaluator_named(options.evaluator, policy)
+    check_folder(output, (policy, *files_of(evaluator)), (MANIFEST,))
+    with writing(folders=[output], force=options.force):
+        episodes = driven_episodes(evaluator)
+        keep(evaluator, episodes, output, policy or "")
+    scores = score_episodes(episodes, expected_of(evaluator, episodes))
+    return EvaluateResult(policy or evaluator.name, output, scores)
 
 
 def _evaluated(

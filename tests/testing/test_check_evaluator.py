@@ -12,9 +12,10 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.testing import check_evaluator
 from tests.evaluators.highway.drivers import EXIT
-from tests.metrics.drives import drive
+from tests.metrics.drives import drive, frames
 
 RUNS = itertools.count()
+STUTTER = (*frames(2), *frames(2))
 
 
 @dataclass(frozen=True)
@@ -31,13 +32,17 @@ class Made:
     def episodes(self) -> Iterator[Episode]:
         run = next(RUNS)
         routes = {"none": [], "twice": ["a", "b", "a"]}.get(self.way, ["a", "b"])
+        if self.way == "no name":
+            routes = ["../a"]
         if self.way == "order" and run % 2:
             routes = routes[::-1]
         for route in routes:
             if self.way == "no episode":
                 yield route  # type: ignore[misc]
             moved = float(run) if self.way == "drifts" else 100.0
-            yield drive(route=route, completion=moved)
+            moved = 140.0 if self.way == "too far" else moved
+            driven = STUTTER if self.way == "stutters" else ()
+            yield drive(route=route, completion=moved, driven=driven)
 
 
 def test_what_errs_in_no_way_holds() -> None:
@@ -52,6 +57,9 @@ def test_what_errs_in_no_way_holds() -> None:
         ("twice", "made yields route a 2 times"),
         ("order", "made yields other routes, or in another order"),
         ("drifts", "made yields two episodes for a"),
+        ("no name", r"made yields route '\.\./a': a name is made of letters"),
+        ("too far", "made: a cannot be kept: .* completion_percent Input should be"),
+        ("stutters", "made: the frames of a are not in their order"),
     ],
 )
 def test_a_wrong_evaluator_is_caught(way: str, message: str) -> None:

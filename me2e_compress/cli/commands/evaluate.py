@@ -12,7 +12,10 @@ from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import evaluate as workflow
 
 Policy = Annotated[
-    str, typer.Argument(help="M.onnx, highway, expert, blind:MPS, or see list")
+    str | None, typer.Argument(help="M.onnx, highway, expert, blind:MPS, or see list")
+]
+Evaluator = Annotated[
+    str, typer.Option(help="who drives it: highway, NAME{option=value}, or see list")
 ]
 Output = Annotated[Path, typer.Option("-o", "--output", help="the results folder")]
 Latency = Annotated[
@@ -32,8 +35,8 @@ Render = Annotated[str | None, typer.Option(help="draw this route as GIF and PNG
 
 
 def evaluate(
-    policy: Policy,
     output: Output,
+    policy: Policy = None,
     routes: given.Routes = "all",
     latency: Latency = "none",
     latency_scale: Scale = 1.0,
@@ -48,18 +51,24 @@ def evaluate(
     engine: given.Engine = "local",
     address: given.Address = None,
     render: Render = None,
+    evaluator: Evaluator = "highway",
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
-    """Drive a policy over routes of highway-env; run it again to go on."""
+    """Drive a policy over routes of highway-env; run it again to go on.
+
+    Another evaluator takes options of its own; --evaluator and --force alone are
+    for all.
+    """
     options = workflow.EvaluateOptions(
         routes=routes, latency=latency, latency_scale=latency_scale,
         latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
         dt_ms=dt_ms, adapter=adapter, weather=weather,
         frame_limit_s=frame_limit, engine=engine, address=address, render=render,
         provider=provider_named(provider, plugins or ()), force=force,
+        evaluator=evaluator,
     )  # fmt: skip
     with listening() as listener:
         found = workflow.evaluate(policy, output, options, listener)

@@ -27,6 +27,7 @@ from me2e_compress.evaluators.bench2drive.route_sets import (
     likely_set,
 )
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.scores import FULL_SET
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,11 @@ class Bench2DriveResults:
     name: ClassVar[str] = "bench2drive"
     folder: Path
     metrics: Path | None = None
+
+    @property
+    def set_size(self) -> int:
+        """How many routes a whole benchmark has."""
+        return FULL_SET
 
     def episodes(self) -> Iterator[Episode]:
         """Yield each route once, in the order of the routes' numbers.

@@ -133,7 +133,6 @@ class ResultsFolder:
             EvaluationError: The disk is full, or the folder cannot be written.
         """
         episode = driven.episode
-        record = {"fingerprint": self._digest, "episode": episode.to_json()}
         cost = {
             "route": episode.route,
             "frames": len(episode.frames),
@@ -141,10 +140,22 @@ class ResultsFolder:
             "seconds": round(driven.seconds, 3),
             "memory_mb": round(driven.memory_bytes / 1e6, 1),
         }
+        self.keep(episode)
         try:
-            write_json(self._file(episode.route), record)
             with self.log.open("a", encoding="utf-8") as log:
                 log.write(f"{json.dumps(cost)}\n")
+        except OSError as error:
+            raise _unwritable(self.log, error) from error
+
+    def keep(self, episode: Episode) -> None:
+        """Write one route.
+
+        Raises:
+            EvaluationError: The disk is full, or the folder cannot be written.
+        """
+        record = {"fingerprint": self._digest, "episode": episode.to_json()}
+        try:
+            write_json(self._file(episode.route), record)
         except OSError as error:
             raise _unwritable(self._file(episode.route), error) from error
 
