@@ -1,4 +1,4 @@
-"""What a graph holds: interface, and nodes, parameters, MACs by module."""
+"""What a graph holds: interface; nodes, parameters, MACs, modelled energy by module."""
 
 import dataclasses
 from collections import Counter
@@ -16,6 +16,12 @@ from me2e_compress.manager import PassManager
 from me2e_compress.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
+from me2e_compress.runtime.energy.modelled import (
+    DEFAULT_PROCESS,
+    ModelledEnergy,
+    costs_of,
+    modelled_energy,
+)
 from me2e_compress.runtime.recurrence import recurrent_inputs
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.result import (
@@ -55,6 +61,7 @@ class InspectResult(Result):
         uncounted: why, with the number of nodes.
         open_dimensions: of the inputs, by name: MACs wait for their sizes.
         recurrent: inputs that are fed back from frame to frame, with the output.
+        modelled_energy: what its MACs and bytes would take; None: not asked for.
     """
 
     file: str
@@ -73,6 +80,7 @@ class InspectResult(Result):
     lowered: str = ""
     hint: str = ""
     recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
+    modelled_energy: ModelledEnergy | None = None
 
     @property
     def headline(self) -> str:
@@ -108,9 +116,11 @@ class InspectResult(Result):
         pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
         back = f"fed back: {', '.join(pairs)}" if pairs else ""
         columns = ("module", "nodes", "parameters", "MB", "GMACs")
+        modelled = self.modelled_energy
         return (
             table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
             table(f"Modules (map {self.map})", columns, rows, note),
+            *(() if modelled is None else modelled.tables()),
         )
 
     def _total_macs(self) -> str:
@@ -142,6 +152,7 @@ def inspect(
     model: str | Path,
     module_map: str | Path | None = None,
     dims: Mapping[str, int] | None = None,
+    process: str | None = None,
 ) -> InspectResult:
     """Read a graph and weigh its modules.
 
@@ -149,12 +160,17 @@ def inspect(
         model: an ONNX file, or the name of one that ships.
         module_map: preset or TOML file; None finds the preset.
         dims: sizes that open dimensions of the inputs are given first.
+        process: model the energy of a frame by the figures of this silicon process,
+            ``45nm`` or ``7nm``; None does not.
 
     Raises:
+        EnergyError: no such process.
         GraphError: no such model.
         PreconditionError: no input has such a dimension.
         ModuleMapError: no such map.
     """
+    if process is not None:
+        costs_of(process)
     path = model_path(model)
     loaded = graph.load(path)
     modules = load_map(module_map, loaded)
@@ -185,7 +201,33 @@ def inspect(
         lowered(loaded),
         "; ".join(filter(None, (lacking_shapes(loaded), wrong))),
         fed_back,
+        None
+        if process is None
+        else modelled_energy(folded, process, provenance.module_of),
     )
+
+
+def model_energy(
+    model: str | Path,
+    process: str = DEFAULT_PROCESS,
+    module_map: str | Path | None = None,
+) -> ModelledEnergy:
+    """Model the energy of a frame of a file; see :func:`modelled_energy` for a graph.
+
+    Args:
+        model: an ONNX file, or the name of one that ships.
+        process: whose figures: ``45nm`` or ``7nm``.
+        module_map: preset or TOML file; None finds the preset.
+
+    Raises:
+        EnergyError: no such process.
+        GraphError: no such model.
+        ModuleMapError: no such map.
+    """
+    costs_of(process)
+    loaded = graph.load(model_path(model))
+    folded = _folded(loaded, load_map(module_map, loaded))
+    return modelled_energy(folded, process, provenance.module_of)
 
 
 def _fed_back(model: ir.Model) -> tuple[dict[str, str], str]:
