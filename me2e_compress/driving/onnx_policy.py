@@ -14,6 +14,7 @@ from me2e_compress.driving.contract import (
     Plan,
     RouteInfo,
 )
+from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.driving.ports import (
     CAMERAS,
     CONTRACT,
@@ -52,6 +53,9 @@ class OnnxPolicy:
         recurrent: Recurrent input to the output that answers it.
         normalization: Of the images; None without an image input.
         image_size: Rows and columns of the images.
+        stage: Changes the plan on the host; None leaves it as the network has it.
+        host_iterations: Of that stage, for the latest plan.
+        host_cells: That the stage took into account, for the latest plan.
     """
 
     session: Session
@@ -61,12 +65,19 @@ class OnnxPolicy:
     recurrent: dict[str, str]
     normalization: ImageNormalization | None
     image_size: tuple[int, int]
+    stage: HostStage | None = None
+    host_iterations: int = field(default=0, init=False)
+    host_cells: int = field(default=0, init=False)
     privileged: bool = field(default=False, init=False)
     _state: dict[str, Array] = field(default_factory=dict, init=False)
 
     @classmethod
     def open(
-        cls, path: Path, adapter: Adapter | None = None, provider: Provider = CPU
+        cls,
+        path: Path,
+        adapter: Adapter | None = None,
+        provider: Provider = CPU,
+        stage: HostStage | None = None,
     ) -> Self:
         """Load a model and run it once on zeros.
 
@@ -74,15 +85,15 @@ class OnnxPolicy:
             path: The file.
             adapter: How its ports relate to the contract; None where they keep it.
             provider: What runs it.
+            stage: Changes the plan on the host; None leaves it.
 
         Raises:
             EvaluationError: It cannot be run, or does not keep the contract.
             ProviderError: The provider is not there.
         """
         try:
-            policy = cls._of(
-                Session(path, threads=1, provider=provider), adapter or Adapter()
-            )
+            session = Session(path, threads=1, provider=provider)
+            policy = cls._of(session, adapter or Adapter(), stage)
             policy._dry_run()
         except (GraphError, FramesError, EvaluationError) as error:
             words = str(error).removeprefix(f"{path}: ")
@@ -90,7 +101,7 @@ class OnnxPolicy:
         return policy
 
     @classmethod
-    def _of(cls, session: Session, adapter: Adapter) -> Self:
+    def _of(cls, session: Session, adapter: Adapter, stage: HostStage | None) -> Self:
         names = {ours: ours for ours in CONTRACT} | {**adapter.inputs}
         recurrent = dict(
             session.recurrent if adapter.recurrent is None else adapter.recurrent
@@ -105,6 +116,7 @@ class OnnxPolicy:
             recurrent,
             None if image is None else adapter.normalization(session.metadata),
             DEFAULT_IMAGE_SIZE if image is None else image_size(image),
+            stage,
         )
 
     @property
@@ -122,7 +134,8 @@ class OnnxPolicy:
         """Run the model once.
 
         Raises:
-            EvaluationError: It needs images and there are none.
+            EvaluationError: It needs images and there are none, or the host stage lacks
+                an output.
             GraphError: A node of the model failed.
         """
         feeds = self.feeds(observation)
@@ -130,7 +143,12 @@ class OnnxPolicy:
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
         command = np.array([observation.command])
         waypoints = self.plan_adapter.plan(outputs, {"command": command, **feeds})
-        return self.adapter.to_ego(waypoints)
+        plan = self.adapter.to_ego(waypoints)
+        if self.stage is None:
+            return plan
+        work = self.stage.work(plan, outputs)
+        self.host_iterations, self.host_cells = work.iterations, work.cells
+        return work.plan
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
         """Lay an observation out as the graph takes it, recurrent inputs left out.

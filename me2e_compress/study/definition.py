@@ -28,6 +28,8 @@ class Variant:
         module_map: Preset or TOML file for the passes; None finds the preset.
         adapter: TOML file that adapts the model to the policy contract.
         trace: Latencies recorded on a device; None measures them here.
+        host_stage: Changes the model's plan on the host, as a text; its time is no
+            part of a trace, see the latency source ``host-stage``.
 
     Raises:
         StudyError: A bad name, or passes, an adapter or a trace without a model.
@@ -39,11 +41,15 @@ class Variant:
     module_map: str | None = None
     adapter: Path | None = None
     trace: Path | None = None
+    host_stage: str = ""
 
     def __post_init__(self) -> None:
         """Refuse what could not be run."""
         check_name("variant", self.name)
-        options = (self.passes, self.module_map, self.adapter, self.trace)
+        options = (
+            *(self.passes, self.module_map, self.adapter, self.trace),
+            self.host_stage,
+        )
         if not self.is_model and any(options):
             raise StudyError(
                 f"variant {self.name}: {self.policy} is not a model: there is nothing "

@@ -85,6 +85,7 @@ class _Variant(_Table):
     map: str | None = None
     adapter: str | None = None
     trace: str | None = None
+    host_stage: str = ""
 
 
 class _Condition(_Table):
@@ -201,7 +202,7 @@ class _Reader:
         return FramesToRecord(asked.frames, asked.held_out, asked.seed)
 
     def _variant(self, table: _Variant) -> Variant:
-        policy, adapter = table.policy, table.adapter
+        policy, adapter, stage = table.policy, table.adapter, table.host_stage
         if policy in SHIPPED:  # a file of that name beside the study wins
             policy = str(model_path(policy, self.path.parent))
         driver = driver_named(policy)
@@ -209,6 +210,7 @@ class _Reader:
             policy = str(model_path(driver.path, self.path.parent))
             if adapter is None and driver.adapter is not None:
                 adapter = str(driver.adapter)
+            stage = stage or driver.host_stage
         return Variant(
             table.name,
             policy,
@@ -216,6 +218,7 @@ class _Reader:
             self._map(table.map),
             self._file(adapter),
             self._file(table.trace),
+            stage,
         )
 
     def _passes(self, table: _Variant) -> tuple[Pass, ...]:

@@ -94,7 +94,12 @@ def prepare_variant(
         raise StudyError(f"variant {variant.name}: {source}: no such model")
     if variant.passes:
         model = _compressed(study, variant, workspace, listener)
-    driver = replace(driver, path=model, provider=PROVIDERS.text(study.provider))
+    driver = replace(
+        driver,
+        path=model,
+        provider=PROVIDERS.text(study.provider),
+        host_stage=variant.host_stage,
+    )
     try_file(model, listener, study.provider)
     driver.open()
     sha256 = graph.sha256_of(model)

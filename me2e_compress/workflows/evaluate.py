@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
@@ -61,6 +62,7 @@ class EvaluateOptions:
         workers: routes at a time.
         dt_ms: step of the world.
         adapter: TOML file that adapts the model to the policy contract.
+        host_stage: changes the model's plan on the host: ``collision-optimizer``.
         weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is a clear day.
         frame_limit_s: until a decision counts as hung.
         engine: ``local`` or ``ray``.
@@ -84,6 +86,7 @@ class EvaluateOptions:
     workers: int = 1
     dt_ms: float = 50.0
     adapter: str | Path | None = None
+    host_stage: str = ""
     weather: str = ""
     frame_limit_s: float = FRAME_LIMIT_S
     engine: str = "local"
@@ -211,6 +214,8 @@ def _evaluated(
     picked, set_size = routes_named(options.routes)
     shown = () if options.render is None else pick_routes(picked, options.render)
     driver = driver_of(policy, options.adapter, options.provider)
+    if options.host_stage:
+        driver = with_stage(driver, options.host_stage)
     if isinstance(driver, OnnxDriver):
         try_file(driver.path, listener, options.provider)
     job = _job(driver, options)
@@ -231,6 +236,21 @@ def _evaluated(
     )
     scores = score_episodes(tuple(evaluator.episodes()), set_size)
     return EvaluateResult(policy, output, scores, _pictures(job, shown, output))
+
+
+def with_stage(driver: Driver, host_stage: str) -> Driver:
+    """Return a driver whose plan a host stage changes.
+
+    Raises:
+        EvaluationError: No such stage, an option that it refuses, or a driver without
+            a network.
+    """
+    HOST_STAGES.parse(host_stage)
+    if not isinstance(driver, OnnxDriver):
+        raise EvaluationError(
+            f"{driver.name} has no network: there are no outputs for a host stage"
+        )
+    return dataclasses.replace(driver, host_stage=host_stage)
 
 
 def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, ...]:

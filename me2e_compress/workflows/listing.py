@@ -10,6 +10,7 @@ from typing import Any
 
 from me2e_compress import modules, recipe
 from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.latency import LATENCY_SOURCES
 from me2e_compress.driving.policies import POLICIES
 from me2e_compress.errors import RecipeError
@@ -123,6 +124,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "policies": POLICIES,
     "latency-sources": LATENCY_SOURCES,
     "energy-counters": ENERGY_COUNTERS,
+    "host-stages": HOST_STAGES,
     "evaluators": EVALUATORS,
     "providers": PROVIDERS,
     "operators": OPERATORS,

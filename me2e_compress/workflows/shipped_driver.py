@@ -11,9 +11,15 @@ from me2e_compress.zoo.shipped import shipped
 
 @dataclass(frozen=True)
 class ShippedDriver(Driver):
-    """The trained driver that comes with the package."""
+    """The trained driver that comes with the package.
+
+    Attributes:
+        host_stage: Changes the plan on the host, as a text: ``collision-optimizer``;
+            empty leaves it as the network has it.
+    """
 
     name: ClassVar[str] = "highway"
+    host_stage: str = ""
 
     def resolved(self) -> Driver:
         """Return the ONNX file that it is.
@@ -21,7 +27,7 @@ class ShippedDriver(Driver):
         Raises:
             GraphError: The file is missing or altered.
         """
-        return OnnxDriver(shipped(self.name))
+        return OnnxDriver(shipped(self.name), host_stage=self.host_stage)
 
     def open(self) -> Policy:
         """Return the policy."""

@@ -29,6 +29,9 @@ InOrder = Annotated[
     bool, typer.Option("--in-order", help="replay a trace in its order")
 ]
 Step = Annotated[float, typer.Option(help="step of the world")]
+Stage = Annotated[
+    str, typer.Option(help="changes the plan on the host: collision-optimizer")
+]
 Weather = Annotated[str, typer.Option(help="fog_m=80,night=0.5 ...")]
 Limit = Annotated[float, typer.Option(help="seconds until a decision counts as hung")]
 Render = Annotated[str | None, typer.Option(help="draw this route as GIF and PNG")]
@@ -46,6 +49,7 @@ def evaluate(
     workers: given.Workers = 1,
     dt_ms: Step = 50.0,
     adapter: given.Adapter = None,
+    host_stage: Stage = "",
     weather: Weather = "",
     frame_limit: Limit = FRAME_LIMIT_S,
     engine: given.Engine = "local",
@@ -65,7 +69,7 @@ def evaluate(
     options = workflow.EvaluateOptions(
         routes=routes, latency=latency, latency_scale=latency_scale,
         latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
-        dt_ms=dt_ms, adapter=adapter, weather=weather,
+        dt_ms=dt_ms, adapter=adapter, host_stage=host_stage, weather=weather,
         frame_limit_s=frame_limit, engine=engine, address=address, render=render,
         provider=provider_named(provider, plugins or ()), force=force,
         evaluator=evaluator,

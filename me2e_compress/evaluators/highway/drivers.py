@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from me2e_compress.driving.contract import Policy
+from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.errors import EvaluationError
@@ -63,12 +64,15 @@ class OnnxDriver(Driver):
         adapter: TOML file that adapts the model to the contract; None where it keeps
             it as it is.
         provider: What runs it, as a text: ``cpu``, ``tensorrt{cache=engines}``.
+        host_stage: Changes the plan on the host, as a text: ``collision-optimizer``;
+            empty leaves it as the network has it.
     """
 
     name: ClassVar[str] = "onnx"
     path: Path
     adapter: Path | None = None
     provider: str = "cpu"
+    host_stage: str = ""
 
     def open(self) -> Policy:
         """Return the policy.
@@ -87,7 +91,9 @@ class OnnxDriver(Driver):
                 f" are {', '.join(POLICIES.names())}"
             )
         adapter = None if self.adapter is None else Adapter.load(self.adapter)
-        return OnnxPolicy.open(self.path, adapter, PROVIDERS.parse(self.provider))
+        stage = HOST_STAGES.parse(self.host_stage) if self.host_stage else None
+        provider = PROVIDERS.parse(self.provider)
+        return OnnxPolicy.open(self.path, adapter, provider, stage)
 
     @property
     def label(self) -> str:
@@ -95,12 +101,15 @@ class OnnxDriver(Driver):
         return self.path.stem
 
     def fingerprint(self) -> str:
-        """Return digests of its files, wherever they lie, and another provider."""
+        """Return digests of its files, wherever they lie, provider and stage."""
         digests = [sha256_of(self.path)]
         if self.adapter is not None:
             digests.append(hashlib.sha256(self.adapter.read_bytes()).hexdigest())
         if self.provider != "cpu":
             digests.append(self.provider)
+        if self.host_stage:
+            stage = HOST_STAGES.parse(self.host_stage)
+            digests.append(HOST_STAGES.text(stage, defaults=True))
         return "+".join(digests)
 
 

@@ -1,0 +1,160 @@
+"""UniAD's collision optimisation: the plan is pushed off the ground that will be taken.
+
+It runs after the network, on the host, and only where ground near the plan is taken; so
+it takes time in critical frames and none elsewhere, which makes the tail of UniAD's
+latency.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from me2e_compress.driving.host_stage import HostStage, HostWork
+from me2e_compress.errors import EvaluationError
+
+Floats = npt.NDArray[np.float64]
+
+UNIAD_CELL_M = 0.5
+"""Side of a cell of UniAD's occupancy, which its weight of a cell is made for."""
+
+
+@dataclass(frozen=True)
+class CollisionOptimizer(HostStage):
+    """Keeps the plan near itself and away from cells that will be occupied.
+
+    UniAD's ``CollisionNonlinearOptimizer`` (OpenDriveLab/UniAD, planning head): over
+    the six waypoints p, with r the network's and o the occupied cells within a radius
+    of r at the same time and s the sigma, it minimises ::
+
+        sum |p - r|^2 + weight * sum exp(-|p - o|^2 / (2 s^2)) / (sqrt(2 pi) s)
+
+    from r on. There it is built in CasADi and solved by IPOPT, here by SciPy with its
+    exact gradient: the same minimum at a fraction of the time, so a latency for UniAD's
+    is charged by iterations and cells rather than measured.
+
+    Attributes:
+        output: Of the network: probabilities [1, T, rows, columns] that a cell is
+            taken when waypoint t is reached (later waypoints take the last), the first
+            row farthest ahead, the first column farthest left.
+        front_m: x of the outer edge of the first row, ego frame; that of ``highway``.
+        left_m: y of the outer edge of the first column.
+        cell_m: Side of a cell.
+        threshold: Probability above which a cell is occupied; ours.
+        radius_m: From the waypoint to the centre of a cell that counts; UniAD's.
+        sigma_m: Width of a cell's repulsion; UniAD's.
+        weight: Of a cell of 0.5 m, as UniAD's is; other cells weigh by their area.
+        solver: Of SciPy; ``SLSQP`` takes less time, seldom much less but then by
+            far: ``benchmarks/bench_host_stage.py``.
+
+    Raises:
+        EvaluationError: A number that is not positive, or a threshold beyond 0 to 1.
+    """
+
+    name: ClassVar[str] = "collision-optimizer"
+    output: str = "occupancy"
+    front_m: float = 48.0
+    left_m: float = 24.0
+    cell_m: float = 1.0
+    threshold: float = 0.5
+    radius_m: float = 5.0
+    sigma_m: float = 1.0
+    weight: float = 5.0
+    solver: Literal["SLSQP", "L-BFGS-B"] = "SLSQP"
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        for option in ("cell_m", "radius_m", "sigma_m", "weight"):
+            value = getattr(self, option)
+            if not 0.0 < value < math.inf:
+                raise EvaluationError(
+                    f"{self.name}: {option} {value:g} is not a positive number"
+                )
+        if not 0.0 <= self.threshold < 1.0:
+            raise EvaluationError(
+                f"{self.name}: threshold {self.threshold:g}: from 0 to below 1"
+            )
+
+    def work(
+        self, plan: Floats, outputs: Mapping[str, npt.NDArray[np.generic]]
+    ) -> HostWork:
+        """Return the plan off occupied cells; the same one where none are near.
+
+        Raises:
+            EvaluationError: The network has no such output, or of another shape.
+        """
+        cells, step = self.near(plan, self._occupancy(outputs))
+        if not len(cells):
+            return HostWork(plan)
+        reference = np.asarray(plan, np.float64)
+        weight = self.weight * (self.cell_m / UNIAD_CELL_M) ** 2
+        problem = _Problem(reference, cells, step, self.sigma_m, weight)
+        found = minimize(problem.cost, reference.ravel(), jac=True, method=self.solver)
+        return HostWork(found.x.reshape(reference.shape), int(found.nit), len(cells))
+
+    def near(
+        self, plan: Floats, occupancy: Floats
+    ) -> tuple[Floats, npt.NDArray[np.intp]]:
+        """Return the occupied cells near the waypoint of their time.
+
+        Args:
+            plan: [6, 2].
+            occupancy: [T, rows, columns].
+
+        Returns:
+            Centres [N, 2] in the ego frame, and the waypoint [N] that each is near.
+        """
+        times = np.minimum(np.arange(len(plan)), len(occupancy) - 1)
+        step, row, column = np.nonzero(occupancy[times] > self.threshold)
+        x = self.front_m - self.cell_m * (row + 0.5)
+        y = self.left_m - self.cell_m * (column + 0.5)
+        cells = np.stack([x, y], axis=-1).astype(np.float64)
+        kept = np.hypot(*(cells - plan[step]).T) <= self.radius_m
+        return cells[kept], step[kept]
+
+    def _occupancy(self, outputs: Mapping[str, npt.NDArray[np.generic]]) -> Floats:
+        if self.output not in outputs:
+            raise EvaluationError(
+                f"{self.name}: the model has no output {self.output}; there are "
+                f"{', '.join(outputs)}"
+            )
+        found = outputs[self.output]
+        if found.ndim != 4 or found.shape[0] != 1 or not found.size:
+            raise EvaluationError(
+                f"{self.name}: output {self.output} has shape {list(found.shape)}, it "
+                "must be [1, T, rows, columns]"
+            )
+        return np.asarray(found[0], np.float64)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The objective, and its gradient.
+
+    Attributes:
+        reference: [6, 2], the network's waypoints.
+        cells: [N, 2].
+        step: [N], the waypoint that a cell is near.
+        sigma: Metres.
+        weight: Of a cell.
+    """
+
+    reference: Floats
+    cells: Floats
+    step: npt.NDArray[np.intp]
+    sigma: float
+    weight: float
+
+    def cost(self, flat: Floats) -> tuple[float, Floats]:
+        """Return the cost of waypoints [12], and its gradient [12]."""
+        moved = flat.reshape(self.reference.shape) - self.reference
+        away = flat.reshape(self.reference.shape)[self.step] - self.cells
+        height = self.weight / (math.sqrt(2.0 * math.pi) * self.sigma)
+        hills = height * np.exp(-(away**2).sum(axis=1) / (2.0 * self.sigma**2))
+        gradient = 2.0 * moved
+        np.add.at(gradient, self.step, -hills[:, None] * away / self.sigma**2)
+        return float((moved**2).sum() + hills.sum()), gradient.ravel()

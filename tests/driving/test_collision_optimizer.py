@@ -1,0 +1,135 @@
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.optimize import check_grad
+
+from me2e_compress.driving.collision_optimizer import CollisionOptimizer, _Problem
+from me2e_compress.driving.host_stage import HOST_STAGES
+from me2e_compress.driving.latency import parse_latency
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.evaluators.highway.runner import drive
+from me2e_compress.testing import check_form
+from tests.evaluators.highway.drivers import PARKED, straight_on
+
+Floats = npt.NDArray[np.float64]
+
+PLAN: Floats = np.array([(4.0 * step, 0.0) for step in range(1, 7)])
+
+
+def taken(*cells: tuple[int, float, float]) -> dict[str, Floats]:
+    """Give occupancy with cells taken: waypoint, x and y of the centre."""
+    found = np.zeros((1, 6, 64, 48))
+    for step, x, y in cells:
+        found[0, step, int(47.5 - x), int(23.5 - y)] = 0.9
+    return {"occupancy": found}
+
+
+def test_a_plan_on_free_ground_stays_as_it_is() -> None:
+    work = CollisionOptimizer().work(PLAN, taken())
+
+    assert work.plan is PLAN
+    assert (work.iterations, work.cells) == (0, 0)
+
+
+def test_only_cells_near_the_waypoint_of_their_time_count() -> None:
+    beside, late, far = (1, 8.5, 1.5), (5, 8.5, 1.5), (1, 8.5, 6.5)
+    work = CollisionOptimizer().work(PLAN, taken(beside, late, far))
+
+    assert work.cells == 1
+    assert work.iterations > 0
+    assert work.plan[[0, 2, 3, 4, 5]] == pytest.approx(PLAN[[0, 2, 3, 4, 5]], abs=1e-3)
+    assert work.plan[1, 1] < -0.5, "the waypoint moves off, to the other side"
+
+
+@pytest.mark.parametrize("solver", ["SLSQP", "L-BFGS-B"])
+def test_the_minimum_does_not_depend_on_the_solver(solver: str) -> None:
+    cells = [(step, 4.5 + 4 * step, 0.5) for step in range(6)]
+    stage = HOST_STAGES.build("collision-optimizer", {"solver": solver})
+
+    work = stage.work(PLAN, taken(*cells))
+
+    moved = np.hypot(*(work.plan - PLAN).T)
+    away = moved + np.hypot(0.5, 0.5)  # where both pulls are equal
+    pushed = 5.0 * 4.0 / np.sqrt(2 * np.pi) * away * np.exp(-(away**2) / 2)
+    assert 2.0 * moved == pytest.approx(pushed, abs=1e-3)
+    assert moved == pytest.approx([1.213] * 6, abs=1e-3)
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    rng = np.random.default_rng(1)
+    step = rng.integers(0, 6, 40)
+    problem = _Problem(PLAN, PLAN[step] + rng.normal(0, 2, (40, 2)), step, 1.0, 20.0)
+    start = PLAN.ravel() + rng.normal(0, 1, 12)
+
+    def cost(flat: Floats) -> float:
+        return problem.cost(flat)[0]
+
+    def gradient(flat: Floats) -> Floats:
+        return problem.cost(flat)[1]
+
+    wrong_by = check_grad(cost, gradient, start)
+
+    assert wrong_by < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("collision-optimizer{radius_m=0}", "radius_m 0 is not a positive number"),
+        ("collision-optimizer{threshold=1}", "threshold 1: from 0 to below 1"),
+        ("collision-optimizer{solver=IPOPT}", "solver: Input should be 'SLSQP'"),
+        ("smoother", "no host stage 'smoother'; there are collision-optimizer"),
+    ],
+)
+def test_options_that_it_refuses(text: str, words: str) -> None:
+    with pytest.raises(EvaluationError, match=words):
+        HOST_STAGES.parse(text)
+
+
+def test_it_has_the_form_of_a_host_stage() -> None:
+    check_form(CollisionOptimizer(radius_m=4.0), HOST_STAGES)
+
+
+def test_a_model_without_the_output_is_refused_when_it_is_opened(
+    tmp_path: Path,
+) -> None:
+    model = straight_on(tmp_path / "m.onnx")
+
+    with pytest.raises(EvaluationError, match=r"m.onnx: .* no output occupancy; there"):
+        OnnxDriver(model, host_stage="collision-optimizer").open()
+
+
+def test_a_host_stage_is_part_of_what_identifies_a_driver(tmp_path: Path) -> None:
+    model = straight_on(tmp_path / "m.onnx")
+    plain = OnnxDriver(model).fingerprint()
+    staged = OnnxDriver(model, host_stage="collision-optimizer").fingerprint()
+
+    assert staged.startswith(f"{plain}+collision-optimizer{{")
+    assert "radius_m=5.0" in staged
+
+
+def test_what_it_does_is_charged_where_it_has_something_to_do(tmp_path: Path) -> None:
+    """The model says that all ground is taken for two seconds, and none after."""
+    model = straight_on(
+        tmp_path / "m.onnx",
+        inputs="float[1] timestamp",
+        body="""two = Constant <value_floats = [2.0]> ()
+        shape = Constant <value_ints = [1, 1, 64, 48]> ()
+        early = Less (timestamp, two)
+        taken = Cast <to = 1> (early)
+        occupancy = Expand (taken, shape)
+        plan = Identity (ahead)""",
+        outputs="float[1, 6, 2] plan, float[1, 1, 64, 48] occupancy",
+    )
+    policy = OnnxDriver(model, host_stage="collision-optimizer").open()
+    source = parse_latency("host-stage{source=fps:10, per_iteration_us=1000}")
+
+    decisions = drive(PARKED, policy, Conditions(source)).decisions
+
+    more = [each.time_us for each in decisions if each.latency_us > 100_000]
+    assert more == [each.time_us for each in decisions if each.time_us < 2_000_000]
+    assert 10 < len(more) < len(decisions)
