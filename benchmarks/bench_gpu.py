@@ -2,7 +2,7 @@
 
     python -m benchmarks.bench_gpu OUT [--providers cpu,cuda,tensorrt,tensorrt-rtx]
         [--subjects highway,vad-tiny] [--plugins LIB --dialect tensorrt] [--frames N]
-        [--runs 200] [--seconds 60] [--warm-up 20] [--threads 0]
+        [--runs 200] [--seconds 60] [--warm-up 20] [--threads 0] [--no-energy]
 
 One frame, recurrent state at zeros, a process a row, alone: nothing else may run on the
 device. Files are those that the provider wants: int8 is placed for TensorRT where that
@@ -13,8 +13,9 @@ runs as that library's plugin too; without, TensorRT gets it in standard operato
 The table gives the median and the 99th percentile over so many runs on the clock, the
 memory that the device had in use more than before (NVML, whoever took it), the largest
 resident set, the least signal to noise over the outputs and that of the plan against
-onnxruntime's CPU on the file as exported, and joules a frame. What is not installed is
-a row that says what to install; "-" was not measured: ``results.json`` says why.
+onnxruntime's CPU on the file as exported, and joules a frame by the counter of that
+device (a minute and a half a row). What is not installed is a row that says what to
+install; "-" was not measured, for a reason below the table.
 
 Files and rows stay in OUT; run again, it goes on. OUT/table.md holds the tables.
 """
@@ -165,7 +166,7 @@ class Bench:
     def _key(self, path: Path, provider: Provider, row: Row) -> str:
         """Name everything that decides what is measured."""
         given = self.given
-        how = (given.runs, given.seconds, given.warm_up, given.threads)
+        how = (given.runs, given.seconds, given.warm_up, given.threads, given.energy)
         known = (graph.sha256_of(path), ort.__version__, PROVIDERS.text(provider))
         return hashlib.sha256(repr((known, row.flags, how)).encode()).hexdigest()
 
@@ -191,6 +192,7 @@ class Bench:
         command = [sys.executable, "-W", "ignore", "-m", "benchmarks.run_on_provider"]
         command += [str(path), str(self.frame), str(answers), *row.flags]
         command += ["--provider", PROVIDERS.text(provider)]
+        command += ["--energy"] if given.energy else []
         for name in ("runs", "seconds", "warm_up", "threads"):
             command += [f"--{name.replace('_', '-')}", str(getattr(given, name))]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -232,6 +234,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--warm-up", type=int, default=20)
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--no-energy", action="store_false", dest="energy")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     rows: list[Found] = []

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import statistics
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,17 @@ def table(rows: list[Found]) -> str:
     for row in rows:
         cells = [row.provider, row.name, *_cells(row)]
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *dict.fromkeys(_notes(rows))])
+
+
+def _notes(rows: list[Found]) -> Iterator[str]:
+    """Say why what is "-" was not measured."""
+    for row in rows:
+        if not row.reason and row.measured["gpu_reason"]:
+            yield f"GPU MB, {row.provider}: {row.measured['gpu_reason']}."
+    for row in rows:
+        if not row.reason and row.measured["energy"]["reason"]:
+            yield f"J/frame, {row.provider}: {row.measured['energy']['reason']}."
 
 
 def _cells(row: Found) -> list[str]:

@@ -2,11 +2,11 @@
 
     python -m benchmarks.run_on_provider MODEL.onnx FRAME.npz OUT.npz --provider TEXT
         [--plugins LIB] [--stock] [--bound] [--threads 0] [--warm-up 20] [--runs 200]
-        [--seconds 60]
+        [--seconds 60] [--energy]
 
 Prints one line of JSON: seconds on the clock of every run after the warm-up (until so
 many runs or seconds, but five at least), the device's memory that was taken meanwhile,
-the largest resident set, joules a frame. OUT.npz gets the outputs.
+the largest resident set, with ``--energy`` joules a frame. OUT.npz gets the outputs.
 
 ``--stock`` makes every optimization of onnxruntime, those that our sessions leave out
 too. ``--bound`` leaves inputs and outputs on the device: what is copied for every frame
@@ -26,13 +26,19 @@ import onnxruntime as ort
 import pynvml
 
 from benchmarks.run_one import peak_mb
-from me2e_compress.errors import Me2eError
+from me2e_compress.errors import EnergyError, Me2eError
 from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.runtime.energy.counter import open_counter
+from me2e_compress.runtime.energy.meter import EnergyMeter
+from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider, provider_named
 from me2e_compress.runtime.session import Session
 
 FEWEST_RUNS = 5
+SCHEDULE = EnergySchedule(warm_up_s=10, windows=5)
+"""A minute and a half a row, where a counter answers."""
 Run = Callable[[], object]
 Outputs = Callable[[], Mapping[str, Any]]
 
@@ -110,9 +116,23 @@ def gpu_used_mb(device: int) -> float | None:
         pynvml.nvmlShutdown()
 
 
-def energy(run: Run) -> EnergyResult:
-    """Measure joules a frame."""
-    return EnergyResult(reason="this version has no energy meter")
+def energy(run: Run, provider: Provider) -> EnergyResult:
+    """Measure joules a frame, by a counter of the device that runs the provider."""
+    names = [f"nvml:{getattr(provider, 'device', 0)}", "ina3221"]
+    if provider.native == CPU.native:
+        names = ["rapl"]
+    reasons = list[str]()
+    for name in names:
+        counter = open_counter(name)
+        if isinstance(counter, Reader):
+            try:
+                return EnergyMeter(counter, SCHEDULE).measure({"frame": run})["frame"]
+            except EnergyError as error:
+                return EnergyResult(reason=str(error))
+            finally:
+                counter.close()
+        reasons.append(counter.reason if isinstance(counter, Absent) else name)
+    return EnergyResult(reason="; ".join(reasons))
 
 
 def measured(given: Any) -> dict[str, Any]:
@@ -137,7 +157,9 @@ def measured(given: Any) -> dict[str, Any]:
         "gpu_mb": None if reason else taken,
         "gpu_reason": reason,
         "host_mb": peak_mb(),
-        "energy": energy(run).to_json(),
+        "energy": (
+            energy(run, provider) if given.energy else EnergyResult(reason="not asked")
+        ).to_json(),
     }
 
 
@@ -154,6 +176,7 @@ def main() -> None:
     parser.add_argument("--warm-up", type=int, default=20)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=60)
+    parser.add_argument("--energy", action="store_true")
     try:
         print(json.dumps(measured(parser.parse_args())))
     except Me2eError as error:

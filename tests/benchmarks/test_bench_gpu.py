@@ -11,12 +11,18 @@ import onnx_ir as ir
 import onnxruntime as ort
 import pytest
 
-from benchmarks import bench_gpu
+from benchmarks import bench_gpu, run_on_provider
 from benchmarks.bench_gpu import ROWS, Bench, provider_or_reason
 from benchmarks.gpu_table import Found, table
 from benchmarks.runtime_files import REFERENCE
 from benchmarks.subject import Subject
-from me2e_compress.runtime.providers import CPU, CpuProvider, TensorRtProvider
+from me2e_compress.runtime.energy.reader import Absent
+from me2e_compress.runtime.providers import (
+    CPU,
+    CpuProvider,
+    Provider,
+    TensorRtProvider,
+)
 from tests.frames import record
 
 TEXT = """
@@ -31,7 +37,13 @@ m (float[1,4] x, float[1,4] prev_x) => (float[1,4] plan, float[1,4] next_x) {
 @pytest.fixture
 def given() -> argparse.Namespace:
     return argparse.Namespace(
-        runs=6, seconds=60, warm_up=1, threads=1, plugins=[], dialect="tensorrt"
+        runs=6,
+        seconds=60,
+        warm_up=1,
+        threads=1,
+        energy=False,
+        plugins=[],
+        dialect="tensorrt",
     )
 
 
@@ -55,7 +67,9 @@ def test_a_row_is_measured_once(
     assert len(first.measured["wall_s"]) == 6
     assert first.measured["sqnr_db"] == {"plan": None, "next_x": None}
     assert first.measured["gpu_reason"] == "runs on the CPU"
-    cells = table([first]).splitlines()[-1].split("|")
+    *_, line, _, _, joules = table([first]).splitlines()
+    assert joules == "J/frame, cpu: not asked."
+    cells = line.split("|")
     assert [each.strip() for each in cells[-4:-1]] == ["∞", "∞", "-"]
 
 
@@ -68,7 +82,7 @@ def test_a_provider_that_is_missing_is_a_row_that_says_what_to_install(
 
     assert isinstance(reason, str)
     shown = table([Found("highway", "tensorrt", "every file", reason)])
-    assert "pip install onnxruntime-gpu, and TensorRT 10" in shown.splitlines()[-1]
+    assert "pip install onnxruntime-gpu, and TensorRT 10" in shown
 
 
 def test_a_row_of_plugins_needs_their_library(
@@ -91,11 +105,27 @@ def test_a_file_that_cannot_be_made_is_a_row(
     assert found.reason == "not made: a pass refused it"
 
 
+@pytest.mark.parametrize(
+    ("provider", "asked"),
+    [(CPU, ["rapl"]), (TensorRtProvider(device=1), ["nvml:1", "ina3221"])],
+)
+def test_energy_is_that_of_the_device_which_runs(
+    provider: Provider, asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        run_on_provider, "open_counter", lambda name: Absent(f"{name} is silent")
+    )
+
+    found = run_on_provider.energy(lambda: None, provider)
+
+    assert found.reason == "; ".join(f"{name} is silent" for name in asked)
+
+
 @pytest.mark.slow
 def test_the_driver_on_the_cpu(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "benchmarks.bench_gpu", str(tmp_path)]
     words += ["--providers", "cpu", "--subjects", "highway", "--frames", "2"]
-    words += ["--runs", "5", "--warm-up", "1"]
+    words += ["--runs", "5", "--warm-up", "1", "--no-energy"]
 
     subprocess.run(words, check=True, capture_output=True)
 
