@@ -1,7 +1,10 @@
 """Plugins that take int8 features, and their scale as one more input."""
 
+import importlib.util
+
 import numpy as np
 import onnx_ir as ir
+import pytest
 
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import array_of
@@ -10,6 +13,7 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.tensorrt import TensorRT
+from me2e_compress.targets.tensorrt.rtx import check
 from tests.nets import MODULES, net
 
 SPARSE_DRIVE_V2 = """
@@ -62,3 +66,13 @@ def test_it_computes_the_same_to_rounding() -> None:
     )
 
     assert 0 < np.abs(got - want).max() < 0.02 * np.abs(want).max()
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("tensorrt_rtx") is None, reason="extra trt-check"
+)
+def test_tensorrts_parser_takes_all_but_the_plugin() -> None:
+    found = check(placed()[1], build=False)
+
+    assert found.passed
+    assert found.cut == ("/head/sampled",)
