@@ -12,6 +12,7 @@ from me2e_compress.runtime.energy.ina3221 import Ina3221, counted
 from me2e_compress.runtime.energy.nvml import Nvml
 from me2e_compress.runtime.energy.rapl import Rapl
 from me2e_compress.runtime.energy.reader import Absent, Reader
+from me2e_compress.testing import check_form
 
 RANGE = 1_000_000
 
@@ -277,4 +278,9 @@ def test_a_counter_that_is_none(text: str, fault: str) -> None:
 
 
 def test_every_counter_of_ours_loads() -> None:
-    assert ENERGY_COUNTERS.usable() == ("nvml", "ina3221", "rapl", "recorded")
+    assert ENERGY_COUNTERS.usable()[:4] == ("nvml", "ina3221", "rapl", "recorded")
+
+
+@pytest.mark.parametrize("text", ["nvml:1", "ina3221", "rapl", "recorded:r.csv"])
+def test_ours_hold(text: str) -> None:
+    check_form(ENERGY_COUNTERS.parse(text), ENERGY_COUNTERS)

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 
 from me2e_compress.runtime.energy.reader import DeviceState, Reader
 
+STEP_S = 0.1
+
 
 class World(Reader):
     """Its counter moves every step; its power is what it is.
@@ -12,18 +14,19 @@ class World(Reader):
     Attributes:
         now: seconds.
         spent: joules.
+        sensed: share of a step, its last part, in which the counter looks.
         readings: of the counter.
     """
 
     counter, device, scope = "simulated", "a device", "board"
 
     def __init__(
-        self, step_s: float = 0.1, idle_w: float = 50.0, tells_power: bool = False
+        self, idle_w: float = 50.0, tells_power: bool = False, sensed: float = 1.0
     ) -> None:
         self.now, self.spent, self.idle_w = 0.03, 0.0, idle_w
-        self._ticks_s, self._shown, self._power = step_s, 0.0, idle_w
-        self._next, self._calls = step_s, list[tuple[float, Callable[[], None]]]()
-        self.tells_power, self.readings = tells_power, 0
+        self._shown, self._seen, self._power = 0.0, 0.0, idle_w
+        self._next, self._calls = STEP_S, list[tuple[float, Callable[[], None]]]()
+        self.tells_power, self.readings, self.sensed = tells_power, 0, sensed
         self.power_factor = 1.0
         self.worked = list[tuple[str, float]]()
 
@@ -33,10 +36,13 @@ class World(Reader):
     def sleep(self, seconds: float) -> None:
         self._pass(seconds, self.idle_w)
 
-    def model(self, name: str, frame_s: float, watts: float) -> Callable[[], None]:
+    def model(self, name: str, *parts: float) -> Callable[[], None]:
+        """Return what runs a frame: seconds and watts of its parts, in turn."""
+
         def run() -> None:
             self.worked.append((name, self.now))
-            self._pass(frame_s, watts)
+            for seconds, watts in zip(parts[::2], parts[1::2], strict=True):
+                self._pass(seconds, watts)
 
         return run
 
@@ -57,17 +63,21 @@ class World(Reader):
         return DeviceState(40 + self.now / 60, {"sm": 1_000 + self.now})
 
     def _pass(self, seconds: float, watts: float) -> None:
-        self._power, end = watts, self.now + seconds
-        moments = [self._next]
-        for period, call in self._calls:  # before the time moves on
-            at = (int(self.now / period) + 1) * period
+        self._power, start, end = watts, self.now, self.now + seconds
+        for period, call in self._calls:
+            at = (int(start / period) + 1) * period
             while at <= end:
                 self.now, at = at, at + period
                 call()
-        self.now = end - seconds
-        while moments[-1] <= end:
-            self.spent += watts * (moments[-1] - self.now)
-            self.now, self._shown = moments[-1], self.spent
-            moments.append(moments[-1] + self._ticks_s)
-        self.spent += watts * (end - self.now)
-        self.now, self._next = end, moments[-1]
+        self.now = start
+        while self._next <= end:
+            self._spend(self._next, watts)
+            self._shown += self._seen / self.sensed
+            self._seen, self._next = 0.0, self._next + STEP_S
+        self._spend(end, watts)
+
+    def _spend(self, until: float, watts: float) -> None:
+        looks = max(self.now, self._next - self.sensed * STEP_S)
+        self._seen += watts * max(0.0, until - looks)
+        self.spent += watts * (until - self.now)
+        self.now = until
