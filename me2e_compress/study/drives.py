@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -154,8 +155,8 @@ class DriveSetup:
             raise StudyError(self._why_not(prepared))
         study, path = self.study, self.workspace.record(variant, condition)
         made_by = fingerprint(job, study.routes, study.set_size)
-        if path.is_file():
-            kept = DriveRecord.load(path)
+        kept = self._kept(path)
+        if kept is not None:
             if other := kept.difference_from(made_by):
                 raise StudyError(f"{path}: of another evaluation: {other}")
             return kept
@@ -163,6 +164,16 @@ class DriveSetup:
         record = DriveRecord.of(variant.name, condition.name, made_by, episodes)
         record.save(path)
         return record
+
+    def _kept(self, path: Path) -> DriveRecord | None:
+        """Read what is kept of a drive; a file that is none is made again."""
+        if not path.is_file():
+            return None
+        try:
+            return DriveRecord.load(path)
+        except StudyError as error:
+            self.listener.on_warning(f"{error}: made again of the results")
+            return None
 
     def _why_not(self, prepared: PreparedVariant) -> str:
         if prepared.failure or prepared.model is None:

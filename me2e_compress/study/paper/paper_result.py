@@ -1,5 +1,6 @@
 """What the paper's study found so far."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +8,9 @@ from typing import Any
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.model_facts import ModelFacts
+from me2e_compress.study.paper.paper_findings import findings
 from me2e_compress.study.paper.paper_tables import all_paper_tables
+from me2e_compress.study.paper.questions import Finding, findings_table
 from me2e_compress.study.paper.route_columns import COLUMNS, mean_of
 from me2e_compress.workflows.result import Result, Table
 
@@ -69,9 +72,14 @@ class PaperResult(Result):
         failed = reason or self.fact(variant).failure
         return failed or f"{variant} under {condition}: not driven"
 
+    @functools.cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """The paper's findings as questions, answered by these drives."""
+        return findings(self)
+
     def tables(self) -> tuple[Table, ...]:
-        """Return the paper's tables, in its order."""
-        return all_paper_tables(self)
+        """Return the findings, then the paper's tables in its order."""
+        return findings_table(self.findings, self.preview), *all_paper_tables(self)
 
     def alerts(self) -> tuple[str, ...]:
         """Return the cells that failed, and why."""
@@ -114,6 +122,7 @@ class PaperResult(Result):
                 }
                 for (variant, condition), cell in self.cells.items()
             ],
+            "findings": [each.to_json() for each in self.findings],
             "failures": [
                 {"scheme": variant, "condition": condition, "reason": why}
                 for (variant, condition), why in self.failures.items()

@@ -1,9 +1,9 @@
 """Means over routes, and paired differences, of what a drive's record keeps."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from me2e_compress.metrics.intervals import Bounds, binomial_interval, mean_estimate
+from me2e_compress.metrics.intervals import Bounds, mean_estimate
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study.drive_record import DriveRecord, RouteRecord
 
@@ -33,18 +33,16 @@ COLUMNS = (DS, SR, DE, DC)
 
 
 def mean_of(record: DriveRecord, column: RouteColumn, seed: int = 0) -> Estimate:
-    """Return a mean over routes with its interval; a rate's is exact."""
-    routes = [route for route in record.routes if column.of(route) is not None]
-    found = [each for route in routes if (each := column.of(route)) is not None]
+    """Return a mean over routes with its intervals."""
+    found = {
+        each.route: value
+        for each in record.routes
+        if (value := column.of(each)) is not None
+    }
     if not found:
         return _none(column.unit, f"no route has a {column.name}")
-    types = [route.scenario for route in routes]
-    mean = mean_estimate(found, types, column.unit, seed, column.bounds)
-    if column is SR:
-        low, high = binomial_interval(sum(each > 0 for each in found), len(found))
-        ends = [None if each is None else 100.0 * each for each in (low, high)]
-        return replace(mean, low=ends[0], high=ends[1])
-    return mean
+    values, types = list(found.values()), _types(record, found)
+    return mean_estimate(values, types, column.unit, seed, column.bounds)
 
 
 def paired(
@@ -54,8 +52,7 @@ def paired(
     seed: int = 0,
 ) -> Estimate:
     """Return the mean of "this minus the reference" over the routes that have both."""
-    types = {route.route: route.scenario for route in record.routes}
-    return mean_gap(gaps(record, reference, column), types, column, seed)
+    return mean_gap(gaps(record, reference, column), record, column, seed)
 
 
 def gaps(
@@ -73,27 +70,34 @@ def gaps(
 
 def mean_gap(
     found: Mapping[str, float],
-    types: Mapping[str, str],
+    record: DriveRecord,
     column: RouteColumn,
     seed: int = 0,
+    of: int = 1,
 ) -> Estimate:
     """Return the mean of differences with its intervals.
 
     Args:
-        found: By route.
-        types: Scenario type by route.
-        column: What differs.
+        found: Differences by route.
+        record: A drive of these routes.
+        column: What they are of.
         seed: Of the bootstrap.
+        of: 2 for differences of differences.
     """
     unit = "points" if column.unit == "%" else column.unit
     if not found:
         return _none(unit, f"no route has a {column.name} in both drives")
     bounds = None
     if column.bounds is not None:
-        width = column.bounds[1] - column.bounds[0]
-        bounds = -width, width
-    kinds = [types[route] for route in found]
-    return mean_estimate(list(found.values()), kinds, unit, seed, bounds)
+        most = of * (column.bounds[1] - column.bounds[0])
+        bounds = -most, most
+    values, types = list(found.values()), _types(record, found)
+    return mean_estimate(values, types, unit, seed, bounds)
+
+
+def _types(record: DriveRecord, found: Mapping[str, float]) -> list[str]:
+    scenario = {each.route: each.scenario for each in record.routes}
+    return [scenario[name] for name in found]
 
 
 def _none(unit: str, reason: str) -> Estimate:

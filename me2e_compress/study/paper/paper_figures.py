@@ -1,0 +1,241 @@
+"""The paper's figures 5 and 7, from what was driven and timed."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from me2e_compress.driving.realtime import skipped_decisions
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.study.paper.published import RATES, PublishedDrive
+from me2e_compress.study.paper.route_columns import DC, DE, DS, RouteColumn, mean_of
+from me2e_compress.study.report.figures import WIDTH_IN
+from me2e_compress.study.report.style import (
+    ACCENT,
+    BASELINE,
+    INK,
+    MUTED,
+    RULE,
+    styled,
+)
+from me2e_compress.study.workload import held_frames
+
+if TYPE_CHECKING:
+    from me2e_compress.study.paper.paper_result import PaperResult
+
+RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)
+SLOWEST_SHOWN = 6
+"""Variants whose tails are drawn; more lines cannot be told apart."""
+
+
+def safety(result: "PaperResult") -> Figure | None:
+    """Draw figure 5a: driving score over the rate of decisions; None without drives."""
+    return _over_rates(result, (DS,))
+
+
+def efficiency_and_comfort(result: "PaperResult") -> Figure | None:
+    """Draw figure 5b: efficiency and comfort over the rate; None without drives."""
+    return _over_rates(result, (DE, DC))
+
+
+def where_the_time_goes(result: "PaperResult") -> Figure | None:
+    """Draw figure 7: modules stacked over inferences, and tails; None without both."""
+    baseline = result.fact(result.study.baseline)
+    timed = [each for each in result.facts if each.latency_us]
+    if not timed or not baseline.modules_us:
+        return None
+    with styled():
+        figure = Figure(figsize=(WIDTH_IN, 3.4), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
+        _stack(left, baseline.modules_us, baseline.variant)
+        names = _shown_tails(result)
+        colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
+        for name, colour in zip(names, (BASELINE, *colours), strict=False):
+            _tail(right, result.fact(name).latency_us, name, colour)
+        right.set_yscale("log")
+        right.yaxis.set_major_formatter(PercentFormatter(1.0))
+        right.set_xlabel("milliseconds on the device")
+        right.set_title("how many decisions take longer", color=MUTED)
+        right.legend(frameon=False, fontsize=7.5)
+        return figure
+
+
+def _over_rates(result: "PaperResult", columns: Sequence[RouteColumn]) -> Figure | None:
+    block = next((b for b in result.study.blocks if b.name == "table-2"), None)
+    if block is None:
+        return None
+    name = block.variants[0]
+    driven = _driven_rates(result, name, block.conditions)
+    if len(driven) < 2:
+        return None
+    with styled():
+        figure = Figure(figsize=(WIDTH_IN, 2.7 * len(columns)), layout="constrained")
+        panels = figure.subplots(len(columns), 2, squeeze=False)
+        for (ours, theirs), column in zip(panels, columns, strict=True):
+            _draw_rates(ours, result, name, driven, column)
+            _draw_given(theirs, column)
+        return figure
+
+
+def _driven_rates(
+    result: "PaperResult", name: str, conditions: Sequence[str]
+) -> list[tuple[float, str]]:
+    """Return the paper's rates that were driven, each with its condition."""
+    held = {
+        held_frames(result.study, each): each.name
+        for each in reversed(result.study.conditions)
+        if each.name in conditions and not (each.traced or each.mean_of)
+    }
+    found = list[tuple[float, str]]()
+    for row in RATES:
+        condition = held.get(skipped_decisions(round(1e6 / row.fps)) + 1)
+        if condition is not None and result.cell(name, condition) is not None:
+            found.append((row.fps, condition))
+    return found
+
+
+def _draw_rates(
+    axes: Axes,
+    result: "PaperResult",
+    name: str,
+    driven: Sequence[tuple[float, str]],
+    column: RouteColumn,
+) -> None:
+    """Draw one column over the rates, and the driver at its own latency."""
+    found = [(fps, _mean(result, name, where, column)) for fps, where in driven]
+    known = [(fps, each) for fps, each in found if each.value is not None]
+    at = [fps for fps, _ in known]
+    axes.fill_between(
+        at,
+        [each.value if each.low is None else each.low for _, each in known],
+        [each.value if each.high is None else each.high for _, each in known],
+        color=ACCENT,
+        alpha=0.15,
+        linewidth=0,
+    )
+    axes.plot(at, [each.value for _, each in known], "o-", color=ACCENT, markersize=4)
+    free = [fps for fps, where in driven if where == driven[-1][1]]
+    if len(free) > 1:
+        axes.axvspan(min(free), max(free), color=RULE, alpha=0.45, linewidth=0)
+        axes.annotate(
+            "one condition",
+            (float(np.sqrt(min(free) * max(free))), 0.03),
+            xycoords=("data", "axes fraction"),
+            ha="center",
+            color=MUTED,
+            fontsize=7.5,
+        )
+    _draw_own(axes, result, name, column)
+    _rate_axis(axes)
+    axes.set_title(f"{column.name}: {name}, 95 % interval", color=MUTED)
+
+
+def _draw_own(
+    axes: Axes, result: "PaperResult", name: str, column: RouteColumn
+) -> None:
+    fps = result.fact(name).fps
+    traced = [each.name for each in result.study.conditions if each.traced]
+    if fps is None or not traced or result.cell(name, traced[0]) is None:
+        return
+    own = _mean(result, name, traced[0], column)
+    if own.value is None:
+        return
+    if own.low is not None and own.high is not None:
+        axes.plot([fps] * 2, [own.low, own.high], color=INK, linewidth=1.4)
+    axes.plot(fps, own.value, "D", color=INK, markersize=5)
+    axes.annotate(
+        "own latency",
+        (fps, own.value),
+        xytext=(6, -9),
+        textcoords="offset points",
+        fontsize=8,
+    )
+
+
+def _draw_given(axes: Axes, column: RouteColumn) -> None:
+    """Draw the paper's own figures, on axes of their own."""
+    pick = {"DS": _ds, "DE %": _de, "DC": _dc}[column.name]
+    at, values = [row.fps for row in RATES], [pick(row) for row in RATES]
+    axes.plot(at, values, "o-", color=MUTED, markersize=4, linewidth=1.0)
+    _rate_axis(axes)
+    axes.set_title(f"{column.name}: the paper's UniAD, as published", color=MUTED)
+
+
+def _rate_axis(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_xticks(RATE_TICKS, [str(each) for each in RATE_TICKS])
+    axes.minorticks_off()
+    axes.set_xlabel("decisions a second (FPS)")
+    axes.grid(visible=True, axis="y")
+    axes.spines["left"].set_visible(False)
+
+
+def _ds(row: PublishedDrive) -> float:
+    return row.ds
+
+
+def _de(row: PublishedDrive) -> float:
+    return row.de
+
+
+def _dc(row: PublishedDrive) -> float:
+    return row.dc
+
+
+def _mean(
+    result: "PaperResult", name: str, condition: str, column: RouteColumn
+) -> Estimate:
+    return mean_of(result.cells[name, condition], column, result.study.seed)
+
+
+def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:
+    """Draw a bar an inference, a colour a module, the largest at the bottom."""
+    colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
+    ordered = sorted(parts.items(), key=lambda part: -sum(part[1]))
+    total = sum(sum(samples) for _, samples in ordered)
+    count = len(ordered[0][1])
+    at, floor = np.arange(1, count + 1), np.zeros(count)
+    for (module, samples), colour in zip(ordered, colours, strict=False):
+        height = np.array(samples) / 1e3
+        label = f"{module}  {sum(samples) / max(1, total):.0%}"
+        axes.bar(at, height, 1.0, floor, color=colour, label=label, linewidth=0)
+        floor += height
+    axes.set_xlim(0.5, count + 0.5)
+    axes.set_xlabel(f"inference of {name}, under a profiler")
+    axes.set_title("milliseconds by module, on the device", color=MUTED)
+    axes.legend(
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.0),
+        frameon=False,
+        reverse=True,
+        fontsize=7.5,
+    )
+
+
+def _shown_tails(result: "PaperResult") -> list[str]:
+    """Return the baseline and, of the others, those with the longest tails."""
+    baseline = result.study.baseline
+    others = [each for each in result.facts if each.latency_us]
+    ranked = sorted(others, key=lambda each: -(each.latency_ms(99) or 0.0))
+    names = [each.variant for each in ranked if each.variant != baseline]
+    return [baseline, *names[: SLOWEST_SHOWN - 1]]
+
+
+def _tail(axes: Axes, samples_us: Sequence[int], name: str, colour: object) -> None:
+    """Draw which share of the inferences takes longer than so many milliseconds."""
+    if not samples_us:
+        return
+    count = len(samples_us)
+    slower = 1 - np.arange(count) / count
+    axes.step(
+        np.sort(samples_us) / 1e3,
+        slower,
+        where="pre",
+        color=colour,  # type: ignore[arg-type]
+        label=name,
+        linewidth=1.2,
+    )
