@@ -88,3 +88,7 @@ def _fact(name: str) -> ModelFacts:
         tuple(int(each) for each in samples),
         modules if name == "float" else {},
     )
+
+
+def _share(value: float) -> float:
+    return float(np.clip(value, 0.0, 1.0))

@@ -108,16 +108,16 @@ def _draw_rates(
     """Draw one column over the rates, and the driver at its own latency."""
     found = [(fps, _mean(result, name, where, column)) for fps, where in driven]
     known = [(fps, each) for fps, each in found if each.value is not None]
-    at = [fps for fps, _ in known]
-    axes.fill_between(
-        at,
-        [each.value if each.low is None else each.low for _, each in known],
-        [each.value if each.high is None else each.high for _, each in known],
-        color=ACCENT,
-        alpha=0.15,
-        linewidth=0,
-    )
-    axes.plot(at, [each.value for _, each in known], "o-", color=ACCENT, markersize=4)
+    sure = [
+        (fps, each.low, each.high)
+        for fps, each in known
+        if each.low is not None and each.high is not None
+    ]
+    if sure:
+        band = np.array(sure, np.float64).T
+        axes.fill_between(*band, color=ACCENT, alpha=0.15, linewidth=0)
+    values = np.array([(fps, each.value) for fps, each in known], np.float64)
+    axes.plot(*values.T, "o-", color=ACCENT, markersize=4)
     free = [fps for fps, where in driven if where == driven[-1][1]]
     if len(free) > 1:
         axes.axvspan(min(free), max(free), color=RULE, alpha=0.45, linewidth=0)

@@ -6,8 +6,9 @@ from pathlib import Path
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_json
+from me2e_compress.study.paper.paper_page import paper_html
 from me2e_compress.study.paper.paper_result import PaperResult
-from me2e_compress.study.workspace import JSON, MARKDOWN
+from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.workflows.claims import writing
 
 
@@ -18,7 +19,7 @@ def write_paper(
     *,
     force: bool = False,
 ) -> tuple[Path, ...]:
-    """Write JSON and Markdown, each whole or not at all; return the files.
+    """Write page, Markdown and JSON, each whole or not at all; return the files.
 
     Args:
         result: What was found.
@@ -31,14 +32,15 @@ def write_paper(
         GraphError: One of the files is not as we left it.
     """
     folder = Path(folder)
-    record, tables = folder / JSON, folder / MARKDOWN
+    report, tables, record = folder / HTML, folder / MARKDOWN, folder / JSON
     heading = f"# {in_markdown(result.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in result.tables())
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with writing([record, tables], force=force):
+        with writing([report, tables, record], force=force):
             write_json(record, result.to_json(), indent=1)
             write_bytes(tables, text.encode())
+            write_bytes(report, paper_html(result, command).encode())
     except OSError as error:
         raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
-    return record, tables
+    return report, tables, record

@@ -31,7 +31,7 @@ PARTNERS = (
     InfractionKind.COLLISION_LAYOUT,
 )
 OURS = (
-    "Means over routes with their 95 % intervals, of these routes. The paper's figures"
+    "Means with their 95 % intervals over these scenario types. The paper's figures"
     " are of UniAD in CARLA, which drives on after a collision; here a route ends at"
     " the first. Compare directions, not numbers."
 )

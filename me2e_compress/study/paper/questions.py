@@ -22,7 +22,7 @@ from me2e_compress.study.paper.route_columns import (
     mean_of,
     paired,
 )
-from me2e_compress.study.tables import estimate_cell
+from me2e_compress.study.tables import MISSING, estimate_cell
 from me2e_compress.workflows.result import Cell, Table
 
 if TYPE_CHECKING:
@@ -241,22 +241,24 @@ def findings_table(found: tuple[Finding, ...], preview: str) -> Table:
         (
             Cell(each.question),
             Cell(each.paper),
-            Cell(each.verdict.value, reason=each.reason),
-            Cell("") if each.estimate is None else _shown(each.estimate),
-            Cell(each.test if each.estimate else f"{each.test}: {each.reason}"),
+            Cell(each.test if each.estimate else each.reason),
+            Cell(each.verdict.value),
+            Cell(MISSING, reason=each.reason)
+            if each.estimate is None
+            else _shown(each.estimate),
         )
         for each in found
     ]
     tested = sum(each.estimate is not None for each in found)
     return Table(
         f"The paper's findings{preview}",
-        ("is it so that", "the paper", "here", "difference", "how it was tested"),
+        ("is it so that", "the paper", "the test", "here", "difference"),
         tuple(rows),
         "Confirmed: the whole 95 % interval of the difference lies on the paper's"
         " side; opposite: on the other; not confirmed: it holds both. Differences are"
         " paired by route. Each interval is stated for itself: of"
         f" {tested} tests at 95 % about {0.05 * tested:.0f} would miss by chance.",
-        words=3,
+        words=4,
     )
 
 

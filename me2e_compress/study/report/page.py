@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from me2e_compress.metrics.infraction import InfractionKind
@@ -50,6 +50,17 @@ class Shown:
     after: tuple[str, str]
 
 
+def template(name: str) -> Template:
+    """Return one of the pages' templates: everything in it is escaped."""
+    return Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    ).get_template(name)
+
+
 def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
     """Build the whole page; it refers to nothing outside itself.
 
@@ -57,15 +68,8 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
         outcome: What was found.
         command: What makes it again, word by word.
     """
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     study = outcome.study
-    return environment.get_template(TEMPLATE).render(
+    return template(TEMPLATE).render(
         title=study.title,
         baseline=study.baseline,
         lede=_lede(outcome),

@@ -1,0 +1,177 @@
+"""Tables, findings and page of the paper's study, from drives that nobody drove."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.study import load_study
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.paper.paper_page import paper_html
+from me2e_compress.study.paper.paper_result import PaperResult
+from me2e_compress.study.paper.paper_run import read_paper
+from me2e_compress.study.paper.questions import (
+    Rule,
+    Verdict,
+    falls,
+    not_lower_by,
+    rises,
+    within,
+)
+from tests.study.paper_records import write_records
+
+YES, NO, OPEN = Verdict.CONFIRMED, Verdict.OPPOSITE, Verdict.NOT_CONFIRMED
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> PaperResult:
+    folder = tmp_path_factory.mktemp("records")
+    write_records(load_study("paper", "22"), folder)
+    return read_paper(load_study("paper"), folder)
+
+
+@pytest.fixture(scope="module")
+def page(result: PaperResult) -> str:
+    return paper_html(result, ("me2e-compress", "study", "paper"))
+
+
+def verdicts(result: PaperResult) -> dict[str, Verdict]:
+    return {each.question: each.verdict for each in result.findings}
+
+
+@pytest.mark.parametrize(
+    ("rule", "low", "high", "verdict"),
+    [
+        (rises, 0.1, 2.0, YES),
+        (rises, -1.0, 2.0, OPEN),
+        (rises, -2.0, -0.1, NO),
+        (rises, 0.0, 0.0, OPEN),
+        (falls, -2.0, -0.1, YES),
+        (falls, 0.1, 2.0, NO),
+        (falls, None, None, OPEN),
+        (not_lower_by(3.0), -2.9, -0.1, YES),
+        (not_lower_by(3.0), -3.1, 1.0, OPEN),
+        (not_lower_by(3.0), -5.0, -3.1, NO),
+        (within(1.0), -0.9, 0.9, YES),
+        (within(1.0), -1.1, 0.9, OPEN),
+        (within(1.0), 1.1, 3.0, NO),
+        (within(1.0), None, None, OPEN),
+    ],
+)
+def test_a_verdict_follows_from_the_interval(
+    rule: Rule, low: float | None, high: float | None, verdict: Verdict
+) -> None:
+    assert rule(Estimate(Measure(1.0, "points"), low, high, 9)) is verdict
+
+
+def test_findings_follow_from_the_drives(result: PaperResult) -> None:
+    found = verdicts(result)
+
+    assert found["More decisions a second drive better, up to 20"] is YES
+    assert found["Comfort falls as the rate rises"] is NO
+    assert found["Without the map it drives no worse"] is NO
+    assert found["Int8 in the whole network costs driving score"] is YES
+
+
+def test_other_drives_turn_a_finding_round(result: PaperResult) -> None:
+    slow, ideal = result.cells["float", "fps-1"], result.cells["float", "ideal"]
+    turned = {**result.cells, ("float", "fps-1"): ideal, ("float", "ideal"): slow}
+
+    found = verdicts(replace(result, cells=turned))
+
+    assert found["More decisions a second drive better, up to 20"] is NO
+    assert found["Comfort falls as the rate rises"] is YES
+
+
+def test_what_was_not_driven_is_not_tested_and_says_so(result: PaperResult) -> None:
+    cells = {key: each for key, each in result.cells.items() if key[0] != "minus-occ"}
+    lacking = replace(
+        result, cells=cells, failures={("minus-occ", "device"): "no memory"}
+    )
+
+    found = {each.question: each for each in lacking.findings}
+    finding = found["Without occupancy it drives better"]
+
+    assert finding.verdict is Verdict.NOT_TESTED
+    assert finding.reason == "no memory"
+    assert finding.estimate is None
+
+
+def test_a_drive_without_collisions_has_no_shares(result: PaperResult) -> None:
+    key = "float", "device"
+    record = result.cells[key]
+    safe = tuple(replace(each, infractions=()) for each in record.routes)
+    cells = {**result.cells, key: replace(record, routes=safe)}
+
+    question = "Without the map more of the collisions are with static things"
+    [finding] = [
+        each
+        for each in replace(result, cells=cells).findings
+        if each.question == question
+    ]
+
+    assert finding.reason == "a drive without a collision has no shares"
+
+
+def test_rates_that_equation_4_makes_one_are_one_drive(result: PaperResult) -> None:
+    table = next(each for each in result.tables() if each.title.startswith("Table 2"))
+    rows = {row[0].text: [cell.text for cell in row] for row in table.rows}
+
+    assert rows["14"][1:8] == rows["30"][1:8]
+    assert rows["14"][1:4] == ["ideal", "0", "20"]
+    assert rows["8"][1:4] == ["fps-10", "1", "10"]
+    assert rows["3"][1:4] == ["fps-3", "5", "3.33"]
+    assert rows["24"][8:] == ["40.63", "138.21", "0.33"]
+
+
+def test_shares_of_collisions_add_up(result: PaperResult) -> None:
+    table = result.tables()[-1]
+
+    for row in table.rows:
+        if row[2].text != "0":
+            assert sum(int(cell.detail) for cell in row[3:]) == int(row[2].text)
+
+
+def test_a_preview_is_named_so_everywhere(result: PaperResult, page: str) -> None:
+    assert all("(preview: 22 of 220 routes)" in each.title for each in result.tables())
+    titles = re.findall(r"<(?:title|h1|figcaption)>(.*?)<", page)
+    assert len(titles) >= 8
+    assert all("preview: 22 of 220 routes" in each for each in titles)
+
+
+def test_the_page_holds_tables_figures_and_findings(
+    result: PaperResult, page: str
+) -> None:
+    assert page.count("<svg") == 3
+    assert "Figure 5a" in page
+    assert "Figure 7" in page
+    assert "one condition" in page
+    assert not re.search(r"(?:src|href)=\"(?!data:|#)", page)
+    for finding in result.findings:
+        assert finding.verdict.value in page
+
+
+def test_a_study_without_drives_has_a_page_too(result: PaperResult) -> None:
+    empty = replace(result, cells={}, facts=())
+
+    page = paper_html(empty)
+
+    assert "<svg" not in page
+    assert set(verdicts(empty).values()) == {Verdict.NOT_TESTED}
+    assert "float under ideal: not driven" in page
+
+
+def test_the_same_records_give_the_same_page(result: PaperResult, page: str) -> None:
+    assert paper_html(result, ("me2e-compress", "study", "paper")) == page
+
+
+def test_a_record_is_read_as_it_was_written(
+    result: PaperResult, tmp_path: Path
+) -> None:
+    record = result.cells["minus-map", "device"]
+    path = tmp_path / "one.jsonl"
+    record.save(path)
+
+    assert DriveRecord.load(path) == record
