@@ -1,7 +1,7 @@
 """The paper's figures 5 and 7, from what was driven and timed."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -225,7 +225,7 @@ def _shown_tails(result: "PaperResult") -> list[str]:
     return [baseline, *names[: SLOWEST_SHOWN - 1]]
 
 
-def _tail(axes: Axes, samples_us: Sequence[int], name: str, colour: object) -> None:
+def _tail(axes: Axes, samples_us: Sequence[int], name: str, colour: Any) -> None:
     """Draw which share of the inferences takes longer than so many milliseconds."""
     if not samples_us:
         return
@@ -235,7 +235,7 @@ def _tail(axes: Axes, samples_us: Sequence[int], name: str, colour: object) -> N
         np.sort(samples_us) / 1e3,
         slower,
         where="pre",
-        color=colour,  # type: ignore[arg-type]
+        color=colour,
         label=name,
         linewidth=1.2,
     )
