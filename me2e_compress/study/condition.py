@@ -202,3 +202,17 @@ def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -
                 f" condition; there are {', '.join(names)}"
             )
         before.append(each.name)
+
+
+def check_conditions_elsewhere(evaluator: str, conditions: Sequence[Condition]) -> None:
+    """Refuse conditions that highway alone understands.
+
+    Raises:
+        StudyError: A condition says more than its name and the latency ``none``.
+    """
+    for each in conditions:
+        if each != Condition(each.name, "none"):
+            raise StudyError(
+                f"condition {each.name}: {evaluator} has conditions of its own, in its "
+                'options: only latency = "none" goes with it'
+            )

@@ -13,8 +13,13 @@ from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study.blocks import Block, FramesToRecord
-from me2e_compress.study.condition import Condition, check_conditions
+from me2e_compress.study.condition import (
+    Condition,
+    check_conditions,
+    check_conditions_elsewhere,
+)
 from me2e_compress.study.names import check_name, check_unique
+from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 
 
 @dataclass(frozen=True)
@@ -113,6 +118,8 @@ class Study:
             Under each condition the baseline drives too.
         report: What is made of the results: a comparison, or the paper's tables, one
             a block.
+        evaluator: What drives: ``highway``, or another by its name and options, which
+            has routes and conditions of its own.
 
     Raises:
         StudyError: Nothing to drive, a name twice, a baseline that is not a variant, a
@@ -134,6 +141,7 @@ class Study:
     to_record: FramesToRecord | None = None
     blocks: tuple[Block, ...] = ()
     report: Literal["comparison", "paper"] = "comparison"
+    evaluator: str = HIGHWAY
 
     def __post_init__(self) -> None:
         """Refuse what could not be finished."""
@@ -146,7 +154,9 @@ class Study:
                 f" {', '.join(names)}"
             )
         check_conditions(self.conditions, names)
-        if not self.routes:
+        if self.elsewhere:
+            self._check_elsewhere()
+        elif not self.routes:
             raise StudyError(f"{self.title}: there is no route to drive")
         if self.seed < 0:
             raise StudyError(f"seed {self.seed}: must be 0 or more")
@@ -154,6 +164,28 @@ class Study:
             block.check(names, [each.name for each in self.conditions])
         if self.to_record is None:
             self._check_frames()
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether another evaluator than highway drives.
+
+        Raises:
+            EvaluationError: highway is given options, which the study has itself.
+        """
+        return not is_highway(self.evaluator)
+
+    def _check_elsewhere(self) -> None:
+        adapted = [each.name for each in self.variants if each.adapter is not None]
+        for what, given in (
+            ("routes", bool(self.routes)),
+            ("report", self.report != "comparison"),
+            (f"the adapter of {', '.join(adapted)}", bool(adapted)),
+        ):
+            if given:
+                raise StudyError(
+                    f"{what}: only highway understands that, not {self.evaluator}"
+                )
+        check_conditions_elsewhere(self.evaluator, self.conditions)
 
     def _check_frames(self) -> None:
         needy = [

@@ -19,6 +19,7 @@ from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.elsewhere import episodes_elsewhere
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.route_outcomes import RouteOutcome, outcomes
 from me2e_compress.study.timing import Clock
@@ -183,6 +184,8 @@ class DriveSetup:
     def _episodes(
         self, prepared: PreparedVariant, condition: Condition
     ) -> tuple[Episode, ...] | None:
+        if self.study.elsewhere:
+            return self._episodes_elsewhere(prepared, condition)
         job = self.job(prepared, condition)
         if job is None:
             return None
@@ -196,6 +199,16 @@ class DriveSetup:
             self.listener.on_warning,
         )
         return tuple(evaluator.episodes())
+
+    def _episodes_elsewhere(
+        self, prepared: PreparedVariant, condition: Condition
+    ) -> tuple[Episode, ...] | None:
+        if prepared.failure:
+            return None
+        place, evaluator = self.workspace, self.study.evaluator
+        stage = f"{prepared.variant.name}, {condition.name}"
+        self.listener.on_progress(stage, 0, 1, evaluator)
+        return episodes_elsewhere(evaluator, prepared, condition, place)
 
     def _drive(
         self,
@@ -211,7 +224,7 @@ class DriveSetup:
         return Drive(
             name,
             condition.name,
-            score(episodes, self.study.set_size, seed),
+            score(episodes, self.study.set_size or len(episodes), seed),
             None if reference is None else difference(episodes, reference, seed),
             outcomes(episodes, reference),
         )

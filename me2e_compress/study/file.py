@@ -17,6 +17,7 @@ from me2e_compress.study.blocks import Block, FramesToRecord
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.workflows.checks import model_path
+from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 from me2e_compress.zoo.shipped import SHIPPED
 
 STUDIES = Path(__file__).parent / "shipped"
@@ -122,7 +123,8 @@ class _Record(_Table):
 class _Study(_Table):
     title: str
     baseline: str
-    routes: str | int = "all"
+    evaluator: str = HIGHWAY
+    routes: str | int | None = None
     seed: int = 0
     frames: str | None = None
     held_out: str | None = None
@@ -170,12 +172,14 @@ class _Reader:
     ) -> Study:
         timing = table.latency
         libraries = (*map(self._beside, table.plugins), *plugins)
-        driven, set_size = self._routes(routes or str(table.routes))
+        which = routes if table.routes is None or routes else str(table.routes)
+        driven, set_size = self._routes(which, table.evaluator)
         return Study(
             title=table.title,
             variants=tuple(self._variant(each) for each in table.variant),
             conditions=tuple(Condition(**dict(each)) for each in table.condition),
             baseline=table.baseline,
+            evaluator=table.evaluator,
             routes=driven,
             set_size=set_size,
             frames=self._file(table.frames),
@@ -238,7 +242,12 @@ class _Reader:
             return name
         return str(self._beside(name))
 
-    def _routes(self, which: str) -> tuple[tuple[Route, ...], int]:
+    def _routes(
+        self, which: str | None, evaluator: str
+    ) -> tuple[tuple[Route, ...], int]:
+        if which is None and not is_highway(evaluator):
+            return (), 0
+        which = which or "all"
         if which.endswith(".json"):
             found = load_routes(self._beside(which))
             return found, len(found)

@@ -106,13 +106,20 @@ class StudyResult(Result):
         return any(each.latency_ms[50].value is not None for each in self.variants)
 
     @property
+    def coverage(self) -> tuple[int, int]:
+        """Routes that were driven, and those of the whole set."""
+        if self.study.routes:
+            return len(self.study.routes), self.study.set_size
+        scores = [each.scores for each in self.drives if each.scores is not None]
+        return (scores[0].routes, scores[0].expected) if scores else (0, 0)
+
+    @property
     def headline(self) -> str:
         """Title, variants, conditions, routes."""
-        study = self.study
+        study, (driven, whole) = self.study, self.coverage
         return (
             f"{study.title}: {len(study.variants)} variants under"
-            f" {len(study.conditions)} conditions on {len(study.routes)} of"
-            f" {study.set_size} routes"
+            f" {len(study.conditions)} conditions on {driven} of {whole} routes"
         )
 
     def lines(self) -> tuple[str, ...]:
@@ -175,7 +182,8 @@ class StudyResult(Result):
             "baseline": study.baseline,
             "seed": study.seed,
             "provider": PROVIDERS.text(study.provider),
-            "routes": {"driven": len(study.routes), "set": study.set_size},
+            "evaluator": study.evaluator,
+            "routes": dict(zip(("driven", "set"), self.coverage, strict=True)),
             "conditions": [each.to_json() for each in study.conditions],
             "latency": {
                 "device_scale": self.device_scale,

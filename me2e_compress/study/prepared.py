@@ -87,7 +87,8 @@ def prepare_variant(
     """
     driver = driver_named(variant.policy, variant.adapter)
     if not isinstance(driver, OnnxDriver):
-        driver.open()
+        if not study.elsewhere:
+            driver.open()
         return PreparedVariant(variant, driver)
     model = source = driver.path
     if not source.is_file():
@@ -101,7 +102,8 @@ def prepare_variant(
         host_stage=variant.host_stage,
     )
     try_file(model, listener, study.provider)
-    driver.open()
+    if not study.elsewhere:  # another evaluator may ask for another interface
+        driver.open()
     sha256 = graph.sha256_of(model)
     origin = source.name, to_text(variant.passes)
     if not variant.passes:

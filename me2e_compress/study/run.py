@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.manager.report import versions
 from me2e_compress.study.definition import Study
@@ -36,7 +37,8 @@ def run_study(
     Args:
         study: What is asked, or its TOML file.
         folder: Where models, traces and results go.
-        engine: Where routes are driven; None for one process of this machine.
+        engine: Where routes are driven; None for one process of this machine. Another
+            evaluator than highway drives where it will.
         listener: Is called with progress and warnings.
         pictures: On how many routes two drives are shown side by side.
         force: Replace a report that is not as we left it, too.
@@ -48,6 +50,10 @@ def run_study(
             is left out, with a warning.
     """
     study, folder = _read(study), Path(folder)
+    if study.elsewhere and engine not in (None, LocalEngine()):
+        raise StudyError(
+            f"workers and engine are highway's: {study.evaluator} drives where it will"
+        )
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
@@ -68,7 +74,9 @@ def _run(
         for condition in study.conditions
         for drive in setup.under(condition, prepared)
     ]
-    contrasts = take_pictures(setup, prepared, drives, pictures)
+    contrasts = (
+        () if study.elsewhere else take_pictures(setup, prepared, drives, pictures)
+    )
     return StudyResult(
         study,
         variants,

@@ -181,7 +181,7 @@ def _condition(outcome: "StudyResult", condition: Condition) -> str:
 
 
 def _routes_note(outcome: "StudyResult") -> str:
-    driven, whole = len(outcome.study.routes), outcome.study.set_size
+    driven, whole = outcome.coverage
     share = f"{driven} routes" if driven == whole else f"{driven} of {whole} routes"
     return (
         f"{share}. DS driving score, SR success rate, DE efficiency, DC comfort, each "

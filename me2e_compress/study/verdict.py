@@ -58,7 +58,7 @@ def _road(found: PairedDifference, outcome: StudyResult) -> str:
         low, high = (number(each, "+.1f") for each in (score.low, score.high))
         said += f" (95 %: {low} to {high})"
         differs = not score.low <= 0 <= score.high
-    routes, whole = score.n, outcome.study.set_size
+    routes, whole = score.n, outcome.coverage[1]
     if not found.differ:
         most = f"{found.unseen_percent:.0f} %"
         said += f"; 0 of {routes} routes differ, with 95 % at most {most} of all do"

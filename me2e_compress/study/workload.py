@@ -70,10 +70,12 @@ class Workload(Result):
     @property
     def headline(self) -> str:
         """Drives, routes, hours."""
+        drives = _count(len(self.drives), "drive")
+        if not self.set_size:
+            return f"{self.title}: {drives}, of routes that the evaluator knows"
         routes = sum(each.routes for each in self.drives)
         done = sum(each.done for each in self.drives)
         how = "by this folder's logs" if self.measured else "an estimate"
-        drives = _count(len(self.drives), "drive")
         return (
             f"{self.title}: {drives}, {_count(routes, 'route')},"
             f" {number(done)} of them driven; about {self.hours:.1f} hours"

@@ -92,11 +92,12 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
 
 def _lede(outcome: StudyResult) -> str:
     study = outcome.study
-    driven = len(study.routes)
-    share = f"{driven}" if driven == study.set_size else f"{driven} of {study.set_size}"
+    driven, whole = outcome.coverage
+    share = f"{driven}" if driven == whole else f"{driven} of {whole}"
+    where = f"of {study.evaluator}" if study.elsewhere else "of highway-env"
     names = ", ".join(each.name for each in study.conditions)
     return (
-        f"{_count(len(study.variants), 'variant')} on {share} routes of highway-env, "
+        f"{_count(len(study.variants), 'variant')} on {share} routes {where}, "
         f"closed loop; {_count(len(study.conditions), 'condition')}: {names}."
     )
 
