@@ -26,7 +26,7 @@ from me2e_compress.metrics.route_measures import RouteMeasures
 
 Floats = npt.NDArray[np.float64]
 
-MEASURES = ("driving score", "efficiency", "comfort", "energy")
+MEASURES: tuple[str, ...] = ("driving score", "efficiency", "comfort", "energy")
 SIGNS = np.array([1.0, 1.0, 1.0, -1.0])
 POINTS = "points"
 

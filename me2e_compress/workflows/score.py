@@ -8,6 +8,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.result_files import holds_records
 from me2e_compress.evaluators.highway.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import scores as metrics
+from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -17,6 +18,7 @@ from me2e_compress.workflows.score_bench2drive import (
     RealRun,
     score_real_run,
 )
+from me2e_compress.workflows.score_eer import EerOptions, EerScores, score_eer
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -26,10 +28,12 @@ class ScoreResult(Result):
     Attributes:
         scores: in the order in which the folders were named.
         real: more of those that hold the results of real runs.
+        eer: EER_AV of all of them together; None where it was not asked for.
     """
 
     scores: Mapping[str, Scores]
     real: Mapping[str, RealRun] = dataclasses.field(default_factory=dict)
+    eer: EerScores | None = None
 
     @property
     def headline(self) -> str:
@@ -39,16 +43,17 @@ class ScoreResult(Result):
         )
 
     def lines(self) -> tuple[str, ...]:
-        """Return none: the tables say it."""
-        return ()
+        """Return whether the order by EER_AV hangs on how it is normalized."""
+        return () if self.eer is None else self.eer.lines()
 
     def tables(self) -> tuple[Table, ...]:
         """Return a table a folder; of a real run also what its records say."""
-        return tuple(
+        found = [
             each
             for name, scores in self.scores.items()
             for each in self._of(name, scores)
-        )
+        ]
+        return (*found, *(() if self.eer is None else self.eer.tables()))
 
     def alerts(self) -> tuple[str, ...]:
         """Return what is wrong with the records of real runs."""
@@ -65,12 +70,15 @@ class ScoreResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the scores of every folder."""
+        """Return the scores of every folder, and EER_AV of all together."""
         found = [
             {"results": name, **self.real.get(name, scores).to_json()}
             for name, scores in self.scores.items()
         ]
-        return {"folders": found}
+        return {
+            "folders": found,
+            "eer": None if self.eer is None else self.eer.to_json(),
+        }
 
     def _of(self, name: str, scores: Scores) -> tuple[Table, ...]:
         if name not in self.real:
@@ -86,6 +94,7 @@ def score(
     *results: str | Path,
     listener: Listener = SILENT,
     real: Bench2DriveOptions | None = None,
+    eer: EerOptions | None = None,
 ) -> ScoreResult:
     """Score the episodes in folders of results.
 
@@ -94,14 +103,18 @@ def score(
         listener: is called with the files that are damaged and left out.
         real: how results of real runs are read; None takes the defaults. Given, all
             folders are taken to be of real runs.
+        eer: joules of the folders, for EER_AV of all of them together.
 
     Raises:
-        EvaluationError: not a folder of results.
+        EvaluationError: not a folder of results, or EER_AV cannot compare them.
+        EnergyError: a file of joules is not usable.
     """
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
+    driven = dict[str, Sequence[Episode]]()
     for path in map(Path, results):
         if real is None and (path / MANIFEST).exists():
-            scores[str(path)] = _scores(path, listener)
+            driven[str(path)], size = _episodes(path, listener)
+            scores[str(path)] = metrics.score(driven[str(path)], size)
             continue
         if real is None and not holds_records(path):
             raise EvaluationError(
@@ -110,15 +123,17 @@ def score(
             )
         run = score_real_run(path, real or Bench2DriveOptions())
         scores[str(path)], runs[str(path)] = run.scores, run
-    return ScoreResult(scores, runs)
+        driven[str(path)] = run.collected.episodes
+    return ScoreResult(scores, runs, score_eer(driven, eer or EerOptions()))
 
 
-def _scores(path: Path, listener: Listener) -> Scores:
+def _episodes(path: Path, listener: Listener) -> tuple[tuple[Episode, ...], int]:
+    """Return what a folder holds, and how many routes the whole set has."""
     folder = ResultsFolder.open(path)
     episodes = tuple(folder.episodes().values())
     for file, reason in folder.corrupt.items():
         listener.on_warning(f"{file}: {reason}: left out")
-    return metrics.score(episodes, folder.set_size)
+    return episodes, folder.set_size
 
 
 def driving_score(scores: Scores) -> str:

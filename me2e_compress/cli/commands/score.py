@@ -11,6 +11,7 @@ from me2e_compress.metrics.penalties import Version
 from me2e_compress.metrics.traffic_signs import Rules
 from me2e_compress.workflows import score as workflow
 from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
+from me2e_compress.workflows.score_eer import EerOptions, joules_named
 
 Metrics = Annotated[
     Path | None, typer.Option(help="a folder of metric_info.json apart from RESULTS")
@@ -24,6 +25,18 @@ AbilityRules = Annotated[
 Penalties = Annotated[
     str | None, typer.Option(help="of infractions: b2d, 1.0, 2.0 or 2.1")
 ]
+Energy = Annotated[
+    list[str] | None,
+    typer.Option(help="NAME=JOULES or NAME=FILE: of an inference; gives EER_AV"),
+]
+Modelled = Annotated[
+    list[str] | None,
+    typer.Option(help="NAME=JOULES by MACs and bytes; an EER_AV of its own"),
+]
+Weights = Annotated[
+    Path | None, typer.Option(help="of EER_AV, as --save-weights wrote them")
+]
+SaveWeights = Annotated[Path | None, typer.Option(help="JSON of the weights of EER_AV")]
 
 
 def score(
@@ -34,11 +47,16 @@ def score(
     junctions: Junctions = None,
     rules: AbilityRules = None,
     penalties: Penalties = None,
+    energy: Energy = None,
+    modelled: Modelled = None,
+    weights: Weights = None,
+    save_weights: SaveWeights = None,
     as_json: given.Json = False,
 ) -> None:
     """Print driving score, success rate, efficiency, comfort and abilities.
 
-    All options but --json are about results of real Bench2Drive or CARLA runs.
+    With --energy or --modelled also EER_AV, which compares all folders. The other
+    options but --json are about results of real Bench2Drive or CARLA runs.
     """
     options = Bench2DriveOptions(
         metrics,
@@ -49,6 +67,14 @@ def score(
     asked = any(each is not None for each in (metrics, junctions, rules, penalties))
     with listening() as listener:
         found = workflow.score(
-            *results, listener=listener, real=options if asked else None
+            *results,
+            listener=listener,
+            real=options if asked else None,
+            eer=EerOptions(
+                joules_named(energy or ()),
+                joules_named(modelled or ()),
+                weights,
+                save_weights,
+            ),
         )
     show(found, as_json)

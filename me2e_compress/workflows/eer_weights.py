@@ -1,0 +1,90 @@
+"""Weights and scales of EER_AV on file, for later calls to score alike."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
+
+from me2e_compress import documents
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.eer import MEASURES, EerScale, Normalization
+from me2e_compress.runtime.atomic import write_json
+
+Kind = Literal["measured", "modelled"]
+"""Of joules: what a counter counted, or what follows from MACs and bytes."""
+
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+_Four = Annotated[dict[str, float], Field(min_length=4, max_length=4)]
+
+
+@with_config(_STRICT)
+@dataclasses.dataclass(frozen=True)
+class SavedWeights:
+    """A scale by the names of the measures, and which joules it is for."""
+
+    energy: Kind
+    normalization: Normalization
+    weights: _Four
+    offset: _Four
+    span: _Four
+
+    @classmethod
+    def of(cls, scale: EerScale, energy: Kind) -> "SavedWeights":
+        """Build it of a scale."""
+        columns = (scale.weights, scale.offset, scale.span)
+        named = [dict(zip(MEASURES, each, strict=True)) for each in columns]
+        return cls(energy, scale.normalization, *named)
+
+    @classmethod
+    def load(cls, path: Path) -> "SavedWeights":
+        """Read what `save` wrote.
+
+        Raises:
+            EvaluationError: no such file, or not of this form.
+        """
+        try:
+            found = _FILE.validate_python(documents.from_json(documents.content(path)))
+        except OSError as error:
+            raise EvaluationError(f"{path}: {error.strerror}") from error
+        except documents.MalformedError as error:
+            raise EvaluationError(f"{path}: no file of weights: {error}") from error
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"])) or "the file"
+            said = f"{path}: no file of weights: {where}: {first['msg']}"
+            raise EvaluationError(said) from error
+        for column in (found.weights, found.offset, found.span):
+            if set(column) != set(MEASURES):
+                names = ", ".join(MEASURES)
+                raise EvaluationError(f"{path}: it must name {names}")
+        if min(found.span.values()) <= 0.0 or min(found.weights.values()) < 0.0:
+            raise EvaluationError(f"{path}: a span or a weight is not positive")
+        return found
+
+    def scale(self) -> EerScale:
+        """Return it as `metrics.eer` takes it."""
+        weights, offset, span = (
+            (each[MEASURES[0]], each[MEASURES[1]], each[MEASURES[2]], each[MEASURES[3]])
+            for each in (self.weights, self.offset, self.span)
+        )
+        return EerScale(self.normalization, weights, offset, span)
+
+    def save(self, path: Path) -> None:
+        """Write it.
+
+        Raises:
+            EvaluationError: the file cannot be written.
+        """
+        try:
+            write_json(path, self.to_json(), indent=1)
+        except OSError as error:
+            said = f"{path}: cannot be written: {error.strerror}"
+            raise EvaluationError(said) from error
+
+    def to_json(self) -> dict[str, Any]:
+        """Return every attribute under its name."""
+        return dataclasses.asdict(self)
+
+
+_FILE = TypeAdapter(SavedWeights)

@@ -1,0 +1,266 @@
+"""EER_AV of folders of results: driving and energy in one score (equations 8 to 11)."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, eer, rankings
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
+from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.workflows.eer_weights import Kind, SavedWeights
+from me2e_compress.workflows.result import Table, number, table
+
+HEADS: Mapping[Kind, str] = {
+    "measured": "EER_AV",
+    "modelled": "EER_AV, modelled energy",
+}
+UNITS = ("%", "%", "ratio", "J")
+
+Joules = Mapping[str, str | Path | float]
+
+
+@dataclasses.dataclass(frozen=True)
+class EerOptions:
+    """What EER_AV is made of besides the episodes.
+
+    Attributes:
+        energy: measured joules of one inference, by folder: a number, or a file that
+            ``profile --energy`` wrote. A folder's last part is enough as its name.
+        modelled: joules of one inference that follow from MACs and bytes, by folder.
+            They make a score of their own, never one with measured joules.
+        weights: file of weights and scales that an earlier call saved.
+        save_weights: where to write those of this call.
+    """
+
+    energy: Joules = dataclasses.field(default_factory=dict)
+    modelled: Joules = dataclasses.field(default_factory=dict)
+    weights: str | Path | None = None
+    save_weights: str | Path | None = None
+
+    @property
+    def asked(self) -> bool:
+        """Whether there is anything to do."""
+        return bool(self.energy or self.modelled or self.weights or self.save_weights)
+
+
+@dataclasses.dataclass(frozen=True)
+class EerScores:
+    """EER_AV with measured joules, and apart from it with modelled ones.
+
+    Attributes:
+        found: by ``measured`` and ``modelled``, those that were asked for.
+        rankings: the variants, best first, by normalization, of each.
+    """
+
+    found: Mapping[Kind, EerResult]
+    rankings: Mapping[Kind, Mapping[str, tuple[str, ...]]]
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the scores, their weights, and how the order hangs on them."""
+        return (self._scores(), *(self._weights(kind) for kind in self._weighed()))
+
+    def lines(self) -> tuple[str, ...]:
+        """Say whether the order hangs on the normalization."""
+        return tuple(self._order(kind) for kind in self._weighed())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return scores, scales, routes left out and orders, by kind of joules."""
+        return {
+            kind: {
+                "scores": {n: each.to_json() for n, each in found.scores.items()},
+                "scale": _scale_json(found, kind),
+                "left_out": dict(found.left_out),
+                "rankings": {k: list(v) for k, v in self.rankings[kind].items()},
+            }
+            for kind, found in self.found.items()
+        }
+
+    def _weighed(self) -> list[Kind]:
+        return [kind for kind, each in self.found.items() if each.scale is not None]
+
+    def _scores(self) -> Table:
+        names = next(iter(self.found.values())).scores
+        columns, rows = ["results"], [[name] for name in names]
+        for kind, result in self.found.items():
+            columns += [HEADS[kind], "95 %", "95 %, other types", "n"]
+            for row, name in zip(rows, names, strict=True):
+                row += _cells(result.scores[name])
+        return table("Driving and energy, points", columns, rows)
+
+    def _weights(self, kind: Kind) -> Table:
+        found = self.found[kind]
+        scale = found.scale
+        if scale is None:
+            return table("Weights", (), ())
+        rows = [
+            (measure, f"{weight:.3f}", f"{low:.4g}", f"{low + span:.4g}", unit)
+            for measure, weight, low, span, unit in zip(
+                MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
+            )
+        ]
+        left = [f"{n} for want of {name}" for name, n in found.left_out.items()]
+        note = f"Routes left out of all: {', '.join(left)}." if left else ""
+        columns = ("measure", "weight", "0 is", "1 is", "unit")
+        return table(
+            f"Weights by CRITIC, {scale.normalization}, {kind} energy",
+            columns,
+            rows,
+            note,
+        )
+
+    def _order(self, kind: Kind) -> str:
+        own = self.found[kind].ranking
+        others = {n: order for n, order in self.rankings[kind].items() if order != own}
+        said = f"EER_AV with {kind} energy, best first: {', '.join(own)}"
+        if not others:
+            return f"{said}; the same under every normalization"
+        turned = "; ".join(f"{n}: {', '.join(order)}" for n, order in others.items())
+        return f"{said}; but {turned}"
+
+
+def score_eer(
+    folders: Mapping[str, Sequence[Episode]], options: EerOptions
+) -> EerScores | None:
+    """Return EER_AV of folders that hold the same routes; None where none is asked.
+
+    Args:
+        folders: episodes by the name of the folder.
+        options: joules and weights.
+
+    Raises:
+        EvaluationError: the folders hold different routes, joules are of no folder or
+            no number, or the weights are not usable.
+        EnergyError: a file of joules is not usable.
+    """
+    if not options.asked:
+        return None
+    given: dict[Kind, Joules] = {
+        "measured": options.energy,
+        "modelled": options.modelled,
+    }
+    asked: dict[Kind, Joules] = {kind: each for kind, each in given.items() if each}
+    if not asked:
+        asked["measured"] = {}
+    scales = _scales(options.weights, asked)
+    for name, each in options.modelled.items():
+        if isinstance(each, (str, Path)):
+            raise EvaluationError(f"modelled energy of {name}: {each} is no number")
+    types, found = _types(folders), dict[Kind, EerResult]()
+    orders = dict[Kind, dict[str, tuple[str, ...]]]()
+    for kind, joules in asked.items():
+        variants = _variants(folders, joules)
+        found[kind] = eer(variants, scales.get(kind), types=types)
+        orders[kind] = {str(n): order for n, order in rankings(variants).items()}
+    if options.save_weights is not None:
+        _save(Path(options.save_weights), found)
+    return EerScores(found, orders)
+
+
+def _scales(
+    weights: str | Path | None, asked: Mapping[Kind, Joules]
+) -> dict[Kind, EerScale]:
+    if weights is None:
+        return {}
+    saved = SavedWeights.load(Path(weights))
+    if saved.energy not in asked:
+        raise EvaluationError(
+            f"{weights}: the weights are for {saved.energy} energy, the joules given "
+            f"are {', '.join(asked)}"
+        )
+    return {saved.energy: saved.scale()}
+
+
+def joules_named(words: Sequence[str]) -> dict[str, str | float]:
+    """Read ``NAME=JOULES`` or ``NAME=FILE``, as the command takes them.
+
+    Raises:
+        EvaluationError: there is no name, or one twice.
+    """
+    found = dict[str, str | float]()
+    for word in words:
+        name, equals, value = word.rpartition("=")
+        if not (name and equals and value):
+            raise EvaluationError(f"energy {word!r}: NAME=JOULES or NAME=FILE is asked")
+        if name in found:
+            raise EvaluationError(f"energy of {name} is given twice")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = value
+    return found
+
+
+def _variants(
+    folders: Mapping[str, Sequence[Episode]], joules: Joules
+) -> dict[str, RouteMeasures]:
+    """Return the measures of every folder, routes in the order of the first."""
+    named = {
+        _folder(name, folders): _joules(name, each) for name, each in joules.items()
+    }
+    order = [episode.route for episode in next(iter(folders.values()), ())]
+    found = dict[str, RouteMeasures]()
+    for name, episodes in folders.items():
+        by_route = {episode.route: episode for episode in episodes}
+        unpaired = sorted({*by_route} ^ {*order})
+        if unpaired:
+            raise EvaluationError(
+                f"{name}: route {unpaired[0]} is in one of the folders only: EER_AV "
+                "compares the same routes"
+            )
+        ordered = [by_route[route] for route in order]
+        found[name] = route_measures(ordered, named.get(name))
+    return found
+
+
+def _folder(name: str, folders: Mapping[str, Sequence[Episode]]) -> str:
+    fitting = [each for each in folders if name in (each, Path(each).name)]
+    if len(fitting) != 1:
+        raise EvaluationError(
+            f"energy of {name}: {len(fitting)} folders of that name; there are "
+            f"{', '.join(folders)}"
+        )
+    return fitting[0]
+
+
+def _joules(name: str, given: str | Path | float) -> float | None:
+    if isinstance(given, (str, Path)):
+        return EnergyResult.load(Path(given)).j_per_frame
+    if not 0.0 <= given < float("inf"):
+        raise EvaluationError(f"energy of {name}: {given} is no number of joules")
+    return given
+
+
+def _types(folders: Mapping[str, Sequence[Episode]]) -> list[str]:
+    return [episode.scenario for episode in next(iter(folders.values()), ())]
+
+
+def _save(path: Path, found: Mapping[Kind, EerResult]) -> None:
+    """Write the scale of measured joules, or of modelled ones where there are none."""
+    kind, result = next(iter(found.items()))
+    if result.scale is None:
+        reason = next(iter(result.scores.values())).measure.reason
+        raise EvaluationError(f"{path}: there are no weights to save: {reason}")
+    SavedWeights.of(result.scale, kind).save(path)
+
+
+def _scale_json(found: EerResult, kind: Kind) -> dict[str, Any] | None:
+    return None if found.scale is None else SavedWeights.of(found.scale, kind).to_json()
+
+
+def _cells(estimate: Estimate) -> list[str]:
+    measure = estimate.measure
+    if measure.value is None:
+        return [f"- ({measure.reason})", "-", "-", str(estimate.n)]
+    here = _between(estimate.low, estimate.high)
+    anew = _between(estimate.anew_low, estimate.anew_high)
+    return [f"{measure.value:.2f}", here, anew, str(estimate.n)]
+
+
+def _between(low: float | None, high: float | None) -> str:
+    if low is None or high is None:
+        return "-"
+    return f"{number(low, '.2f')} to {number(high, '.2f')}"

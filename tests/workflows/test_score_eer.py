@@ -1,0 +1,187 @@
+"""EER_AV of folders: whose joules, whose weights, and what cannot be compared."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from me2e_compress.cli.commands.score import score as command
+from me2e_compress.errors import EnergyError, EvaluationError
+from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.evaluators.highway.worker import Driven
+from me2e_compress.metrics.episode import Episode, InferenceRecord
+from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.workflows.score_eer import EerOptions, joules_named, score_eer
+from tests.docs.documents import faults
+from tests.metrics.drives import cruise, drive, infraction
+
+CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
+
+
+def driven(
+    route: str, decisions: int, speed: float, *, crashed: bool = False
+) -> Episode:
+    found = drive(
+        *[CRASH] * crashed,
+        route=route,
+        driven=cruise(speed=speed, traffic=10.0),
+        completion=60.0 if crashed else 100.0,
+    )
+    records = tuple(InferenceRecord(0, 0) for _ in range(decisions))
+    return dataclasses.replace(found, decisions=records)
+
+
+FOLDERS = {
+    "runs/fast": [driven("a", 9, 12.0), driven("b", 5, 15.0, crashed=True)],
+    "runs/slow": [driven("b", 20, 5.0), driven("a", 14, 8.0)],
+}
+
+
+def test_every_folder_has_a_score_by_its_own_joules() -> None:
+    found = score_eer(FOLDERS, EerOptions({"fast": 2.0, "runs/slow": 3.0}))
+
+    assert found is not None
+    scale = found.found["measured"].scale
+    assert scale is not None
+    # 9 and 5 decisions of 2 J, 20 and 14 of 3 J
+    assert (scale.offset[3], scale.offset[3] + scale.span[3]) == (10.0, 60.0)
+    assert set(found.found) == {"measured"}
+    assert len(found.found["measured"].ranking) == 2
+
+
+def test_modelled_joules_make_a_column_of_their_own() -> None:
+    found = score_eer(
+        FOLDERS, EerOptions({"fast": 2.0}, modelled={"fast": 0.5, "slow": 0.1})
+    )
+
+    assert found is not None
+    (scores, *_) = found.tables()
+    assert scores.columns[1] == "EER_AV"
+    assert scores.columns[5] == "EER_AV, modelled energy"
+    (_, slow) = scores.rows
+    assert slow[1].text == "- (energy: not measured)"
+    assert slow[5].text != "-"
+
+
+def test_joules_come_from_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "energy.json"
+    EnergyResult(6.0, 3, 2.0, low=1.5, high=2.5).save(file)
+
+    found = score_eer(FOLDERS, EerOptions({"fast": file, "slow": 3.0}))
+    given = score_eer(FOLDERS, EerOptions({"fast": 2.0, "slow": 3.0}))
+
+    assert found is not None
+    assert given is not None
+    assert found.to_json() == given.to_json()
+
+
+def test_weights_are_saved_and_used_again(tmp_path: Path) -> None:
+    joules, file = {"fast": 2.0, "slow": 3.0}, tmp_path / "weights.json"
+    first = score_eer(FOLDERS, EerOptions(joules, save_weights=file))
+    alone = {"runs/slow": FOLDERS["runs/slow"]}
+    again = score_eer(alone, EerOptions({"slow": 3.0}, weights=file))
+
+    assert first is not None
+    assert again is not None
+    there, here = (
+        each.found["measured"].scores["runs/slow"] for each in (first, again)
+    )
+    assert here.value == pytest.approx(there.value)
+
+
+def test_weights_for_other_joules_are_refused(tmp_path: Path) -> None:
+    joules, file = {"fast": 2.0, "slow": 3.0}, tmp_path / "weights.json"
+    score_eer(FOLDERS, EerOptions(modelled=joules, save_weights=file))
+
+    with pytest.raises(EvaluationError, match="are for modelled energy, the jou"):
+        score_eer(FOLDERS, EerOptions(joules, weights=file))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("span", {"energy": 0.0}, "a span or a weight is not positive"),
+        ("weights", {"joy": 1.0}, "weights: Dictionary should have at most 4"),
+        ("energy", "guessed", "energy: Input should be 'measured' or 'modelled'"),
+    ],
+)
+def test_spoiled_weights_are_one_line(
+    tmp_path: Path, key: str, value: object, said: str
+) -> None:
+    file = tmp_path / "weights.json"
+    joules = {"fast": 2.0, "slow": 3.0}
+    score_eer(FOLDERS, EerOptions(joules, save_weights=file))
+    record = json.loads(file.read_text())
+    spoiled = {**record[key], **value} if isinstance(value, dict) else value
+    file.write_text(json.dumps({**record, key: spoiled}))
+
+    with pytest.raises(EvaluationError, match=re.escape(said)):
+        score_eer(FOLDERS, EerOptions(joules, weights=file))
+
+
+def test_no_joules_no_score() -> None:
+    assert score_eer(FOLDERS, EerOptions()) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (EerOptions({"other": 2.0}), "energy of other: 0 folders of that name"),
+        (EerOptions({"fast": -1.0}), "energy of fast: -1.0 is no number of joules"),
+        (EerOptions({"fast": float("nan")}), "nan is no number of joules"),
+        (EerOptions(modelled={"fast": "a.json"}), "of fast: a.json is no number"),
+        (EerOptions(weights="no.json"), "no.json: No such file"),
+    ],
+)
+def test_what_cannot_be_used_is_named(options: EerOptions, said: str) -> None:
+    with pytest.raises(EvaluationError, match=re.escape(said)):
+        score_eer(FOLDERS, options)
+
+
+def test_a_file_of_joules_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "energy.json").write_text("{}")
+
+    with pytest.raises(EnergyError, match=r"energy\.json: not an energy file"):
+        score_eer(FOLDERS, EerOptions({"fast": tmp_path / "energy.json"}))
+
+
+def test_other_routes_cannot_be_compared() -> None:
+    mixed = {**FOLDERS, "runs/short": FOLDERS["runs/fast"][:1]}
+
+    with pytest.raises(EvaluationError, match="runs/short: route b is in one of"):
+        score_eer(mixed, EerOptions({"fast": 2.0}))
+
+
+def test_joules_by_name() -> None:
+    found = joules_named(["a=1.5", "runs/b=e=2.json"])
+
+    assert found == {"a": 1.5, "runs/b=e": "2.json"}
+
+
+@pytest.mark.parametrize("words", [["1.5"], ["a="], ["=2"], ["a=1", "a=2"]])
+def test_joules_without_a_name_or_with_two(words: list[str]) -> None:
+    with pytest.raises(EvaluationError, match="energy"):
+        joules_named(words)
+
+
+def test_the_command_prints_what_the_page_says(tmp_path: Path) -> None:
+    for name, episodes in FOLDERS.items():
+        path = tmp_path / Path(name).name
+        folder = ResultsFolder.create(path, {"routes": ["a", "b"], "set_size": 2})
+        for each in episodes:
+            folder.save(Driven(each, 0.0, 0))
+    app = typer.Typer()
+    app.command()(command)
+    words = [str(tmp_path / "fast"), str(tmp_path / "slow"), "--energy", "fast=2"]
+
+    result = CliRunner().invoke(app, [*words, "--energy", "slow=3", "--json"])
+
+    document = json.loads(result.stdout)
+    assert faults("score", document) == []
+    scores = document["eer"]["measured"]["scores"]
+    assert {Path(name).name for name in scores} == {"fast", "slow"}
