@@ -28,7 +28,7 @@ import pynvml
 from benchmarks.run_one import peak_mb
 from me2e_compress.errors import EnergyError, Me2eError
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.counter import open_counter
+from me2e_compress.runtime.energy.energy_counter import open_counter
 from me2e_compress.runtime.energy.meter import EnergyMeter
 from me2e_compress.runtime.energy.reader import Absent, Reader
 from me2e_compress.runtime.energy.schedule import EnergySchedule

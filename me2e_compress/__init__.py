@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.lint import LintOptions, LintResult, lint
     from me2e_compress.workflows.listener import Listener
     from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
-    from me2e_compress.workflows.profile import ProfileOptions, ProfileResult, profile
+    from me2e_compress.workflows.profile import ProfileOptions, profile
+    from me2e_compress.workflows.profile_result import ProfileResult
     from me2e_compress.workflows.score import ScoreResult, score
     from me2e_compress.workflows.search import SearchOptions, SearchResult, search
     from me2e_compress.workflows.sensitivity import (
@@ -140,7 +141,8 @@ _ROOMS = {
     "workflows.lint": ("LintOptions", "LintResult", "lint"),
     "workflows.listener": ("Listener",),
     "workflows.plan": ("PlanOptions", "PlanResult", "plan"),
-    "workflows.profile": ("ProfileOptions", "ProfileResult", "profile"),
+    "workflows.profile": ("ProfileOptions", "profile"),
+    "workflows.profile_result": ("ProfileResult",),
     "workflows.score": ("ScoreResult", "score"),
     "workflows.search": ("SearchOptions", "SearchResult", "search"),
     "workflows.sensitivity": (

@@ -19,7 +19,7 @@ from me2e_compress.operators import OPERATORS
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES
 from me2e_compress.registry import Entry, Option, Registry, describe
-from me2e_compress.runtime.energy.counter import ENERGY_COUNTERS
+from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS
 from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.result import Result, Table, table

@@ -12,16 +12,14 @@ from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.modules import assign
 from me2e_compress.runtime.breakdown import Breakdown, break_down
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.counter import check_counter
+from me2e_compress.runtime.energy.energy_counter import check_counter
 from me2e_compress.runtime.energy.models import measure_energy
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.latency_trace import (
     LatencyTrace,
     Microseconds,
-    shares,
-    shares_table,
 )
-from me2e_compress.runtime.others_load import BUSY, OthersLoad, is_busy
+from me2e_compress.runtime.others_load import OthersLoad
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
@@ -34,17 +32,12 @@ from me2e_compress.workflows.checks import (
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table
+from me2e_compress.workflows.profile_result import ProfileResult
 
 MOST_SAMPLES = 10**9
 """Inferences that can be asked for: at a millisecond each, a fortnight."""
 KINDS = (".png", ".svg", ".pdf")
 """Endings of a figure."""
-_SHOWN = 12
-"""Operators in a table."""
-BEYOND_P99 = 5
-"""Samples that must lie beyond the 99th percentile: with fewer, one disturbance more or
-less moves it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,89 +81,6 @@ class ProfileOptions:
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
         check_count("--warm-up", self.warm_up, most=MOST_SAMPLES)
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class ProfileResult(Result):
-    """Latencies of one model.
-
-    Attributes:
-        model: the file.
-        trace: the samples.
-        output: the trace that was written; None if none was.
-        operators_us: what each operator took, in inferences under a profiler.
-        figure: the picture that was drawn; None if none was.
-        others_cores: how many cores other processes kept busy; None: not measured.
-        cores: of the machine.
-        energy: joules, or why there are none; None: not asked for.
-        energy_output: the file they were written to; None if they were not.
-    """
-
-    model: Path
-    trace: LatencyTrace
-    output: Path | None
-    others_cores: float | None = None
-    cores: int = 1
-    operators_us: Microseconds = dataclasses.field(default_factory=dict)
-    figure: Path | None = None
-    energy: EnergyResult | None = None
-    energy_output: Path | None = None
-
-    @property
-    def headline(self) -> str:
-        """File, number of inferences, machine."""
-        return f"{self.output or self.model.name}: {self.trace.headline}"
-
-    def lines(self) -> tuple[str, ...]:
-        """Return how far the last percentile can be trusted, and the joules."""
-        energy = () if self.energy is None else (self.energy.headline,)
-        count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
-        if count >= needed:
-            return energy
-        return (
-            *energy,
-            f"p99 rests on too few samples: {count}, and {needed} are needed for"
-            f" {BEYOND_P99} beyond it (--samples {needed})",
-        )
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return whether the machine was busy, and what puts joules in doubt."""
-        energy = () if self.energy is None else self.energy.alerts()
-        if self.others_cores is None or not is_busy(self.others_cores, self.cores):
-            return energy
-        return (
-            *energy,
-            f"the machine was busy: other processes took {self.others_cores:.1f} of"
-            f" {self.cores} cores, and more than {BUSY:.0%} moves latencies; measure"
-            " again when it is idle",
-        )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return the percentiles in milliseconds, by module and operator too."""
-        whole, *modules = self.trace.tables()
-        energy = () if self.energy is None else self.energy.tables()
-        found = (dataclasses.replace(whole, title=self.headline), *modules, *energy)
-        if not self.operators_us:
-            return found
-        rest = len(self.operators_us) - _SHOWN
-        shown = shares_table("By operator, as it runs", "operator", self.operators_us)
-        note = f"{rest} more operators: --json" if rest > 0 else ""
-        return *found, dataclasses.replace(shown, rows=shown.rows[:_SHOWN], note=note)
-
-    def records(self) -> list[dict[str, object]]:
-        """Return a row an inference, in their order."""
-        return [{"latency_us": sample} for sample in self.trace.samples_us]
-
-    def to_json(self) -> object:
-        """Return what the trace holds, shares, joules, how busy the machine was."""
-        return {
-            **self.trace.to_json(),
-            "modules": shares(self.trace.modules_us),
-            "operators": shares(self.operators_us),
-            "energy": None if self.energy is None else self.energy.to_json(),
-            "others_cores": self.others_cores,
-            "cores": self.cores,
-        }
 
 
 def profile(

@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.others_load import SHORTEST_S, OthersLoad
-from me2e_compress.workflows.profile import BEYOND_P99, ProfileResult
+from me2e_compress.workflows.profile_result import BEYOND_P99, ProfileResult
 
 ENOUGH = 100 * BEYOND_P99
 

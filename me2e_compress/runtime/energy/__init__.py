@@ -1,5 +1,5 @@
 """Energy of a model: measured by a counter of the device, or modelled, never mixed."""
 
-from me2e_compress.runtime.energy.result import EnergyResult
+from me2e_compress.runtime.energy.energy_result import EnergyResult
 
 __all__ = ["EnergyResult"]

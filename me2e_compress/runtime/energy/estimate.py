@@ -59,7 +59,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class EnergyEstimate:
     """Joules a frame and their 95 % interval.
 
     Attributes:
@@ -75,7 +75,7 @@ class Estimate:
 
 def estimate(
     windows: Sequence[Window], step_s: float, idle_w: float | None = None
-) -> Estimate:
+) -> EnergyEstimate:
     """Return joules a frame over windows of one model, and how well they are known.
 
     The mean of the windows, and Student's t over what is left of them after a straight
@@ -117,7 +117,7 @@ def estimate(
     pauses = float(np.mean(paused * np.abs(watts - idle) / frames)) / 2
     half = math.hypot(student_t(free) * math.sqrt(variance / len(windows)), pauses)
     mean = float(spent.mean())
-    return Estimate(mean, max(0.0, mean - half), mean + half)
+    return EnergyEstimate(mean, max(0.0, mean - half), mean + half)
 
 
 def student_t(free: int) -> float:

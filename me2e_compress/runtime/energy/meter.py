@@ -11,12 +11,12 @@ from statistics import fmean, median
 import numpy as np
 
 from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.energy_result import EnergyResult
+from me2e_compress.runtime.energy.energy_summary import CountedBy, summarise
 from me2e_compress.runtime.energy.estimate import BEATS, Window, beat, detuning
 from me2e_compress.runtime.energy.power import SAMPLED_S, PowerSamples, in_background
 from me2e_compress.runtime.energy.reader import DeviceState, Reader
-from me2e_compress.runtime.energy.result import EnergyResult
 from me2e_compress.runtime.energy.schedule import EnergySchedule
-from me2e_compress.runtime.energy.summary import CountedBy, summarise
 
 Work = Callable[[], object]
 """Runs one frame of a model and returns when it is done, on the device too."""

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from typing import ClassVar
 
-from me2e_compress.runtime.energy.counter import EnergyCounter
+from me2e_compress.runtime.energy.energy_counter import EnergyCounter
 from me2e_compress.runtime.energy.reader import Reader
 
 

@@ -7,7 +7,7 @@ import pynvml
 import pytest
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.counter import ENERGY_COUNTERS, open_counter
+from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS, open_counter
 from me2e_compress.runtime.energy.ina3221 import Ina3221, counted
 from me2e_compress.runtime.energy.nvml import Nvml
 from me2e_compress.runtime.energy.rapl import Rapl

@@ -6,8 +6,8 @@ from itertools import groupby
 import pytest
 
 from me2e_compress.errors import EnergyError
+from me2e_compress.runtime.energy.energy_result import EnergyResult
 from me2e_compress.runtime.energy.meter import EnergyMeter
-from me2e_compress.runtime.energy.result import EnergyResult
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 from tests.runtime.energy.world import World
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from me2e_compress import documents
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.counter import EnergyCounter
+from me2e_compress.runtime.energy.energy_counter import EnergyCounter
+from me2e_compress.runtime.energy.energy_recording import EnergyRecording
 from me2e_compress.runtime.energy.power import Floats, integrated
-from me2e_compress.runtime.energy.recording import EnergyRecording
 
 _COLUMNS = "time_s, frames, and joules or watts"
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from me2e_compress.runtime.energy.energy_result import EnergyResult
 from me2e_compress.runtime.energy.estimate import Window, estimate
 from me2e_compress.runtime.energy.reader import DeviceState
-from me2e_compress.runtime.energy.result import EnergyResult
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from typing import ClassVar
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.registry import Registry, name_in
+from me2e_compress.runtime.energy.energy_recording import EnergyRecording
 from me2e_compress.runtime.energy.reader import Absent, Reader
-from me2e_compress.runtime.energy.recording import EnergyRecording
 
 __all__ = [
     "ENERGY_COUNTERS",
@@ -55,7 +55,7 @@ ENERGY_COUNTERS: Registry[EnergyCounter] = Registry(
         "nvml": f"{_HERE}.nvml:Nvml",
         "ina3221": f"{_HERE}.ina3221:Ina3221",
         "rapl": f"{_HERE}.rapl:Rapl",
-        "recorded": f"{_HERE}.recorded:Recorded",
+        "recorded": f"{_HERE}.recorded_energy:Recorded",
     },
 )
 

@@ -1,0 +1,103 @@
+"""Latencies of one model, and its joules, as they are shown."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.runtime.latency_trace import (
+    LatencyTrace,
+    Microseconds,
+    shares,
+    shares_table,
+)
+from me2e_compress.runtime.others_load import BUSY, is_busy
+from me2e_compress.workflows.result import Result, Table
+
+_SHOWN = 12
+"""Operators in a table."""
+BEYOND_P99 = 5
+"""Samples that must lie beyond the 99th percentile: with fewer, one disturbance more or
+less moves it."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ProfileResult(Result):
+    """Latencies of one model.
+
+    Attributes:
+        model: the file.
+        trace: the samples.
+        output: the trace that was written; None if none was.
+        operators_us: what each operator took, in inferences under a profiler.
+        figure: the picture that was drawn; None if none was.
+        others_cores: how many cores other processes kept busy; None: not measured.
+        cores: of the machine.
+        energy: joules, or why there are none; None: not asked for.
+        energy_output: the file they were written to; None if they were not.
+    """
+
+    model: Path
+    trace: LatencyTrace
+    output: Path | None
+    others_cores: float | None = None
+    cores: int = 1
+    operators_us: Microseconds = dataclasses.field(default_factory=dict)
+    figure: Path | None = None
+    energy: EnergyResult | None = None
+    energy_output: Path | None = None
+
+    @property
+    def headline(self) -> str:
+        """File, number of inferences, machine."""
+        return f"{self.output or self.model.name}: {self.trace.headline}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return how far the last percentile can be trusted, and the joules."""
+        energy = () if self.energy is None else (self.energy.headline,)
+        count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
+        if count >= needed:
+            return energy
+        return (
+            *energy,
+            f"p99 rests on too few samples: {count}, and {needed} are needed for"
+            f" {BEYOND_P99} beyond it (--samples {needed})",
+        )
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return whether the machine was busy, and what puts joules in doubt."""
+        energy = () if self.energy is None else self.energy.alerts()
+        if self.others_cores is None or not is_busy(self.others_cores, self.cores):
+            return energy
+        return (
+            *energy,
+            f"the machine was busy: other processes took {self.others_cores:.1f} of"
+            f" {self.cores} cores, and more than {BUSY:.0%} moves latencies; measure"
+            " again when it is idle",
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the percentiles in milliseconds, by module and operator too."""
+        whole, *modules = self.trace.tables()
+        energy = () if self.energy is None else self.energy.tables()
+        found = (dataclasses.replace(whole, title=self.headline), *modules, *energy)
+        if not self.operators_us:
+            return found
+        rest = len(self.operators_us) - _SHOWN
+        shown = shares_table("By operator, as it runs", "operator", self.operators_us)
+        note = f"{rest} more operators: --json" if rest > 0 else ""
+        return *found, dataclasses.replace(shown, rows=shown.rows[:_SHOWN], note=note)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row an inference, in their order."""
+        return [{"latency_us": sample} for sample in self.trace.samples_us]
+
+    def to_json(self) -> object:
+        """Return what the trace holds, shares, joules, how busy the machine was."""
+        return {
+            **self.trace.to_json(),
+            "modules": shares(self.trace.modules_us),
+            "operators": shares(self.operators_us),
+            "energy": None if self.energy is None else self.energy.to_json(),
+            "others_cores": self.others_cores,
+            "cores": self.cores,
+        }
