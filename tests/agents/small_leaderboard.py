@@ -133,7 +133,7 @@ class World:
             first = math.nan if self.frame == 1 else compass
             return np.array([self.acceleration, 0.0, 9.81, 0.0, 0.0, gyro, first])
         if kind == "sensor.speedometer":
-            return {"speed": self.speed}
+            return {"speed": np.float64(self.speed)}
         raise AssertionError(kind)
 
 
