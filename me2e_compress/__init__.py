@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.profile import ProfileOptions, profile
     from me2e_compress.workflows.profile_result import ProfileResult
     from me2e_compress.workflows.score import ScoreResult, score
+    from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
     from me2e_compress.workflows.search import SearchOptions, SearchResult, search
     from me2e_compress.workflows.sensitivity import (
         SensitivityOptions,
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PASSES",
+    "Bench2DriveOptions",
     "BuildOptions",
     "CalibrateOptions",
     "CalibrateResult",
@@ -144,6 +146,7 @@ _ROOMS = {
     "workflows.profile": ("ProfileOptions", "profile"),
     "workflows.profile_result": ("ProfileResult",),
     "workflows.score": ("ScoreResult", "score"),
+    "workflows.score_bench2drive": ("Bench2DriveOptions",),
     "workflows.search": ("SearchOptions", "SearchResult", "search"),
     "workflows.sensitivity": (
         "SensitivityOptions",

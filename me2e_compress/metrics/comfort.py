@@ -1,6 +1,6 @@
 """Driving comfort: the share of seconds with every variable in its range."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,6 +83,11 @@ def standing_share(episode: Episode) -> float | None:
     if not episode.frames:
         return None
     return float(1.0 - _moving(episode.frames).mean())
+
+
+def stood_most(episodes: Iterable[Episode]) -> tuple[str, ...]:
+    """Return the routes on which the ego stood for more than half of the frames."""
+    return tuple(one.route for one in episodes if (standing_share(one) or 0.0) > 0.5)
 
 
 def frame_interval_us(frames: Sequence[EgoFrame]) -> int:

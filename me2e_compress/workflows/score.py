@@ -8,15 +8,18 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.result_files import holds_records
 from me2e_compress.evaluators.highway.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import scores as metrics
+from me2e_compress.metrics.comfort import stood_most
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number, table
 from me2e_compress.workflows.score_bench2drive import (
+    STANDING,
     Bench2DriveOptions,
     RealRun,
     score_real_run,
+    some_of,
 )
 from me2e_compress.workflows.score_eer import EerOptions, EerScores, score_eer
 
@@ -133,6 +136,8 @@ def _episodes(path: Path, listener: Listener) -> tuple[tuple[Episode, ...], int]
     episodes = tuple(folder.episodes().values())
     for file, reason in folder.corrupt.items():
         listener.on_warning(f"{file}: {reason}: left out")
+    if stood := stood_most(episodes):
+        listener.on_warning(f"{path}: {STANDING}: {some_of(stood)}")
     return episodes, folder.set_size
 
 

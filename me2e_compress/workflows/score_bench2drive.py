@@ -13,7 +13,7 @@ from me2e_compress.evaluators.bench2drive.evaluator import (
 )
 from me2e_compress.evaluators.bench2drive.records import number_of
 from me2e_compress.metrics import scores as metrics
-from me2e_compress.metrics.comfort import standing_share
+from me2e_compress.metrics.comfort import stood_most
 from me2e_compress.metrics.leaderboard_scores import (
     LeaderboardScores,
     Quotients,
@@ -25,8 +25,7 @@ from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.traffic_signs import MEAN, RULES, Rules, ability_rates
 from me2e_compress.workflows.result import Table, number, table
 
-STOOD = 0.5
-"""Share of a route's frames from which on its comfort is that of standing."""
+STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"
 _NAMED = 5
 _TOLERANCE = 1e-6
 
@@ -90,35 +89,30 @@ class RealRun:
     def alerts(self, name: str) -> Iterator[str]:
         """Say what must not be overlooked, one line each."""
         found = self.collected
-        if found.foreign:
-            yield (
-                f"{name}: {len(found.foreign)} routes are not of the set "
-                f"{found.route_set}: {_some(found.foreign)}"
-            )
-        elif found.route_set is None:
-            yield f"{name}: the routes are of no set of Bench2Drive that is known"
-        if found.contradictory:
-            yield (
-                f"{name}: {len(found.contradictory)} routes were driven more than once "
-                "with different results, the lowest driving score counts: "
-                f"{_some(found.contradictory)}"
-            )
+        if found.route_set is None:
+            yield f"{name}: its routes are of no set of Bench2Drive that is known"
+        for what, routes in (
+            (f"of another set than {found.route_set}", found.foreign),
+            (
+                "driven more than once with different results, of which the lowest "
+                "driving score counts",
+                found.contradictory,
+            ),
+            (STANDING, self.stood),
+        ):
+            if routes:
+                yield f"{name}: {what}: {some_of(routes)}"
         for where, reason in list(found.broken.items())[:_NAMED]:
             yield f"{where}: {reason}: left out"
         if len(found.broken) > _NAMED:
-            yield f"{name}: {len(found.broken) - _NAMED} more are broken and left out"
+            yield f"{name}: broken and left out, too: {len(found.broken) - _NAMED}"
         yield from self._stated()
-        if self.stood:
-            yield (
-                f"{name}: the ego stood for most of {len(self.stood)} routes, which is "
-                f"comfortable: see comfort in motion: {_some(self.stood)}"
-            )
         if found.off_rate:
             route, interval_s = next(iter(found.off_rate.items()))
             yield (
-                f"{name}: {len(found.off_rate)} routes are not recorded at 20 Hz "
-                f"({route} at {1 / interval_s:.3g} Hz): their comfort does not compare "
-                "with others'"
+                f"{name}: not recorded at 20 Hz, so that comfort does not compare with "
+                f"others': {len(found.off_rate)} of {len(found.episodes)}, {route} at "
+                f"{1 / interval_s:.3g} Hz"
             )
         yield from found.notes[:_NAMED]
 
@@ -170,17 +164,17 @@ class RealRun:
                 value = found[key]
                 if value is None or not math.isclose(said, value, abs_tol=_TOLERANCE):
                     yield (
-                        f"{path}: it says {key} {said:g}, its {len(episodes)} records "
-                        f"say {number(value, 'g')}"
+                        f"{path}: it says {key} {said:g}, its records say "
+                        f"{number(value, 'g')}"
                     )
 
     def _counts(self, name: str) -> Table:
         found = self.collected
         rows = [
             ("evaluated", "", str(len(found.episodes))),
-            *((key, _some(of), str(len(of))) for key, of in self._named().items()),
+            *((key, some_of(of), str(len(of))) for key, of in self._named().items()),
             ("unfinished files", "", str(len(found.unfinished))),
-            ("broken", _some(tuple(found.broken)), str(len(found.broken))),
+            ("broken", some_of(tuple(found.broken)), str(len(found.broken))),
         ]
         route_set = found.route_set or "of no known set"
         title = f"{name}: real runs, Bench2Drive's routes {route_set}"
@@ -234,7 +228,7 @@ def score_real_run(path: Path, options: Bench2DriveOptions) -> RealRun:
         scores,
         leaderboard_scores(episodes, options.penalties, set_size),
         rules,
-        tuple(e.route for e in episodes if (standing_share(e) or 0.0) > STOOD),
+        stood_most(episodes),
     )
 
 
@@ -262,7 +256,7 @@ def _shown(quotients: Quotients, over: str) -> str:
     return number(measure.value, ".4f")
 
 
-def _some(names: Sequence[str]) -> str:
+def some_of(names: Sequence[str]) -> str:
     """Name the first of many."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return ", ".join(names[:_NAMED]) + more

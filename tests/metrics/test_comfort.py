@@ -10,6 +10,7 @@ from me2e_compress.metrics.comfort import (
     comfort_in_motion,
     smooth_frames,
     standing_share,
+    stood_most,
 )
 from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
 from tests.metrics.drives import drive, frames
@@ -165,6 +166,7 @@ def test_segments_without_motion_are_left_out_of_comfort_in_motion() -> None:
     assert comfort(mostly_still).value == 7 / 8
     assert comfort_in_motion(mostly_still).value == 1 / 2
     assert standing_share(mostly_still) == 0.75
+    assert stood_most([mostly_still, held(40, speed_mps=1.0)]) == ("r1",)
 
 
 def test_who_never_moves_has_no_comfort_in_motion() -> None:

@@ -20,6 +20,7 @@ from me2e_compress.evaluators.bench2drive.records import (
 _CHECKPOINT = b'"_checkpoint"'
 _STEP = re.compile(rb'\s*\{\s*"-?\d+"\s*:\s*\{\s*"\w+"\s*:\s*\[')
 _PARTS = (b'"angular_velocity"', b'"forward_vector"')
+_BEGUN = b"begun"
 _HEAD_BYTES = 4096
 _PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".bin"}
 
@@ -73,6 +74,9 @@ def find_files(folder: Path) -> FoundFiles:
     for path, kind in _kinds(folder):
         if kind is None:
             continue
+        if kind == _BEGUN:
+            found.broken[path] = "it ends before it says what it is"
+            continue
         if kind != _CHECKPOINT:
             found.recordings.append(path)
             continue
@@ -93,7 +97,7 @@ def _kinds(folder: Path) -> Iterator[tuple[Path, bytes | None]]:
         folders.sort()
         for name in sorted(names):
             path = Path(where, name)
-            if path.suffix.lower() not in _PICTURES and path.is_file():
+            if path.suffix.lower() not in _PICTURES and os.path.isfile(path):
                 yield path, _kind(path)
 
 
@@ -102,6 +106,8 @@ def _kind(path: Path) -> bytes | None:
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
+            if _is_begun(head) and path.suffix == ".json":
+                return _BEGUN
             if not head.lstrip().startswith(b"{"):
                 return None
             if _CHECKPOINT in head:
@@ -113,6 +119,11 @@ def _kind(path: Path) -> bytes | None:
             return _CHECKPOINT if _CHECKPOINT in file.read() else None
     except OSError:
         return None
+
+
+def _is_begun(head: bytes) -> bool:
+    """Return whether a file ends before its first key does, as a kill leaves it."""
+    return b'{"_checkpoint"'.startswith(b"".join(head.split()))
 
 
 def _read(path: Path) -> ResultFile:

@@ -148,7 +148,9 @@ def test_what_is_broken_is_named_and_the_rest_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "no results of a leaderboard below it"),
+        ("[]", "no results of a leaderboard below it"),
+        ("", "no results of a leaderboard: r.json: it ends before"),
+        ('{ "_check', "no results of a leaderboard: r.json: it ends before"),
         ('{"_checkpoint": {"rec', "no results of a leaderboard: r.json: not JSON"),
         ('{"_checkpoint": 5}', "r.json: _checkpoint: Input should be"),
         ('{"_checkpoint": {"records": []}}', "no record: r.json holds none"),
