@@ -216,3 +216,22 @@ def check_conditions_elsewhere(evaluator: str, conditions: Sequence[Condition]) 
                 f"condition {each.name}: {evaluator} has conditions of its own, in its "
                 'options: only latency = "none" goes with it'
             )
+
+
+def check_pairs(
+    pairs: Sequence[tuple[str, str]],
+    variants: Sequence[str],
+    conditions: Sequence[str],
+) -> None:
+    """Check that pairs name drives of the study.
+
+    Raises:
+        StudyError: One does not.
+    """
+    for name in (name for pair in pairs for name in pair):
+        variant, _, condition = name.partition(".")
+        if variant not in variants or condition not in conditions:
+            raise StudyError(
+                f"pair: {name!r} is no VARIANT.CONDITION; there are "
+                f"{', '.join(variants)} and {', '.join(conditions)}"
+            )

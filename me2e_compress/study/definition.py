@@ -17,6 +17,7 @@ from me2e_compress.study.condition import (
     Condition,
     check_conditions,
     check_conditions_elsewhere,
+    check_pairs,
 )
 from me2e_compress.study.names import check_name, check_unique
 from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
@@ -116,6 +117,7 @@ class Study:
         to_record: Frames that it records itself; None takes folders.
         blocks: Which variants drive under which conditions; none is all under all.
             Under each condition the baseline drives too.
+        pairs: Drives that are held against each other, ``VARIANT.CONDITION`` of both.
         report: What is made of the results: a comparison, or the paper's tables, one
             a block.
         evaluator: What drives: ``highway``, or another by its name and options, which
@@ -140,6 +142,7 @@ class Study:
     provider: Provider = CPU
     to_record: FramesToRecord | None = None
     blocks: tuple[Block, ...] = ()
+    pairs: tuple[tuple[str, str], ...] = ()
     report: Literal["comparison", "paper"] = "comparison"
     evaluator: str = HIGHWAY
 
@@ -154,6 +157,7 @@ class Study:
                 f" {', '.join(names)}"
             )
         check_conditions(self.conditions, names)
+        check_pairs(self.pairs, names, [each.name for each in self.conditions])
         if self.elsewhere:
             self._check_elsewhere()
         elif not self.routes:

@@ -114,6 +114,11 @@ class _Block(_Table):
     conditions: list[str]
 
 
+class _Pair(_Table):
+    of: str
+    against: str
+
+
 class _Record(_Table):
     frames: int
     held_out: int
@@ -137,6 +142,7 @@ class _Study(_Table):
     """Files written before variants had their name say ``[[scheme]]``."""
     condition: list[_Condition]
     block: list[_Block] = Field(default_factory=list)
+    pair: list[_Pair] = Field(default_factory=list)
 
 
 _KINDS: dict[object, type[_Table]] = {
@@ -145,6 +151,7 @@ _KINDS: dict[object, type[_Table]] = {
     "condition": _Condition,
     "latency": _Latency,
     "block": _Block,
+    "pair": _Pair,
     "record": _Record,
 }
 
@@ -192,6 +199,7 @@ class _Reader:
                 Block(each.name, tuple(each.variants), tuple(each.conditions))
                 for each in table.block
             ),
+            pairs=tuple((each.of, each.against) for each in table.pair),
             report=table.report,
         )
 

@@ -8,6 +8,7 @@ from typing import Any
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.providers import PROVIDERS
+from me2e_compress.study.changes import Change, changes, held_against
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drives import Drive
@@ -167,6 +168,17 @@ class StudyResult(Result):
         """Return the drives under one condition."""
         return tuple(each for each in self.drives if each.condition == condition.name)
 
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """What the change of a condition costs each variant."""
+        study = self.study
+        return changes(study.conditions, self.drives, study.baseline, study.seed)
+
+    @property
+    def pairs(self) -> tuple[Change, ...]:
+        """The drives that the study holds against each other."""
+        return held_against(self.study.pairs, self.drives, self.study.seed)
+
     def variant(self, name: str) -> VariantOutcome:
         """Return a variant by its name."""
         return next(each for each in self.variants if each.name == name)
@@ -192,6 +204,8 @@ class StudyResult(Result):
             },
             "schemes": [each.to_json() for each in self.variants],
             "drives": [each.to_json() for each in self.drives],
+            "changes": [each.to_json() for each in self.changes],
+            "pairs": [each.to_json() for each in self.pairs],
             "machine": self.machine,
             "versions": dict(self.versions),
         }

@@ -13,6 +13,7 @@ from me2e_compress.study.plan_fidelity import EXACT
 from me2e_compress.workflows.result import Cell, Table
 
 if TYPE_CHECKING:
+    from me2e_compress.study.changes import Change
     from me2e_compress.study.outcome import StudyResult, VariantOutcome
 
 MISSING = "\N{EN DASH}"
@@ -141,7 +142,56 @@ def _abilities(
 def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
     """Every table of a study, in the order of reading."""
     compared = [differences(outcome)] if len(outcome.variants) > 1 else []
-    return (*scoreboards(outcome), *compared, *abilities(outcome))
+    return (
+        *scoreboards(outcome),
+        *compared,
+        *change_tables(outcome),
+        *abilities(outcome),
+    )
+
+
+def change_tables(outcome: "StudyResult") -> tuple[Table, ...]:
+    """Show what changes of conditions cost, and pairs of drives; none, if none."""
+    baseline = outcome.study.baseline
+    found = outcome.changes, outcome.pairs
+    titles = (
+        f"One change, the same routes and seeds; more than it costs {baseline}?",
+        "Pairs of drives on the same routes",
+    )
+    note = (
+        "The first drive minus the second, mean over routes with its 95 % interval: one"
+        " that holds zero shows no difference."
+    )
+    further = (
+        f" Beyond: minus {baseline}'s own difference, route by route; below zero where"
+        " the change costs more than it."
+    )
+    columns = ("drive", "against", "DS, points", "DS, other types", "SR, points")
+    return tuple(
+        Table(
+            title,
+            (*columns, "DS beyond", "SR beyond")[: len(columns) + 2 * beyond],
+            tuple(_change(each, beyond=beyond) for each in rows),
+            note + further if beyond else note,
+        )
+        for title, rows, beyond in zip(titles, found, (True, False), strict=True)
+        if rows
+    )
+
+
+def _change(change: "Change", *, beyond: bool) -> tuple[Cell, ...]:
+    score = change.driving_score
+    cells = (
+        Cell(change.drive),
+        Cell(change.against),
+        estimate_cell(score, signed=True),
+        between_cell(score.anew_low, score.anew_high, "+.1f"),
+        estimate_cell(change.success_rate, signed=True),
+    )
+    own = Cell(MISSING, reason="the baseline itself")
+    rest = (change.beyond_driving_score, change.beyond_success_rate)
+    shown = (own if each is None else estimate_cell(each, signed=True) for each in rest)
+    return (*cells, *shown) if beyond else cells
 
 
 def _scores(drive: Drive) -> tuple[Cell, ...]:

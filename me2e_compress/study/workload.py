@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.driving.latency_source import DecisionFacts
-from me2e_compress.driving.realtime import skipped_decisions
+from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
 from me2e_compress.evaluators.highway.conditions import step_us
 from me2e_compress.evaluators.highway.durations import EXPERT_S
 from me2e_compress.simulator.routes import Route
@@ -157,12 +157,15 @@ def held_frames(study: Study, condition: Condition) -> int:
     """Return how many frames a decision is held: n + 1 of equation 4.
 
     Frames are the condition's steps. Under a trace, or a mean of one, it is that of the
-    baseline's median on the device, so far as the study says it.
+    baseline's median on the device, so far as the study says it; nobody is in view.
     """
+    if condition.latency_model == LatencyModel.FIFO:
+        return 1
     latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
     if not condition.mean_of:
         source = condition.source(study.seed).with_trace((latency_us,), 1.0)
-        latency_us = source.on_route("")(DecisionFacts(latency_us))
+        nobody = DecisionFacts(latency_us, np.empty((0, 2)))
+        latency_us = source.on_route("")(nobody)
     return skipped_decisions(latency_us, step_us(condition.dt_ms)) + 1
 
 

@@ -15,7 +15,12 @@ from me2e_compress.study.report.figures import forest, pareto
 from me2e_compress.study.report.findings import findings
 from me2e_compress.study.route_outcomes import RouteOutcome
 from me2e_compress.study.side_by_side import Contrast
-from me2e_compress.study.tables import abilities, differences, scoreboards
+from me2e_compress.study.tables import (
+    abilities,
+    change_tables,
+    differences,
+    scoreboards,
+)
 
 TEMPLATE = "report.html"
 WORDS = {
@@ -77,6 +82,7 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
         scoreboards=scoreboards(outcome),
         curves=_markup(curves(outcome)),
         differences=differences(outcome) if len(outcome.variants) > 1 else None,
+        changes=change_tables(outcome),
         forest=_markup(forest(outcome)),
         fronts=[
             (each.name, _markup(drawn))

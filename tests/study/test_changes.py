@@ -1,0 +1,110 @@
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.errors import StudyError
+from me2e_compress.study import Condition, Study, load_study
+from me2e_compress.study.changes import changes, held_against
+from me2e_compress.study.drives import Drive
+from me2e_compress.study.file import STUDIES
+from me2e_compress.study.route_outcomes import RouteOutcome
+from me2e_compress.study.tables import change_tables
+from tests.study.conftest import IDEAL, Make
+
+FOG = Condition("fog", "none", against="ideal")
+CONDITIONS = (IDEAL, FOG)
+
+
+def drive(variant: str, condition: str, scores: Sequence[float]) -> Drive:
+    routes = tuple(
+        RouteOutcome(f"r{n}", f"type{n // 2}", score, score == 100.0, "", (), 1)
+        for n, score in enumerate(scores)
+    )
+    return Drive(variant, condition, None, routes=routes)
+
+
+DRIVES = (
+    drive("float", "ideal", [100, 100, 100, 60]),
+    drive("int8", "ideal", [100, 100, 80, 60]),
+    drive("float", "fog", [100, 90, 100, 60]),
+    drive("int8", "fog", [60, 90, 80, 20]),
+)
+
+
+def test_a_change_is_held_against_the_same_routes_without_it() -> None:
+    float_, int8 = changes(CONDITIONS, DRIVES, "float", 0)
+
+    assert (float_.drive, float_.against) == ("float.fog", "float.ideal")
+    assert float_.driving_score.value == pytest.approx(-2.5)
+    assert float_.success_rate.value == pytest.approx(-25.0)
+    assert float_.beyond_driving_score is None
+    assert int8.driving_score.value == pytest.approx((-40 - 10 - 40) / 4)
+
+
+def test_int8_loses_more_is_a_difference_of_differences() -> None:
+    _, int8 = changes(CONDITIONS, DRIVES, "float", 0)
+
+    found = int8.beyond_driving_score
+    assert found is not None
+    assert found.value == pytest.approx((-40 + 0 + 0 - 40) / 4)
+    assert found.low is not None
+    assert found.high is not None
+    assert found.low < -20.0 < found.high
+    assert found.n == 4
+
+
+def test_what_was_not_driven_is_left_out() -> None:
+    missing = Drive("int8", "fog", None, reason="it failed")
+
+    assert len(changes(CONDITIONS, (*DRIVES[:3], missing), "float", 0)) == 1
+    assert held_against([("int8.fog", "float.ideal")], DRIVES[:3], 0) == ()
+
+
+def test_a_pair_crosses_variants_and_conditions() -> None:
+    [pair] = held_against([("int8.fog", "float.ideal")], DRIVES, 0)
+
+    assert pair.driving_score.value == pytest.approx((-40 - 10 - 20 - 40) / 4)
+    assert pair.to_json()["beyond_baseline"]["driving_score"] is None
+
+
+def test_a_pair_of_nothing_is_refused(make: Make) -> None:
+    with pytest.raises(StudyError, match=r"pair: 'slow.fog' is no VARIANT.CONDITION"):
+        make(pairs=(("slow.ideal", "slow.fog"),))
+
+
+def test_tables_of_changes_and_pairs(make: Make) -> None:
+    class Outcome:
+        """A study's outcome, so far as these tables read it."""
+
+        study: Study = make(conditions=(IDEAL, FOG), baseline="slow")
+        changes = changes(CONDITIONS, DRIVES, "float", 0)
+        pairs = held_against([("int8.fog", "float.ideal")], DRIVES, 0)
+
+    one, other = change_tables(Outcome())  # type: ignore[arg-type]
+
+    assert one.columns[-2:] == ("DS beyond", "SR beyond")
+    assert [len(row) for row in one.rows] == [7, 7]
+    assert one.rows[0][5].reason == "the baseline itself"
+    assert [len(row) for row in other.rows] == [5]
+
+
+@pytest.mark.parametrize("name", ["tail", "shifts"])
+def test_a_study_that_ships_is_whole(name: str) -> None:
+    study = load_study(STUDIES / f"{name}.toml", "2")
+
+    assert study.pairs or any(each.against for each in study.conditions)
+
+
+def test_pairs_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text("""
+    title = "t"
+    baseline = "blind"
+    routes = 2
+    variant = [{name = "blind", policy = "blind"}]
+    condition = [{name = "a", latency = "none"}, {name = "b", latency = "fps:4"}]
+    pair = [{of = "blind.b", against = "blind.a"}]
+    """)
+
+    assert load_study(path).pairs == (("blind.b", "blind.a"),)
