@@ -53,10 +53,6 @@ def summarise(
     frames = sum(each.frames for each in windows)
     frame_s = sum(each.taken_s - each.paused_s for each in windows) / frames
     warmth = [e.temperature_c for e in states if e.temperature_c is not None]
-    clocks: dict[str, list[float]] = {}
-    for state in states:
-        for name, mhz in state.clocks_mhz.items():
-            clocks.setdefault(name, []).append(mhz)
     throttled = dict.fromkeys(reason for each in states for reason in each.throttled)
     return EnergyResult(
         joules=sum(each.joules for each in windows),
@@ -73,7 +69,7 @@ def summarise(
         counter_step_s=by.step_s,
         idle_w=idle_w,
         temperature=(warmth[0], warmth[-1]) if warmth else None,
-        clocks={name: (min(seen), max(seen)) for name, seen in clocks.items()},
+        clocks=_clocks(states),
         throttled=tuple(throttled),
         device=by.device,
         scope=by.scope,
@@ -81,3 +77,12 @@ def summarise(
         power_j_per_frame=power_j_per_frame,
         warnings=warnings,
     )
+
+
+def _clocks(states: Sequence[DeviceState]) -> dict[str, tuple[float, float]]:
+    """Return the lowest and the highest of each clock, MHz."""
+    seen: dict[str, list[float]] = {}
+    for state in states:
+        for name, mhz in state.clocks_mhz.items():
+            seen.setdefault(name, []).append(mhz)
+    return {name: (min(each), max(each)) for name, each in seen.items()}

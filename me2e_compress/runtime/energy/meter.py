@@ -14,7 +14,12 @@ from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_result import EnergyResult
 from me2e_compress.runtime.energy.energy_summary import CountedBy, summarise
 from me2e_compress.runtime.energy.estimate import BEATS, Window, beat, detuning
-from me2e_compress.runtime.energy.power import SAMPLED_S, PowerSamples, in_background
+from me2e_compress.runtime.energy.power import (
+    FEWEST_SAMPLES,
+    SAMPLED_S,
+    PowerSamples,
+    in_background,
+)
 from me2e_compress.runtime.energy.reader import DeviceState, Reader
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 
@@ -112,10 +117,6 @@ class EnergyMeter:
         self, spans: Sequence[_Span], step_s: float, idle_w: float, frame_s: float
     ) -> EnergyResult:
         reader, frames = self._reader, spans[0].frames
-        by_power = None
-        if reader.counts and reader.tells_power:
-            joules = sum(self._power.joules(each.begin_s, each.end_s) for each in spans)
-            by_power = joules / sum(each.frames for each in spans)
         pause = detuning(frame_s, frames, step_s)
         left = beat(frame_s + pause, frames, step_s)
         warnings = (
@@ -127,9 +128,18 @@ class EnergyMeter:
             CountedBy(reader.counter, reader.device, reader.scope, step_s),
             idle_w,
             states=[state for each in spans for state in each.states],
-            power_j_per_frame=by_power,
+            power_j_per_frame=self._by_power(spans),
             warnings=warnings if left > BEATS else (),
         )
+
+    def _by_power(self, spans: Sequence[_Span]) -> float | None:
+        """Return joules a frame beside the counter; None: it was read too seldom."""
+        ends = [(each.begin_s, each.end_s) for each in spans]
+        fewest = min(self._power.count(*each) for each in ends)
+        if not self._reader.counts or fewest < FEWEST_SAMPLES:
+            return None
+        joules = sum(self._power.joules(*each) for each in ends)
+        return joules / sum(each.frames for each in spans)
 
     def _window(self, span: _Span) -> Window:
         joules = span.joules

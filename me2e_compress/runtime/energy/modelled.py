@@ -153,29 +153,19 @@ def modelled_energy(
         EnergyError: No such process.
     """
     costs = costs_of(process)
-    count, seen = graph.macs_counter(model), set[str]()
-    found, unknown = list[_Traffic](), 0
-    for node in model.graph.all_nodes():
-        macs = count(node)
-        if macs == 0:
-            continue
-        traffic = None if macs is None else _traffic(node, macs, module_of(node), seen)
-        if traffic is None:
-            unknown += 1
-        else:
-            found.append(traffic)
+    found, unknown = _multiplying(model, module_of)
     by_module: defaultdict[str, float] = defaultdict(float)
-    macs_of: defaultdict[str, int] = defaultdict(int)
+    macs: defaultdict[str, int] = defaultdict(int)
     for each in found:
         by_module[each.module] += _mac_j(each, costs) + _memory_j(each, costs)
-        macs_of[each.number] += each.macs
+        macs[each.number] += each.macs
     mac_j = sum(_mac_j(each, costs) for each in found)
     memory_j = sum(_memory_j(each, costs) for each in found)
     return ModelledEnergy(
         mac_j + memory_j if found or not unknown else None,
         mac_j,
         memory_j,
-        dict(macs_of),
+        dict(macs),
         sum(each.weight_bytes for each in found),
         sum(each.activation_bytes for each in found),
         dict(by_module),
@@ -203,6 +193,20 @@ def _mac_j(each: _Traffic, costs: EnergyCosts) -> float:
 
 def _memory_j(each: _Traffic, costs: EnergyCosts) -> float:
     return (each.weight_bytes + each.activation_bytes) * costs.byte_pj * 1e-12
+
+
+def _multiplying(
+    model: ir.Model, module_of: Callable[[ir.Node], str]
+) -> tuple[list[_Traffic], int]:
+    """Weigh the nodes that multiply; count those of which nobody knows."""
+    count, seen = graph.macs_counter(model), set[str]()
+    weighed = [
+        None if macs is None else _traffic(node, macs, module_of(node), seen)
+        for node in model.graph.all_nodes()
+        if (macs := count(node)) != 0
+    ]
+    found = [each for each in weighed if each is not None]
+    return found, len(weighed) - len(found)
 
 
 def _traffic(node: ir.Node, macs: int, module: str, seen: set[str]) -> _Traffic | None:

@@ -14,7 +14,7 @@ Floats = npt.NDArray[np.float64]
 
 SAMPLED_S = 0.02
 """Power is read so often: five times within a usual step of 0.1 s."""
-_FEWEST = 20
+FEWEST_SAMPLES = 20
 """Samples of a window; with fewer, its integral tells nothing of it."""
 
 
@@ -34,6 +34,10 @@ class PowerSamples:
         """Read the power once."""
         self._taken.append((self._clock(), self._reader.watts()))
 
+    def count(self, begin_s: float, end_s: float) -> int:
+        """Count the readings from one time to another."""
+        return sum(begin_s <= each <= end_s for each, _ in self._taken)
+
     def joules(self, begin_s: float, end_s: float) -> float:
         """Return the energy from one time to another.
 
@@ -41,12 +45,12 @@ class PowerSamples:
             EnergyError: The power was read too seldom between them.
         """
         times, watts = np.array(self._taken or [(0.0, 0.0)]).T
-        count = int(np.sum((times >= begin_s) & (times <= end_s)))
-        if count < _FEWEST:
+        count = self.count(begin_s, end_s)
+        if count < FEWEST_SAMPLES:
             raise EnergyError(
                 f"{self._reader.counter} of {self._reader.device}: power was read"
-                f" {count} times in {end_s - begin_s:.1f} s, at least {_FEWEST} are"
-                " needed"
+                f" {count} times in {end_s - begin_s:.1f} s, at least {FEWEST_SAMPLES}"
+                " are needed"
             )
         so_far = integrated(times, watts)
         return float(

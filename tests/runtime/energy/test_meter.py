@@ -88,10 +88,8 @@ def test_power_stands_beside_the_counter(factor: float, alerts: int) -> None:
     assert len(found.alerts()) == alerts
 
 
-def test_power_that_cannot_be_read_often_enough_is_an_error() -> None:
-    world = World(tells_power=True)
-    world.counts = False
-    slow = EnergyMeter(
+def seldom(world: World) -> EnergyMeter:
+    return EnergyMeter(
         world,
         SCHEDULE,
         clock=world.clock,
@@ -99,8 +97,21 @@ def test_power_that_cannot_be_read_often_enough_is_an_error() -> None:
         every=lambda period, call: world.every(10 * period, call),
     )
 
+
+def test_power_alone_that_is_read_too_seldom_is_an_error() -> None:
+    world = World(tells_power=True)
+    world.counts = False
+
     with pytest.raises(EnergyError, match="power was read 10 times"):
-        slow.measure({"m": world.model("m", 0.03, 300)})
+        seldom(world).measure({"m": world.model("m", 0.03, 300)})
+
+
+def test_power_that_is_read_too_seldom_spoils_no_counter() -> None:
+    world = World(tells_power=True)
+    found = seldom(world).measure({"m": world.model("m", 0.03, 300)})["m"]
+
+    assert found.j_per_frame == pytest.approx(9.0, rel=0.03)
+    assert found.power_j_per_frame is None
 
 
 def test_frames_that_keep_step_with_the_counter_are_held_up() -> None:
