@@ -22,6 +22,7 @@ def run_and_report(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     records: Path | None = None,
+    weigh: Path | None = None,
     *,
     force: bool = False,
 ) -> tuple[StudyResult | PaperResult, tuple[Path, ...]]:
@@ -35,6 +36,7 @@ def run_and_report(
         listener: Is called with progress and warnings.
         records: Folder of finished drives that the paper's tables are made of, and
             nothing is driven.
+        weigh: Folder of another stack's files, counted in the paper's table 4.
         force: Replace a report that is not as we left it, too.
 
     Returns:
@@ -45,8 +47,9 @@ def run_and_report(
         Me2eError: See `run_study` and `run_paper`.
     """
     if study.report == "comparison":
-        if records is not None:
-            raise StudyError("--records is for a study with the paper's tables")
+        if records is not None or weigh is not None:
+            option = "--weigh" if records is None else "--records"
+            raise StudyError(f"{option} is for a study with the paper's tables")
         found = run_study(study, folder, engine, listener, force=force)
         written = write_study(found, folder, command, force=force)
         return found, (written.report, written.tables, written.record)
@@ -57,5 +60,5 @@ def run_and_report(
     def land(so_far: PaperResult) -> None:
         write_paper(so_far, folder, command, force=force)
 
-    driven = run_paper(study, folder, engine, listener, land, force=force)
+    driven = run_paper(study, folder, engine, listener, land, weigh, force=force)
     return driven, write_paper(driven, folder, command, force=force)

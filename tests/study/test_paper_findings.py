@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress.errors import StudyError
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import load_study
 from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.paper.model_facts import Int8Counts, ModelFacts, weighed
 from me2e_compress.study.paper.paper_page import paper_html
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.paper_run import read_paper
@@ -124,6 +126,52 @@ def test_rates_that_equation_4_makes_one_are_one_drive(result: PaperResult) -> N
     assert rows["8"][1:4] == ["fps-10", "1", "10"]
     assert rows["3"][1:4] == ["fps-3", "5", "3.33"]
     assert rows["24"][8:] == ["40.63", "138.21", "0.33"]
+
+
+def test_modelled_energy_stands_apart_from_measured(result: PaperResult) -> None:
+    table = next(each for each in result.tables() if each.title.startswith("Table 5"))
+    at = {name: table.columns.index(name) for name in table.columns}
+    row = table.rows[0]
+
+    assert row[at["J/frame"]].reason == "not measured"
+    assert row[at["EER_AV"]].reason == "energy: not measured"
+    assert row[at["modelled mJ/frame"]].text == "4"
+    assert row[at["EER_AV, modelled"]].detail
+
+
+def test_measured_joules_are_scored_and_multiplied(result: PaperResult) -> None:
+    facts = tuple(replace(each, joules=(2.0, 1.9, 2.1)) for each in result.facts)
+    tables = {
+        each.title.split(":")[0]: each for each in replace(result, facts=facts).tables()
+    }
+
+    five, six = tables["Table 5"], tables["Table 6"]
+
+    assert five.rows[0][five.columns.index("J/frame")].text == "2"
+    assert five.rows[0][five.columns.index("EER_AV")].detail
+    assert six.rows[1][six.columns.index("J/frame x FPS")].text == "20"
+    assert six.rows[1][six.columns.index("W")].reason
+
+
+def test_what_is_int8_is_counted_beside_the_papers_counts(
+    result: PaperResult, tmp_path: Path
+) -> None:
+    vad = ModelFacts(
+        "vad-tiny full", size_bytes=59_612_069, int8=Int8Counts(162, 180, 164)
+    )
+    table = next(
+        each
+        for each in replace(result, facts=(*result.facts, vad)).tables()
+        if each.title.startswith("Table 4")
+    )
+    rows = {row[0].text: [cell.text for cell in row[1:]] for row in table.rows}
+
+    assert rows["feature-ext"][:3] == ["30", "31", "31"]
+    assert rows["feature-ext"][4:] == ["UniAD", "365", "281", "138", "257.17"]
+    ours, given = ["162", "180", "164", "59.61"], ["VAD", "194", "155", "77", "83.32"]
+    assert rows["vad-tiny full"] == [*ours, *given]
+    with pytest.raises(StudyError, match=r"none of exact, prediction, .* as \.onnx$"):
+        weighed(tmp_path)
 
 
 def test_shares_of_collisions_add_up(result: PaperResult) -> None:

@@ -20,6 +20,10 @@ Records = Annotated[
     Path | None,
     typer.Option(help="the paper's tables from finished drives: drives nothing"),
 ]
+Weigh = Annotated[
+    Path | None,
+    typer.Option(help="another stack's exact.onnx, full.onnx, ...: for table 4"),
+]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="count drives and hours, drive nothing")
 ]
@@ -31,6 +35,7 @@ def study(
     routes: Routes = None,
     tables: Tables = None,
     records: Records = None,
+    weigh: Weigh = None,
     dry_run: DryRun = False,
     provider: Provider = None,
     plugins: given.Plugins = None,
@@ -62,6 +67,7 @@ def study(
         ("--routes", routes),
         ("--tables", tables),
         ("--records", records),
+        ("--weigh", weigh),
         ("--provider", provider),
         *(("--plugins", each) for each in plugins or ()),
     ]
@@ -72,7 +78,7 @@ def study(
     with listening() as listener:
         chosen_engine = engine_of(engine, workers, address)
         found, files = run_and_report(
-            asked, output, words, chosen_engine, listener, records, force=force
+            asked, output, words, chosen_engine, listener, records, weigh, force=force
         )
     show(found, as_json)
     if not as_json:

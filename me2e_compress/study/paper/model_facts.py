@@ -12,11 +12,15 @@ from me2e_compress.errors import StudyError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.energy import EnergyResult
+from me2e_compress.runtime.energy.modelled import DEFAULT_PROCESS
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.timing import Clock
 from me2e_compress.workflows.inspect import inspect
 
 FILE = "variants.json"
+SCHEMES = ("exact", "prediction", "feature-ext", "full")
+"""Rows of table 4."""
 
 _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 
@@ -52,6 +56,11 @@ class ModelFacts:
         int8: What of it is int8; None for a file without a plan.
         latency_us: Of inferences alone, warm, on the device imagined.
         modules_us: Of inferences under a profiler, module by module, on the device.
+        modelled_j: Joules a frame by published energies of MACs and bytes: no
+            measurement.
+        joules: Measured joules a frame, and the ends of their 95 % interval; None
+            where nothing counted.
+        no_joules: Why nothing did.
         failure: Why there is no file that can drive; empty if there is one.
     """
 
@@ -64,6 +73,9 @@ class ModelFacts:
     int8: Int8Counts | None = None
     latency_us: tuple[int, ...] = ()
     modules_us: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    modelled_j: float | None = None
+    joules: tuple[float, float, float] | None = None
+    no_joules: str = "not measured"
     failure: str = ""
 
     def latency_ms(self, percent: float) -> float | None:
@@ -78,6 +90,18 @@ class ModelFacts:
         if not self.latency_us:
             return None
         return 1e6 / float(np.mean(self.latency_us))
+
+    @property
+    def of_another_stack(self) -> bool:
+        """Whether it was counted for table 4 alone: a variant's name has no space."""
+        return " " in self.variant
+
+    def with_energy(self, found: EnergyResult) -> "ModelFacts":
+        """Return it with what a counter said, or why none did."""
+        if found.j_per_frame is None:
+            return replace(self, no_joules=found.reason)
+        low, high = found.low or 0.0, found.high or found.j_per_frame
+        return replace(self, joules=(found.j_per_frame, low, high), no_joules="")
 
 
 _FACTS = TypeAdapter(tuple[ModelFacts, ...])
@@ -99,13 +123,15 @@ def facts_of(
     before = known.get(name)
     if prepared.model is None:
         return ModelFacts(name, failure=prepared.failure)
-    if before is not None and before.sha256 == prepared.sha256:
+    if before and before.modelled_j and before.sha256 == prepared.sha256:
         return (
             before
             if before.latency_us == latency_us
             else replace(before, latency_us=latency_us, modules_us={})
         )
-    found = inspect(prepared.model, prepared.variant.module_map)
+    module_map = prepared.variant.module_map
+    found = inspect(prepared.model, module_map, None, DEFAULT_PROCESS)
+    modelled = found.modelled_energy
     return ModelFacts(
         name,
         prepared.sha256,
@@ -115,6 +141,32 @@ def facts_of(
         found.macs,
         int8_counts(prepared.model),
         latency_us,
+        modelled_j=None if modelled is None else modelled.modelled_j_per_frame,
+    )
+
+
+def weighed(folder: Path) -> tuple[ModelFacts, ...]:
+    """Count the files of another stack, for table 4 alone.
+
+    Args:
+        folder: Holds ``exact.onnx``, ``prediction.onnx``, ``feature-ext.onnx`` and
+            ``full.onnx``, or some of them; its name is the stack's.
+
+    Raises:
+        StudyError: It holds none of them.
+    """
+    files = [(scheme, folder / f"{scheme}.onnx") for scheme in SCHEMES]
+    there = [(scheme, path) for scheme, path in files if path.is_file()]
+    if not there:
+        raise StudyError(f"{folder}: none of {', '.join(SCHEMES)} as .onnx")
+    return tuple(
+        ModelFacts(
+            f"{folder.resolve().name} {scheme}",
+            graph.sha256_of(path),
+            size_bytes=graph.file_bytes(path),
+            int8=int8_counts(path),
+        )
+        for scheme, path in there
     )
 
 

@@ -126,6 +126,26 @@ LATENCY_QUESTIONS = (
         lambda e: e.difference(DEVICE, CONSTANT),
         lambda _: falls,
     ),
+    Question(
+        "Spikes in critical frames cost driving score at equal mean latency",
+        "the collision optimisation takes over 150 ms where obstacles are near",
+        "DS of the driver with that stage, charged where it is called, minus the same"
+        " at its mean latency",
+        lambda e: e.difference(("optimizer", "tail"), ("optimizer", "even")),
+        lambda _: falls,
+    ),
+    Question(
+        "Without the stage it drives better at equal mean latency",
+        "DS +16.94 % without occupancy, which only triggers the stage (scheme 1)",
+        "DS without the stage at its mean latency, minus with it as it is charged",
+        lambda e: e.difference(("float", "even"), ("optimizer", "tail")),
+    ),
+    Question(
+        "Without the stage it drives better, and faster for it",
+        "the same",
+        "DS without the stage and its time, minus with both",
+        lambda e: e.difference(("float", "tail"), ("optimizer", "tail")),
+    ),
 )
 MODULE_QUESTIONS = (
     Question(

@@ -4,8 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.runtime.energy.models import measure_energy
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.blocks import Block
 from me2e_compress.study.definition import Study
@@ -18,6 +20,7 @@ from me2e_compress.study.paper.model_facts import (
     facts_of,
     load_facts,
     save_facts,
+    weighed,
 )
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
@@ -39,6 +42,7 @@ def run_paper(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     on_block: Callable[[PaperResult], None] = lambda result: None,
+    weigh: Path | None = None,
     *,
     force: bool = False,
 ) -> PaperResult:
@@ -54,6 +58,7 @@ def run_paper(
         engine: Where routes are driven; None for one process of this machine.
         listener: Is called with progress and warnings.
         on_block: Is called with all there is after each block.
+        weigh: Folder of another stack's files, counted in table 4.
         force: Replace a report that is not as we left it, too.
 
     Raises:
@@ -64,7 +69,9 @@ def run_paper(
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
-        return _run(study, folder, engine or LocalEngine(), listener, on_block)
+        others = () if weigh is None else weighed(weigh)
+        started = _begun(study, folder, engine or LocalEngine(), listener, others)
+        return _all_driven(*started, on_block)
 
 
 def read_paper(study: Study, records: str | Path) -> PaperResult:
@@ -84,9 +91,11 @@ def read_paper(study: Study, records: str | Path) -> PaperResult:
     scale = about.get("device_scale")
     if not isinstance(scale, float | int):
         raise StudyError(f"{folder / FILE}: no device_scale")
+    names = [each.name for each in study.variants]
+    weighed_too = (each for each in facts.values() if each.of_another_stack)
     return PaperResult(
         _of_these_routes(study, found, folder),
-        tuple(facts[each.name] for each in study.variants if each.name in facts),
+        (*(facts[name] for name in names if name in facts), *weighed_too),
         cells,
         {},
         float(scale),
@@ -108,21 +117,31 @@ def _of_these_routes(study: Study, found: Sequence[DriveRecord], folder: Path) -
     return replace(study, routes=routes, set_size=found[0].set_size)
 
 
-def _run(
+def _begun(
     study: Study,
     folder: Path,
     engine: Engine,
     listener: Listener,
-    on_block: Callable[[PaperResult], None],
-) -> PaperResult:
+    others: tuple[ModelFacts, ...],
+) -> tuple[DriveSetup, Sequence[PreparedVariant], PaperResult]:
+    """Make, time and weigh the models; return what drives them."""
     workspace = Workspace(folder)
     study = recorded(study, workspace, listener)
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
-    facts = _facts(study, prepared, clock, workspace, listener)
+    facts = _facts(study, prepared, clock, workspace, listener, others)
     result = PaperResult(study, facts, {}, {}, clock.scale, this_machine())
     setup = DriveSetup(study, clock, workspace, engine, listener)
-    for block in study.blocks:
+    return setup, prepared, result
+
+
+def _all_driven(
+    setup: DriveSetup,
+    prepared: Sequence[PreparedVariant],
+    result: PaperResult,
+    on_block: Callable[[PaperResult], None],
+) -> PaperResult:
+    for block in setup.study.blocks:
         result = _driven(block, setup, prepared, result)
         on_block(result)
     return result
@@ -157,6 +176,7 @@ def _facts(
     clock: Clock,
     workspace: Workspace,
     listener: Listener,
+    others: tuple[ModelFacts, ...],
 ) -> tuple[ModelFacts, ...]:
     """Weigh every variant, and profile the baseline by module, unless it is known."""
     path = workspace.folder / "records" / FILE
@@ -168,11 +188,41 @@ def _facts(
         if each.variant is study.reference and not facts.modules_us:
             facts = replace(facts, modules_us=_by_module(study, each, clock, listener))
         found.append(facts)
-    about = {"machine": this_machine(), "device_scale": clock.scale}
+    found = [*_with_joules(study, prepared, found, listener), *others]
     names = [each.variant for each in found]
-    others = [each for name, each in known.items() if name not in names]
-    save_facts(path, (*found, *others), about)
-    return tuple(found)
+    more = [each for name, each in known.items() if name not in names]
+    about = {"machine": this_machine(), "device_scale": clock.scale}
+    save_facts(path, (*found, *more), about)
+    return (*found, *(each for each in more if each.of_another_stack))
+
+
+def _with_joules(
+    study: Study,
+    prepared: Sequence[PreparedVariant],
+    found: Sequence[ModelFacts],
+    listener: Listener,
+) -> list[ModelFacts]:
+    """Measure joules a frame where a counter of this machine counts them."""
+    models = {
+        each.variant.name: each.model
+        for each, facts in zip(prepared, found, strict=True)
+        if each.model is not None and facts.joules is None
+    }
+    if study.held_out is None or not models:
+        return list(found)
+    measured = measure_energy(
+        models,
+        CalibrationSet(study.held_out),
+        threads=study.timing.threads,
+        provider=study.provider,
+        on_window=lambda done, total, name: listener.on_progress(
+            "energy", done, total, name
+        ),
+    )
+    return [
+        each.with_energy(measured[each.variant]) if each.variant in measured else each
+        for each in found
+    ]
 
 
 def _by_module(
