@@ -136,14 +136,12 @@ class EnergyResult(Displayed):
         if self.power_j_per_frame is not None:
             rows.append(("by power", f"{self.power_j_per_frame:.4g}", "", ""))
         columns = ("energy", "J/frame", "low 95 %", "high 95 %")
-        return (table("Energy", columns, rows, "\n".join(self._notes())),)
+        title = f"{self.counter} of {self.device} ({self.scope})"
+        return (table(title, columns, rows, "\n".join(self._notes())),)
 
     def _notes(self) -> list[str]:
         long = f" of {self.window_s:.1f} s" if self.window_s else ""
-        notes = [
-            f"{self.counter} of {self.device} ({self.scope}):"
-            f" {self.frames} frames in {self.windows} windows{long}"
-        ]
+        notes = [f"{self.frames} frames in {self.windows} windows{long}"]
         if self.idle_w is not None:
             notes.append(f"idle {self.idle_w:.4g} W")
         if self.temperature is not None:

@@ -70,6 +70,20 @@ def test_models_take_turns_there_and_back() -> None:
     assert found["b"].j_per_frame == pytest.approx(4.0, rel=0.03)
 
 
+def test_a_drift_falls_on_all_models_alike() -> None:
+    world = World()
+    world.drift = 0.01  # a third more at the end
+    found = meter(world).measure(
+        {"a": world.model("a", 0.03, 300), "b": world.model("b", 0.03, 150)}
+    )
+
+    a, b = found["a"], found["b"]
+    assert a.j_per_frame is not None
+    assert b.j_per_frame == pytest.approx(a.j_per_frame / 2, rel=0.02)
+    assert a.window_j_per_frame[-1] > 1.2 * a.window_j_per_frame[0]
+    assert (a.high or 0) - (a.low or 0) < 0.05 * a.j_per_frame
+
+
 def test_power_alone_is_integrated() -> None:
     world = World(tells_power=True)
     world.counts = False

@@ -15,6 +15,7 @@ class World(Reader):
         now: seconds.
         spent: joules.
         sensed: share of a step, its last part, in which the counter looks.
+        drift: share by which the power of work rises in a second.
         readings: of the counter.
     """
 
@@ -27,7 +28,7 @@ class World(Reader):
         self._shown, self._seen, self._power = 0.0, 0.0, idle_w
         self._next, self._calls = STEP_S, list[tuple[float, Callable[[], None]]]()
         self.tells_power, self.readings, self.sensed = tells_power, 0, sensed
-        self.power_factor = 1.0
+        self.power_factor, self.drift = 1.0, 0.0
         self.worked = list[tuple[str, float]]()
 
     def clock(self) -> float:
@@ -42,7 +43,7 @@ class World(Reader):
         def run() -> None:
             self.worked.append((name, self.now))
             for seconds, watts in zip(parts[::2], parts[1::2], strict=True):
-                self._pass(seconds, watts)
+                self._pass(seconds, watts * (1 + self.drift * self.now))
 
         return run
 
