@@ -87,7 +87,7 @@ class Bench:
         text = (
             "import-normalize,fold-constants,"
             f"ablate-modules{{drop=[{', '.join(modules)}], fill=means, "
-            "drop_outputs=true},eliminate-redundant,fuse-basic"
+            "drop_outputs=true},eliminate-redundant,hoist-linear,fuse-basic"
         )
         return Variant(f"minus-{'-'.join(modules)}", self.model, recipe.parse(text))
 

@@ -1,6 +1,7 @@
 """What every shipped recipe makes of VAD-tiny: size, fidelity, and does it still see.
 
     python -m benchmarks.bench_recipes [FOLDER] [--calibration 8] [--held-out 4]
+        [--only full,fused]
 
 Exports VAD-tiny and writes its frames into FOLDER (default: a scratch folder), runs
 every recipe for it from file to file, compares each result with the source on
@@ -17,7 +18,7 @@ from time import process_time
 
 from me2e_compress import graph, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.fidelity.compare import compare
+from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.reaction import plan_reaction
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compress import CompressOptions, compress
@@ -35,6 +36,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--calibration", type=int, default=8)
     parser.add_argument("--held-out", type=int, default=4)
+    parser.add_argument("--only", default=",".join(RECIPES))
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.folder or Path(scratch)
@@ -48,28 +50,28 @@ def main(argv: Sequence[str] | None = None) -> None:
             )
         )
         others = CalibrationSet(held_out)
-        print(HEAD)
-        reference = Session(source, threads=2, release=True)
-        report("source", source, reference, others, 0.0)
-        for name in RECIPES:
+        print(HEAD, flush=True)
+        opened = Session(source, threads=2, release=True)
+        reference = Reference.of(opened, others)
+        report("source", source, reference, 0.0)
+        for name in options.only.split(","):
             start = process_time()
             target = folder / f"{name}.onnx"
             unchecked = CompressOptions(module_map="vad", verify_frames=0)
             compress(source, target, name, seen, unchecked)
-            report(name, target, reference, others, process_time() - start)
+            report(name, target, reference, process_time() - start)
 
 
-def report(
-    name: str, path: Path, reference: Session, frames: CalibrationSet, cpu_s: float
-) -> None:
+def report(name: str, path: Path, reference: Reference, cpu_s: float) -> None:
     model = graph.load(path)
     weights = [value.const_value for value in model.graph.initializers.values()]
     int8 = sum(w.nbytes for w in weights if w is not None and w.dtype.name == "INT8")
     session = Session(path, threads=2, release=True)
-    found = compare(reference, session, frames)
+    found = reference.compare(session)
+    first, second, *_ = reference.frames
     ego = {item.name: item.sqnr_db for item in found.outputs}["ego_fut_preds"]
     moves = [
-        plan_reaction(session, frames[0], frames[1], image="img", camera=camera)
+        plan_reaction(session, first, second, image="img", camera=camera)
         for camera in range(CAMERAS)
     ]
     plan = found.plan
