@@ -145,6 +145,11 @@ class Adapter(BaseModel):
                 f"no output {found.output}, which the adapter names as the plan; there "
                 f"are {there}"
             )
+        if found.scores is not None and found.scores not in outputs:
+            raise EvaluationError(
+                f"no output {found.scores}, which the adapter names as the scores; "
+                f"there are {there}"
+            )
         return found
 
     def projection(self, lidar2img: Floats) -> Floats:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.session import Session, detached, replay
@@ -59,6 +60,9 @@ class Fidelity:
         plan_reason: why not; empty where it was.
         frames: how many were compared.
         plan_output: the output that holds the plan; empty where it was not measured.
+        agents: outputs that are sets of agents, matched; None where there are none.
+        same_choice: share of frames on which both choose the same candidate of a
+            scored plan; None where no scores choose it.
     """
 
     outputs: tuple[OutputFidelity, ...]
@@ -67,6 +71,8 @@ class Fidelity:
     plan_reason: str
     frames: int
     plan_output: str = ""
+    agents: SetFidelity | None = None
+    same_choice: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -129,7 +135,9 @@ def _compare(
         )
     tallies = {name: _Tally(name) for name in shared}
     adapter, reason = _common_adapter(a, b)
-    moved: list[Float64] = []
+    named = SetOutputs.of(a.metadata, {name: a.outputs[name].shape for name in shared})
+    sets = None if named is None else SetTally(named)
+    moved, chosen = list[Float64](), list[bool]()
     count = 0
     there, along = itertools.tee(frames)
     runs = zip(answers, replay(b, there, shared), along, strict=True)
@@ -139,6 +147,10 @@ def _compare(
         if adapter is not None:
             gap = adapter.plan(left, frame.arrays) - adapter.plan(right, frame.arrays)
             moved.append(np.linalg.norm(gap, axis=1))
+            if adapter.scores is not None:
+                chosen.append(adapter.choice(left) == adapter.choice(right))
+        if sets is not None:
+            sets.add(left, right)
         count += 1
     if not count:
         raise EvaluationError("no frames to compare on")
@@ -149,6 +161,8 @@ def _compare(
         reason,
         count,
         adapter.output if adapter is not None and moved else "",
+        None if sets is None else sets.result(),
+        float(np.mean(chosen)) if chosen else None,
     )
 
 
@@ -159,8 +173,9 @@ def _common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
     shape = a.outputs[adapter.output].shape
     if PLAN not in a.metadata and (len(shape) not in (3, 4) or shape[-1] != 2):
         return None, f"{adapter.output} is {list(shape)}, a plan is [1, n, 2]"
-    if adapter.output not in b.outputs:
-        return None, f"the second model has no output {adapter.output}"
+    for needed in (adapter.output, adapter.scores):
+        if needed is not None and needed not in b.outputs:
+            return None, f"the second model has no output {needed}"
     return adapter, ""
 
 

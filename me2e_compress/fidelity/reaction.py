@@ -33,10 +33,11 @@ def plan_reaction(
     if adapter is None:
         raise EvaluationError("the model does not say which output is its plan")
     changed = {**frame.arrays, image: _exchanged(frame, other, image, camera)}
+    needed = [adapter.output, *([adapter.scores] if adapter.scores else [])]
     plans = [
         adapter.plan(values, arrays)
         for arrays in (frame.arrays, changed)
-        for values in replay(session, [Frame(0, True, arrays)], [adapter.output])
+        for values in replay(session, [Frame(0, True, arrays)], needed)
     ]
     length = float(np.linalg.norm(plans[0]))
     gap = float(np.linalg.norm(plans[1] - plans[0]))

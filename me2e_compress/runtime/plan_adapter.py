@@ -27,6 +27,8 @@ class PlanAdapter(pydantic.BaseModel):
         deltas: True where it holds steps from waypoint to waypoint, not positions.
         command_input: the input whose first element picks the mode.
         default_mode: the mode where no input picks one.
+        scores: the output [1, modes] whose largest value picks the mode; not with
+            ``command_input``.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -35,6 +37,13 @@ class PlanAdapter(pydantic.BaseModel):
     deltas: bool = False
     command_input: str | None = None
     default_mode: int = 0
+    scores: str | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _one_choice(self) -> Self:
+        if self.scores is not None and self.command_input is not None:
+            raise ValueError("scores and command_input both pick the mode")
+        return self
 
     @classmethod
     def of(cls, metadata: Mapping[str, str], outputs: Sequence[str]) -> Self | None:
@@ -56,11 +65,12 @@ class PlanAdapter(pydantic.BaseModel):
             raise GraphError(
                 f"metadata {PLAN} is not a plan adapter: {first}"
             ) from error
-        if found.output not in outputs:
-            raise GraphError(
-                f"metadata {PLAN} names output {found.output}; there is"
-                f" {', '.join(outputs)}"
-            )
+        for named in (found.output, found.scores):
+            if named is not None and named not in outputs:
+                raise GraphError(
+                    f"metadata {PLAN} names output {named}; there is"
+                    f" {', '.join(outputs)}"
+                )
         return found
 
     def plan(self, outputs: Arrays, inputs: Arrays) -> npt.NDArray[np.float64]:
@@ -71,7 +81,7 @@ class PlanAdapter(pydantic.BaseModel):
         """
         value = np.asarray(outputs[self.output], np.float64)
         if value.ndim == 4:
-            mode = self._mode(inputs)
+            mode = self._mode(inputs) if self.scores is None else self.choice(outputs)
             if not 0 <= mode < value.shape[1]:
                 raise GraphError(
                     f"mode {mode} of {self.output}: it has {value.shape[1]} modes"
@@ -83,6 +93,16 @@ class PlanAdapter(pydantic.BaseModel):
             )
         points: npt.NDArray[np.float64] = value[0]
         return np.cumsum(points, axis=0) if self.deltas else points
+
+    def choice(self, outputs: Arrays) -> int:
+        """Return the mode that the scores pick: their largest, the first of equals.
+
+        Raises:
+            GraphError: no output of scores is named.
+        """
+        if self.scores is None:
+            raise GraphError(f"nothing names the scores of {self.output}")
+        return int(np.argmax(np.asarray(outputs[self.scores], np.float64)[0]))
 
     def _mode(self, inputs: Arrays) -> int:
         if self.command_input is None or self.command_input not in inputs:

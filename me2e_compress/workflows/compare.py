@@ -7,6 +7,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.compare import compare as measure
+from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
@@ -36,10 +37,13 @@ class CompareResult(Result):
         found = self.fidelity
         if found.plan is None:
             return f"plan displacement: not measured ({found.plan_reason})"
-        return (
+        said = (
             f"plan displacement: mean {found.plan.mean_m:.4f} m, largest"
             f" {found.plan.max_m:.4f} m over {found.frames} frames"
         )
+        if found.same_choice is None:
+            return said
+        return f"{said}; the same candidate on {found.same_choice:.1%} of them"
 
     def tables(self) -> tuple[Table, ...]:
         """Return signal to noise and largest error of every output."""
@@ -49,7 +53,8 @@ class CompareResult(Result):
             *((name, "removed", "") for name in found.missing),
         ]
         title = f"Fidelity over {found.frames} frames"
-        return (table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows),)
+        outputs = table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows)
+        return (outputs, *(() if found.agents is None else (_agents(found.agents),)))
 
     def records(self) -> list[dict[str, object]]:
         """Return a row an output."""
@@ -58,6 +63,21 @@ class CompareResult(Result):
     def to_json(self) -> object:
         """Return outputs, missing outputs, plan and number of frames."""
         return self.fidelity
+
+
+def _agents(found: SetFidelity) -> Table:
+    rows = [(name, f"{decibels:.1f}") for name, decibels in found.sqnr_db.items()]
+    away = (
+        "" if found.centre_m is None else f", {found.centre_m:.2f} m apart on average"
+    )
+    return table(
+        "Sure agents, each against the nearest, not slot by slot",
+        ("output", "SQNR dB"),
+        rows,
+        f"Of {found.agents} that the first is sure of (score 0.5), {found.found} have "
+        f"one of the second within 2 m{away}; it is sure of {found.kept} of them, and "
+        f"of {found.added} where the first has none.",
+    )
 
 
 def compare(

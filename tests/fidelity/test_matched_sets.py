@@ -1,0 +1,176 @@
+"""Agents in another order are the same agents; others are lost, or new."""
+
+import json
+import math
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.errors import GraphError
+from me2e_compress.fidelity.compare import compare
+from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.session import Session
+
+Frames = dict[str, np.ndarray]
+
+BOXES = np.array([[10.0, 0, 4, 2], [20, 3, 4, 2], [5, -4, 4, 2], [90, 9, 4, 2]])
+SCORES = np.array([0.9, 0.8, 0.7, 0.1])
+SHAPES = {"boxes": (1, 4, 4), "scores": (1, 4), "futures": (1, 4, 3, 6, 2)}
+
+SWAPPED = """
+<ir_version: 9, opset_import: ["" : 17]>
+tracker (float[1,2,3] x, float[1,2] s) => (float[1,2,3] boxes, float[1,2] scores)
+<int64[2] order = {%s}> {
+    boxes = Gather <axis = 1> (x, order)
+    scores = Gather <axis = 1> (s, order)
+}
+"""
+
+SCORED = """
+<ir_version: 9, opset_import: ["" : 17]>
+chooser (float[1,2,6,2] x, float[1,2] s) => (float[1,2,6,2] plans, float[1,2] votes)
+<float bias = {%s}> {
+    plans = Identity(x)
+    votes = Pow(s, bias)
+}
+"""
+
+
+def outputs(boxes: np.ndarray, scores: np.ndarray) -> Frames:
+    return {"boxes": boxes[None], "scores": scores[None]}
+
+
+def matched(left: Frames, right: Frames) -> SetFidelity:
+    tally = SetTally(SetOutputs(others=()))
+    tally.add(left, right)
+    return tally.result()
+
+
+@pytest.mark.parametrize("order", [[3, 2, 1, 0], [1, 0, 2, 3], [2, 3, 0, 1]])
+def test_the_order_does_not_matter(order: list[int]) -> None:
+    found = matched(outputs(BOXES, SCORES), outputs(BOXES[order], SCORES[order]))
+
+    assert (found.agents, found.found, found.kept, found.added) == (3, 3, 3, 0)
+    assert found.centre_m == 0.0
+    assert found.sqnr_db == {"boxes": math.inf, "scores": math.inf}
+
+
+def test_an_agent_that_moved_a_metre() -> None:
+    moved = BOXES.copy()
+    moved[0, 1] += 1.0
+
+    found = matched(outputs(BOXES, SCORES), outputs(moved[::-1], SCORES[::-1]))
+
+    assert found.centre_m == pytest.approx(1 / 3)
+    signal = float((BOXES[:3] ** 2).sum())
+    assert found.sqnr_db["boxes"] == pytest.approx(10 * math.log10(signal))
+
+
+def test_agents_that_are_lost_doubted_or_new() -> None:
+    other = BOXES.copy()
+    other[0, 0] = 40.0  # the first went, and stands where nobody was
+    scores = np.array([0.9, 0.4, 0.7, 0.1])  # the second is doubted
+
+    found = matched(outputs(BOXES, SCORES), outputs(other, scores))
+
+    assert (found.agents, found.found, found.kept, found.added) == (3, 2, 1, 1)
+
+
+def test_nobody_is_sure_of_anybody() -> None:
+    found = matched(outputs(BOXES, SCORES / 10), outputs(BOXES, SCORES / 10))
+
+    assert found == SetFidelity(0, 0, 0, 0, None, {})
+
+
+def test_a_detector_that_sorts_otherwise_is_the_same() -> None:
+    frame = Frame(
+        0,
+        starts_scene=True,
+        arrays={
+            "x": np.array([[[1, 2, 3], [9, 8, 7]]], np.float32),
+            "s": np.array([[0.9, 0.8]], np.float32),
+        },
+    )
+    one, other = (Session(ir.from_onnx_text(SWAPPED % o)) for o in ("0, 1", "1, 0"))
+
+    found = compare(one, other, [frame])
+
+    assert found.outputs[0].sqnr_db < 6.0
+    assert found.agents is not None
+    assert found.agents.sqnr_db["boxes"] == math.inf
+
+
+def test_the_outputs_are_named_in_the_metadata() -> None:
+    named = json.dumps({"boxes": "tracks", "scores": "sure", "others": []})
+    shapes = {"tracks": (1, 9, 7), "sure": (1, 9)}
+
+    found = SetOutputs.of({"me2e.sets": named}, shapes)
+
+    assert found == SetOutputs(boxes="tracks", scores="sure", others=())
+
+
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        {"boxes": (1, 4, 4)},
+        {"boxes": (1, 4, 4), "scores": (1, 5)},
+        {"boxes": (4, 4), "scores": (4,)},
+    ],
+)
+def test_outputs_of_another_form_are_no_set(shapes: dict[str, tuple[int, ...]]) -> None:
+    assert SetOutputs.of({}, shapes) is None
+
+
+def test_only_outputs_with_a_row_an_agent_belong_to_it() -> None:
+    found = SetOutputs.of({}, SHAPES)
+    assert found == SetOutputs()
+
+    found = SetOutputs.of({}, {**SHAPES, "futures": (1, 9, 3)})
+    assert found == SetOutputs(others=())
+
+
+def test_metadata_that_is_no_set_is_named() -> None:
+    with pytest.raises(GraphError, match=r"me2e\.sets names no outputs"):
+        SetOutputs.of({"me2e.sets": '{"box": 1}'}, SHAPES)
+
+
+def chooser(bias: float) -> Session:
+    model = ir.from_onnx_text(SCORED % bias)
+    model.metadata_props["me2e.plan"] = json.dumps(
+        {"output": "plans", "scores": "votes"}
+    )
+    return Session(model)
+
+
+def votes(first: float, second: float) -> Frame:
+    x = np.stack([np.zeros((6, 2)), np.ones((6, 2))])[None]
+    scores = np.array([[first, second]], np.float32)
+    return Frame(0, starts_scene=True, arrays={"x": x.astype(np.float32), "s": scores})
+
+
+def test_a_scored_plan_is_compared_by_the_candidate_that_is_chosen() -> None:
+    # a power of -1 turns the order of the votes round, but for equal ones
+    frames = [votes(0.5, 0.9), votes(0.9, 0.5), votes(0.7, 0.7), votes(0.2, 0.4)]
+
+    found = compare(chooser(1.0), chooser(-1.0), frames)
+
+    assert found.same_choice == 0.25
+    assert found.plan is not None
+    assert found.plan.max_m == pytest.approx(math.sqrt(2.0))
+
+
+def test_scores_and_a_command_cannot_both_choose() -> None:
+    text = json.dumps({"output": "plan", "scores": "s", "command_input": "c"})
+
+    with pytest.raises(GraphError, match="not a plan adapter"):
+        PlanAdapter.of({"me2e.plan": text}, ["plan", "s"])
+
+
+def test_scores_that_are_not_there_are_named() -> None:
+    text = json.dumps({"output": "plan", "scores": "votes"})
+
+    with pytest.raises(GraphError, match="names output votes; there is plan"):
+        PlanAdapter.of({"me2e.plan": text}, ["plan"])
