@@ -4,21 +4,14 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.driving.host_stage import HOST_STAGES
-from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.evaluators.highway.conditions import (
-    Conditions,
-    latency_model_named,
-    step_us,
-)
-from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.evaluation_options import (
-    engine_of,
+    HighwayEvaluation,
     routes_named,
-    weather_of,
 )
-from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
+from me2e_compress.evaluators.highway.evaluator import DrivingProgress
 from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
 from me2e_compress.metrics.scores import Scores
@@ -211,31 +204,39 @@ def _by_another(
 def _evaluated(
     policy: str, output: Path, options: EvaluateOptions, listener: Listener
 ) -> EvaluateResult:
-    picked, set_size = routes_named(options.routes)
+    picked, _ = routes_named(options.routes)
     shown = () if options.render is None else pick_routes(picked, options.render)
     driver = driver_of(policy, options.adapter, options.provider)
     if options.host_stage:
         driver = with_stage(driver, options.host_stage)
     if isinstance(driver, OnnxDriver):
         try_file(driver.path, listener, options.provider)
-    job = _job(driver, options)
 
     def on_progress(now: DrivingProgress) -> None:
         running = f"DS {number(now.driving_score, '.1f')}"
         running += f" SR {number(now.success_rate, '.1f')} %"
         listener.on_progress("evaluate", now.done, now.total, running)
 
-    evaluator = HighwayEvaluator(
-        job,
-        picked,
+    asked = HighwayEvaluation(
+        policy,
         output,
-        set_size,
-        engine_of(options.engine, options.workers, options.address),
-        on_progress,
-        listener.on_warning,
+        routes=options.routes,
+        latency=options.latency,
+        latency_scale=options.latency_scale,
+        in_order=options.in_order,
+        latency_model=options.latency_model,
+        seed=options.seed,
+        dt_ms=options.dt_ms,
+        weather=options.weather,
+        frame_limit_s=options.frame_limit_s,
+        workers=options.workers,
+        engine=options.engine,
+        address=options.address,
     )
-    scores = score_episodes(tuple(evaluator.episodes()), set_size)
-    return EvaluateResult(policy, output, scores, _pictures(job, shown, output))
+    evaluator = asked.evaluator(on_progress, listener.on_warning, driver)
+    scores = score_episodes(tuple(evaluator.episodes()), evaluator.set_size)
+    pictures = _pictures(evaluator.job, shown, output)
+    return EvaluateResult(policy, output, scores, pictures)
 
 
 def with_stage(driver: Driver, host_stage: str) -> Driver:
@@ -259,23 +260,6 @@ def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, 
     from me2e_compress.evaluators.highway.render import render  # imports highway-env
 
     return tuple(file for route in routes for file in render(job, route, folder))
-
-
-def _job(driver: Driver, options: EvaluateOptions) -> Job:
-    latency = parse_latency(
-        options.latency,
-        in_order=options.in_order,
-        scale=options.latency_scale,
-        seed=options.seed,
-    )
-    conditions = Conditions(
-        latency,
-        step_us(options.dt_ms),
-        image_size_of(driver.open()),
-        weather_of(options.weather),
-        latency_model_named(options.latency_model),
-    )
-    return Job(driver, conditions, options.frame_limit_s)
 
 
 def driver_of(

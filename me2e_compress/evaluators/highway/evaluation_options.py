@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from me2e_compress.driving.latency import parse_latency
-from me2e_compress.driving.policies import driver_named
+from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import (
     Conditions,
@@ -34,6 +34,8 @@ class HighwayEvaluation:
         folder: Where the results go.
         routes: ``all``, a number, ids parted by commas, or a file of routes.
         latency: What decisions cost: ``none``, ``fps:10``, ``trace:FILE``.
+        latency_scale: Of a trace or a measurement.
+        in_order: Replay a trace in its order.
         latency_model: ``drop`` decisions meanwhile, or ``fifo``: delay controls.
         seed: Of the draws from a trace.
         adapter: TOML file that adapts a model to the policy contract.
@@ -41,7 +43,7 @@ class HighwayEvaluation:
         weather: ``fog_m=80,night=0.5,dropped=BACK``; empty for a clear day.
         frame_limit_s: Seconds until a decision counts as hung.
         workers: Routes at a time.
-        engine: Where: processes of this machine, or a Ray cluster.
+        engine: Where: ``local``, processes of this machine, or ``ray``, a cluster.
         address: Of a running Ray cluster; None starts one.
     """
 
@@ -50,6 +52,8 @@ class HighwayEvaluation:
     folder: Path
     routes: str = "all"
     latency: str = "none"
+    latency_scale: float = 1.0
+    in_order: bool = False
     latency_model: str = "drop"
     seed: int = 0
     adapter: Path | None = None
@@ -57,7 +61,7 @@ class HighwayEvaluation:
     weather: str = ""
     frame_limit_s: float = FRAME_LIMIT_S
     workers: int = 1
-    engine: Literal["local", "ray"] = "local"
+    engine: str = "local"
     address: str | None = None
 
     def episodes(self) -> Iterator[Episode]:
@@ -73,20 +77,28 @@ class HighwayEvaluation:
         self,
         on_progress: Callable[[DrivingProgress], None] = lambda progress: None,
         on_warning: Callable[[str], None] = lambda line: None,
+        driver: Driver | None = None,
     ) -> HighwayEvaluator:
         """Build what drives.
 
         Args:
             on_progress: Called at the start and after every route.
             on_warning: Called with one line a surprise.
+            driver: Who drives; None finds the policy by its name.
 
         Raises:
             EvaluationError: An option that nothing can be driven with.
         """
         picked, set_size = routes_named(self.routes)
-        driver = driver_named(self.policy, self.adapter)
+        driver = driver or driver_named(self.policy, self.adapter)
+        latency = parse_latency(
+            self.latency,
+            in_order=self.in_order,
+            scale=self.latency_scale,
+            seed=self.seed,
+        )
         conditions = Conditions(
-            parse_latency(self.latency, seed=self.seed),
+            latency,
             step_us(self.dt_ms),
             image_size_of(driver.open()),
             weather_of(self.weather),

@@ -49,7 +49,7 @@ def test_options_reach_the_drive(tmp_path: Path) -> None:
         ('policy=blind, weather="hail=1"', "weather option 'hail': there are fog_m"),
         ("policy=blind, dt_ms=1e308", r"a step of 1e\+308 ms: it must divide 50 ms"),
         ("policy=blind, dt_ms=nan", "a step of nan ms"),
-        ("policy=blind, engine=cloud", "engine: Input should be 'local' or 'ray'"),
+        ("policy=blind, engine=cloud", "engine 'cloud' with address None"),
         ("policy=blind, address=here", "engine 'local' with address here"),
         ("routes=all", "highway needs the option policy"),
     ],
