@@ -1,7 +1,7 @@
 """An evaluation in highway-env as plain options: who drives what, and under what."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,7 +15,7 @@ from me2e_compress.evaluators.highway.conditions import (
     latency_model_named,
     step_us,
 )
-from me2e_compress.evaluators.highway.drivers import image_size_of
+from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
@@ -45,6 +45,7 @@ class HighwayEvaluation:
         workers: Routes at a time.
         engine: Where: ``local``, processes of this machine, or ``ray``, a cluster.
         address: Of a running Ray cluster; None starts one.
+        provider: What runs the model: ``cpu``, ``tensorrt{cache=engines}``.
     """
 
     name: ClassVar[str] = "highway"
@@ -63,6 +64,7 @@ class HighwayEvaluation:
     workers: int = 1
     engine: str = "local"
     address: str | None = None
+    provider: str = "cpu"
 
     def episodes(self) -> Iterator[Episode]:
         """Drive what is missing, then yield all routes in the order given.
@@ -90,7 +92,7 @@ class HighwayEvaluation:
             EvaluationError: An option that nothing can be driven with.
         """
         picked, set_size = routes_named(self.routes)
-        driver = driver or driver_named(self.policy, self.adapter)
+        driver = driver or self._driver()
         latency = parse_latency(
             self.latency,
             in_order=self.in_order,
@@ -113,6 +115,12 @@ class HighwayEvaluation:
             on_progress,
             on_warning,
         )
+
+    def _driver(self) -> Driver:
+        found = driver_named(self.policy, self.adapter)
+        if isinstance(found, OnnxDriver):
+            return replace(found, provider=self.provider)
+        return found
 
 
 def routes_named(text: str) -> tuple[tuple[Route, ...], int]:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.driving.latency import FrameRate
-from me2e_compress.errors import EvaluationError
+from me2e_compress.errors import EvaluationError, ProviderError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.evaluators.highway.evaluation_options import HighwayEvaluation
 from me2e_compress.simulator.routes import save_routes
@@ -36,6 +36,14 @@ def test_options_reach_the_drive(tmp_path: Path) -> None:
     assert conditions.latency == FrameRate(5.0)
     assert conditions.dt_us == 25_000
     assert conditions.weather.night == 0.5
+
+
+def test_the_model_runs_on_its_provider(tmp_path: Path) -> None:
+    model = tmp_path / "m.onnx"
+    model.touch()
+
+    with pytest.raises(ProviderError, match="no provider 'npu'; there are cpu, cuda"):
+        HighwayEvaluation(str(model), tmp_path, provider="npu").evaluator()
 
 
 @pytest.mark.parametrize(
