@@ -42,7 +42,7 @@ from me2e_compress.study import (
     Variant,
     run_study,
 )
-from me2e_compress.study.tables import all_tables
+from me2e_compress.study.all_tables import all_tables
 from me2e_compress.study.workspace import MARKDOWN, Workspace
 from me2e_compress.study.write import write_study
 from me2e_compress.workflows.checks import model_path

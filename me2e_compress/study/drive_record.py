@@ -16,6 +16,7 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 
 from me2e_compress import documents
 from me2e_compress.errors import StudyError
+from me2e_compress.metrics import surrogate_safety as near
 from me2e_compress.metrics.comfort import comfort
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.efficiency import efficiency
@@ -49,6 +50,12 @@ class RouteRecord:
         decisions: How many.
         latency_us: What they cost on the vehicle: `PERCENTS` of them.
         latency_sum_us: All of it.
+        ttc_exposure: Percent of the frames with a time to collision below 1.5 s; like
+            all below, None where it was not recorded or there was none.
+        smallest_ttc: Seconds.
+        smallest_pet: Post-encroachment time of crossing paths, seconds.
+        smallest_distance: Metres.
+        at_fault: Whether a collision was the ego's fault.
     """
 
     route: str
@@ -64,6 +71,11 @@ class RouteRecord:
     decisions: int
     latency_us: tuple[int, ...]
     latency_sum_us: int
+    ttc_exposure: float | None = None
+    smallest_ttc: float | None = None
+    smallest_pet: float | None = None
+    smallest_distance: float | None = None
+    at_fault: bool | None = None
 
     @property
     def collisions(self) -> tuple[tuple[str, str], ...]:
@@ -91,6 +103,11 @@ class RouteRecord:
             len(charged),
             tuple(int(each) for each in latency_us) if charged else (),
             sum(charged),
+            _rounded(near.ttc_exposure(episode).value),
+            _rounded(near.smallest_ttc(episode).value),
+            _rounded(near.smallest_pet(episode).value),
+            _rounded(near.smallest_distance(episode).value),
+            near.at_fault_collision(episode),
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.providers import PROVIDERS
+from me2e_compress.study.all_tables import all_tables
 from me2e_compress.study.changes import Change, changes, held_against
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
@@ -15,7 +16,6 @@ from me2e_compress.study.drives import Drive
 from me2e_compress.study.plan_fidelity import PlanFidelity, measure_json
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.side_by_side import Contrast
-from me2e_compress.study.tables import all_tables
 from me2e_compress.study.timing import Clock
 from me2e_compress.workflows.result import Result, Table
 

@@ -139,17 +139,6 @@ def _abilities(
     )
 
 
-def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Every table of a study, in the order of reading."""
-    compared = [differences(outcome)] if len(outcome.variants) > 1 else []
-    return (
-        *scoreboards(outcome),
-        *compared,
-        *change_tables(outcome),
-        *abilities(outcome),
-    )
-
-
 def change_tables(outcome: "StudyResult") -> tuple[Table, ...]:
     """Show what changes of conditions cost, and pairs of drives; none, if none."""
     baseline = outcome.study.baseline

@@ -4,12 +4,12 @@ import pytest
 
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import StudyResult
+from me2e_compress.study.all_tables import all_tables, near_misses
 from me2e_compress.study.tables import (
     INFINITE,
     MINUS,
     MISSING,
     abilities,
-    all_tables,
     differences,
     estimate_cell,
     measure_cell,
@@ -140,3 +140,12 @@ def test_what_was_not_measured_is_never_zero() -> None:
     cell = estimate_cell(Estimate(Measure(None, "%", "no route"), None, None, 0))
 
     assert cell == Cell(MISSING, reason="no route")
+
+
+def test_near_misses_of_every_drive(found: StudyResult) -> None:
+    table = near_misses(found)
+
+    assert len(table.rows) == len(found.drives)
+    slow = {row[0].text: row for row in table.rows}["slow, ideal"]
+    assert slow[4].text != MISSING
+    assert slow[4].detail

@@ -9,6 +9,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from me2e_compress.metrics.infraction import InfractionKind
+from me2e_compress.study.all_tables import near_misses
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import forest, pareto
@@ -89,6 +90,7 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
             for each in study.conditions
             if (drawn := pareto(outcome, each)) is not None
         ],
+        near_misses=near_misses(outcome),
         abilities=abilities(outcome),
         contrasts=[_shown(each, study.baseline) for each in outcome.contrasts],
         made=_made(outcome, command),

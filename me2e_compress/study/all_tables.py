@@ -1,0 +1,65 @@
+"""Every table of a study, the one of near misses among them."""
+
+from typing import TYPE_CHECKING
+
+from me2e_compress.study.drives import Drive
+from me2e_compress.study.tables import (
+    MISSING,
+    abilities,
+    change_tables,
+    differences,
+    estimate_cell,
+    scoreboards,
+)
+from me2e_compress.workflows.result import Cell, Table
+
+if TYPE_CHECKING:
+    from me2e_compress.study.outcome import StudyResult
+
+COLUMNS = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
+
+
+def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
+    """Every table of a study, in the order of reading."""
+    compared = [differences(outcome)] if len(outcome.variants) > 1 else []
+    return (
+        *scoreboards(outcome),
+        *compared,
+        *change_tables(outcome),
+        near_misses(outcome),
+        *abilities(outcome),
+    )
+
+
+def near_misses(outcome: "StudyResult") -> Table:
+    """Show how near every drive came to collisions, which few routes end in."""
+    several = len(outcome.study.conditions) > 1
+    return Table(
+        "Near misses",
+        ("variant", *COLUMNS),
+        tuple(
+            (
+                Cell(f"{each.variant}, {each.condition}" if several else each.variant),
+                *_cells(each),
+            )
+            for each in outcome.drives
+        ),
+        "Means over routes with their 95 % intervals: share of the time with a time to "
+        "collision below 1.5 s, the least of a route, post-encroachment time of "
+        "crossing paths, smallest distance; and routes with a collision that the ego "
+        "could have prevented. Least TTC and PET exist on some routes only.",
+        outcome.study.baseline,
+    )
+
+
+def _cells(drive: Drive) -> tuple[Cell, ...]:
+    if drive.scores is None:
+        return (Cell(MISSING, reason=drive.reason),) * len(COLUMNS)
+    found = drive.scores.safety
+    return (
+        estimate_cell(found.ttc_exposure),
+        estimate_cell(found.smallest_ttc, ".2f"),
+        estimate_cell(found.smallest_pet, ".2f"),
+        estimate_cell(found.smallest_distance, ".2f"),
+        estimate_cell(found.at_fault_collisions),
+    )
