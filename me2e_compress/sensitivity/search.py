@@ -1,9 +1,9 @@
-"""Which modules to make int8 under a budget of time or size."""
+"""Which modules to make int8 under budgets of time, size and energy."""
 
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import onnx_ir as ir
 
@@ -38,38 +38,46 @@ class Candidate:
         modules: those that are int8.
         loss: predicted: the losses of its modules alone, squared and added, the root
             of that: errors of different modules are taken to be independent.
-        cost: predicted: that of the float model less what each module alone saves.
+        costs: predicted, one a budget: those of the float model less what each module
+            alone saves.
         score: measured; None where it was not tried.
-        measured_cost: measured; None where it was not tried.
+        measured_costs: measured; None where it was not tried.
     """
 
     modules: tuple[str, ...]
     loss: float
-    cost: float
+    costs: tuple[float, ...]
     score: Score | None = None
-    measured_cost: float | None = None
+    measured_costs: tuple[float, ...] | None = None
 
 
 def search(
     trials: Trials,
     modules: Sequence[str],
-    budget: Budget,
+    budgets: Sequence[Budget],
     *,
     most_tried: int = 8,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> tuple[Candidate, ...]:
-    """Find the assignment that loses least within a budget.
+    """Find the assignment that loses least within every budget.
 
     Every module is scored and weighed alone; all assignments are predicted from that,
     and the best of those that should fit are built, scored and weighed in turn until
     one does fit; the last that is tried is the cheapest of all.
+
+    Args:
+        trials: judges variants.
+        modules: those that may be int8.
+        budgets: all are to be met; at least one.
+        most_tried: assignments that are built.
+        progress: is called with modules done and in all, and the next one.
 
     Returns:
         What was tried; the last one fits.
 
     Raises:
         EvaluationError: too many modules, or nothing fits; the message gives the least
-            cost that was found.
+            costs that were found.
     """
     active = [name for name in modules if names_of(trials, name)]
     if len(active) > MOST_MODULES:
@@ -77,46 +85,79 @@ def search(
             f"{len(active)} modules are more than {MOST_MODULES}: use a coarser map"
         )
     # 1. every module alone: what it loses, what it saves
-    float_cost = budget.cost(trials.model)
+    whole = _costs(budgets, trials.model)
     losses, savings = {}, {}
     for done, name in enumerate(active):
         if progress:
             progress(done, len(active), name)
         losses[name] = trials.score(Int8Choice((name,))).loss
-        savings[name] = float_cost - budget.cost(trials.variant(Int8Choice((name,))))
+        alone = _costs(budgets, trials.variant(Int8Choice((name,))))
+        savings[name] = tuple(a - b for a, b in zip(whole, alone, strict=True))
     # 2. every assignment, predicted from that
-    ranked = _predict(active, losses, savings, float_cost)
+    ranked = _predict(active, losses, savings, whole)
     # 3. the best that should fit, measured until one does
     tried: list[Candidate] = []
-    least = min(each.cost for each in ranked)
-    for candidate in _promising(ranked, budget.limit, most_tried):
+    for candidate in _promising(ranked, budgets, most_tried):
         choice = Int8Choice(candidate.modules)
-        cost = budget.cost(trials.variant(choice))
-        score, least = trials.score(choice), min(least, cost)
-        tried.append(dataclasses.replace(candidate, score=score, measured_cost=cost))
-        if cost <= budget.limit:
+        costs = _costs(budgets, trials.variant(choice))
+        score = trials.score(choice)
+        tried.append(dataclasses.replace(candidate, score=score, measured_costs=costs))
+        if _share(budgets, costs) <= 1:
             return tuple(tried)
-    raise EvaluationError(
-        f"nothing fits {budget.limit:g} {budget.unit}: the float model costs"
-        f" {float_cost:g}, the cheapest assignment about {least:g}"
+    found = [each.costs for each in ranked]
+    found += [each.measured_costs for each in tried if each.measured_costs]
+    raise EvaluationError(nothing_fits(budgets, whole, found))
+
+
+def nothing_fits(
+    budgets: Sequence[Budget], whole: Sequence[float], found: Sequence[Sequence[float]]
+) -> str:
+    """Say that no assignment is within the budgets, and what the least costs are.
+
+    Args:
+        budgets: what was asked.
+        whole: what the float model costs.
+        found: what each assignment costs.
+    """
+
+    def said(costs: Iterable[float]) -> str:
+        pairs = zip(costs, budgets, strict=True)
+        return " and ".join(f"{cost:g} {budget.unit}" for cost, budget in pairs)
+
+    least = said(map(min, zip(*found, strict=True)))
+    apart = "; each alone" if len(budgets) > 1 else ""
+    return (
+        f"nothing fits {said(each.limit for each in budgets)}: the float model costs"
+        f" {said(whole)}, the least found is about {least}{apart}"
     )
 
 
-def _promising(ranked: Sequence[Candidate], limit: float, most: int) -> list[Candidate]:
+def _costs(budgets: Sequence[Budget], made: ir.Model) -> tuple[float, ...]:
+    return tuple(each.cost(made) for each in budgets)
+
+
+def _share(budgets: Sequence[Budget], costs: Sequence[float]) -> float:
+    """Return how much of the budget that is met worst is spent; 1 is all of it."""
+    return max(cost / budget.limit for cost, budget in zip(costs, budgets, strict=True))
+
+
+def _promising(
+    ranked: Sequence[Candidate], budgets: Sequence[Budget], most: int
+) -> list[Candidate]:
     """Choose those predicted to fit, the best first and the cheapest of all last."""
-    fitting = [each for each in ranked if each.cost <= limit]
+    fitting = [each for each in ranked if _share(budgets, each.costs) <= 1]
     chosen = fitting[: most - 1]
-    cheapest = min(ranked, key=lambda each: each.cost)
+    cheapest = min(ranked, key=lambda each: _share(budgets, each.costs))
     return chosen if not fitting or cheapest in chosen else [*chosen, cheapest]
 
 
 def _predict(
     modules: Sequence[str],
     losses: dict[str, float],
-    savings: dict[str, float],
-    float_cost: float,
+    savings: dict[str, tuple[float, ...]],
+    whole: tuple[float, ...],
 ) -> list[Candidate]:
-    """Predict all assignments, the least loss first, then the least cost."""
+    """Predict all assignments, the least loss first, then the least costs."""
     subsets = itertools.chain.from_iterable(
         itertools.combinations(modules, size) for size in range(len(modules) + 1)
     )
@@ -124,8 +165,11 @@ def _predict(
         Candidate(
             subset,
             math.sqrt(sum(losses[name] ** 2 for name in subset)),
-            float_cost - sum(savings[name] for name in subset),
+            tuple(
+                cost - sum(savings[name][at] for name in subset)
+                for at, cost in enumerate(whole)
+            ),
         )
         for subset in subsets
     ]
-    return sorted(found, key=lambda each: (each.loss, each.cost, each.modules))
+    return sorted(found, key=lambda each: (each.loss, each.costs, each.modules))

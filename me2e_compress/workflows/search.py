@@ -1,8 +1,9 @@
-"""The modules whose int8 meets a budget and costs the plan least."""
+"""The modules whose int8 meets budgets and costs the plan least."""
 
 import dataclasses
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import onnx_ir as ir
 
@@ -12,7 +13,13 @@ from me2e_compress.runtime.interleaved import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity import Budget, Candidate, Int8Choice, Trials
 from me2e_compress.sensitivity import search as find
-from me2e_compress.workflows.checks import check_number, model_path
+from me2e_compress.workflows.budgets import (
+    Joules,
+    check_budgets,
+    joules_here,
+    joules_of,
+)
+from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number, table
@@ -20,27 +27,27 @@ from me2e_compress.workflows.result import Result, Table, number, table
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SearchOptions(TrialOptions):
-    """How int8 is judged, and the budget: one of the two.
+    """How int8 is judged, and the budgets: one or more.
 
     Attributes:
         max_mb: most MB of weights.
         max_ms: most milliseconds a frame, on this CPU.
+        max_joules: most joules a frame: measured where a counter answers, else
+            modelled.
 
     Raises:
-        RecipeError: no budget or two, one that is not positive and finite, or time on
-            this CPU of int8 for another target.
+        RecipeError: no budget, one that is not positive and finite, or time on this
+            CPU of int8 for another target.
     """
 
     max_mb: float | None = None
     max_ms: float | None = None
+    max_joules: float | None = None
 
     def __post_init__(self) -> None:
         """Check the budget."""
         super().__post_init__()
-        check_number("--max-mb", self.max_mb)
-        check_number("--max-ms", self.max_ms)
-        if (self.max_mb is None) == (self.max_ms is None):
-            raise RecipeError("give a budget: --max-mb or --max-ms, one of the two")
+        check_budgets(self.max_mb, self.max_ms, self.max_joules)
         if self.max_ms is not None and self.runs_on != "onnxruntime":
             raise RecipeError(
                 f"--max-ms is measured on this CPU, where int8 for {self.runs_on} is"
@@ -60,13 +67,13 @@ class SearchResult(Result):
     Attributes:
         output: the recipe that was written.
         tried: assignments; the last one fits and is the recipe's.
-        unit: of the budget.
+        limits: the budgets: unit and the most it may cost.
         written: what was written, in words.
     """
 
     output: Path
     tried: tuple[Candidate, ...]
-    unit: str
+    limits: tuple[tuple[str, float], ...]
     written: str
 
     @property
@@ -81,30 +88,44 @@ class SearchResult(Result):
                 ", ".join(each.modules) or "none",
                 number(None if each.score is None else each.score.loss, ".4g"),
                 f"{each.loss:.4g}",
-                number(each.measured_cost, ".4g"),
+                *(number(cost, ".4g") for cost in each.measured_costs or ()),
             )
             for each in self.tried
         ]
-        columns = ("int8", "loss", "predicted", self.unit)
-        return (table("Tried, best first", columns, rows),)
+        units = [unit for unit, _ in self.limits]
+        limits = " and ".join(f"{limit:g} {unit}" for unit, limit in self.limits)
+        columns = ("int8", "loss", "predicted", *units)
+        note = f"budget: {limits}"
+        return (table("Tried, best first", columns, rows, note),)
 
     def records(self) -> list[dict[str, object]]:
-        """Return a row an assignment."""
+        """Return a row an assignment; a cost is that of the first budget."""
         return [
             {
                 "modules": each.modules,
                 "loss": None if each.score is None else each.score.loss,
                 "predicted_loss": each.loss,
-                "cost": each.measured_cost,
-                "predicted_cost": each.cost,
-                "unit": self.unit,
+                "cost": each.measured_costs[0] if each.measured_costs else None,
+                "predicted_cost": each.costs[0],
+                "unit": self.limits[0][0],
             }
             for each in self.tried
         ]
 
     def to_json(self) -> object:
-        """Return what was tried."""
-        return {"unit": self.unit, "tried": self.tried}
+        """Return what was tried; ``unit`` and ``cost`` are of the first budget."""
+        tried = [
+            dataclasses.asdict(each)
+            | {
+                "cost": each.costs[0],
+                "measured_cost": each.measured_costs[0]
+                if each.measured_costs
+                else None,
+            }
+            for each in self.tried
+        ]
+        budgets = [{"unit": unit, "limit": limit} for unit, limit in self.limits]
+        return {"unit": self.limits[0][0], "budgets": budgets, "tried": tried}
 
 
 def search(
@@ -114,18 +135,19 @@ def search(
     options: SearchOptions,
     listener: Listener = SILENT,
 ) -> SearchResult:
-    """Find the modules whose int8 meets a budget and costs the plan least.
+    """Find the modules whose int8 meets the budgets and costs the plan least.
 
     Args:
         model: the float ONNX file, or the name of one that ships.
         frames: folder of recorded frames.
         output: the recipe.
-        options: with a budget.
+        options: with one budget or more.
         listener: is called with progress and warnings.
 
     Raises:
         GraphError: no such model, or the output would harm an input.
         RecipeError: no such scheme, rule set or target.
+        EnergyError: a counter that answers is not usable.
         FramesError: frames or saved ranges that do not fit.
         PreconditionError: the graph is quantized already, or nothing can be int8.
         EvaluationError: nothing fits; says what the least was.
@@ -139,20 +161,48 @@ def _search(
     files: TrialFiles, options: SearchOptions, listener: Listener
 ) -> SearchResult:
     trials, modules = files.trials(options, options.runs_on, listener)
-    if options.max_mb is not None:
-        budget = Budget(
-            options.max_mb * 1e6,
-            "bytes of weights",
-            lambda made: graph.size(made).weight_bytes,
-        )
-    else:
-        seconds = partial(_seconds, trials, options.threads)
-        budget = Budget((options.max_ms or 0) / 1e3, "s", seconds)
+    budgets = _budgets(options, trials)
     report = partial(listener.on_progress, "modules")
-    tried = find(trials, modules, budget, progress=report)
+    tried = find(trials, modules, budgets, progress=report)
     choice = Int8Choice(tried[-1].modules)
     written = files.write(choice, options, options.runs_on)
-    return SearchResult(files.output, tried, budget.unit, written)
+    limits = tuple((each.unit, each.limit) for each in budgets)
+    return SearchResult(files.output, tried, limits, written)
+
+
+def _budgets(options: SearchOptions, trials: Trials) -> list[Budget]:
+    """List what is to be met: size, time, energy."""
+    found = list[Budget]()
+    if options.max_mb is not None:
+        found.append(Budget(options.max_mb * 1e6, "bytes of weights", _weight_bytes))
+    if options.max_ms is not None:
+        seconds = partial(_seconds, trials, options.threads)
+        found.append(Budget(options.max_ms / 1e3, "s", seconds))
+    if options.max_joules is not None:
+        kind = joules_here()
+        joules = partial(_joules, trials, options.threads, kind)
+        found.append(Budget(options.max_joules, kind, joules))
+    return found
+
+
+def _weight_bytes(made: ir.Model) -> float:
+    return float(graph.size(made).weight_bytes)
+
+
+def _joules(trials: Trials, threads: int, kind: Joules, made: ir.Model) -> float:
+    """Return joules of a frame."""
+    reference = trials.reference
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "int8.onnx"
+        graph.save(made, file)
+        found = joules_of(
+            kind,
+            {"int8": file},
+            reference.frames,
+            threads=threads,
+            provider=reference.session.provider,
+        )
+    return found["int8"]
 
 
 def _seconds(trials: Trials, threads: int, made: ir.Model) -> float:

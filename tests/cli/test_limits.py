@@ -15,6 +15,7 @@ F = "dense.onnx frames -o out"
     [
         (f"search {F}", "--max-mb"),
         (f"search {F}", "--max-ms"),
+        (f"search {F}", "--max-joules"),
         (f"sensitivity {F}", "--limit"),
         (f"sensitivity {F} --drive 1", "--drive-limit"),
         ("evaluate blind --routes 1 -o out", "--dt-ms"),

@@ -8,6 +8,8 @@ from me2e_compress import graph
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
 
+MODELLED = "modelled J"
+
 
 def test_sensitivity_writes_a_recipe_that_compresses(
     command: Command, dense: Path, capsys: pytest.CaptureFixture[str]
@@ -109,20 +111,36 @@ def test_search_writes_the_least_int8_that_fits(
     assert ("quantize-int8" in (dense / "r.toml").read_text()) == int8
 
 
-def test_search_by_time_runs_on_this_cpu(command: Command, dense: Path) -> None:
+def test_search_keeps_size_time_and_energy_at_once(
+    command: Command,
+    dense: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("me2e_compress.workflows.search.joules_here", lambda: MODELLED)
+    budgets = ("--max-ms", "10000", "--max-mb", "1", "--max-joules", "1")
     done = command(
-        *("search", dense / "dense.onnx", dense / "frames", "--max-ms", "10000"),
+        *("search", dense / "dense.onnx", dense / "frames", *budgets, "--json"),
         *("--map", dense / "map.toml", "-o", dense / "r.toml"),
     )
 
     assert done == 0
+    found = strict(capsys.readouterr().out)
+    assert faults("search", found) == []
+    units = [each["unit"] for each in found["budgets"]]
+    assert units == ["bytes of weights", "s", MODELLED]
+    assert len(found["tried"][-1]["measured_costs"]) == 3
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ((), "give a budget"),
-        (("--max-mb", "1", "--max-ms", "1"), "one of the two"),
+        (("--max-mb", "1", "--max-joules", "0"), "--max-joules is 0"),
+        (
+            ("--max-mb", "1", "--max-ms", "1e-9"),
+            "nothing fits .* 1e-12 s: .* alone",
+        ),
         (("--max-ms", "1", "--target", "tensorrt"), "use --target onnxruntime"),
         (("--max-mb", "0.0000001"), "nothing fits"),
         (("--max-mb", "1", "--scheme", "int4"), "no scheme int4; there are .*int8"),

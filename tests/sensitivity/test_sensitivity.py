@@ -261,12 +261,9 @@ def test_the_search_keeps_the_budget_and_loses_least(tmp_path: Path) -> None:
     only_backbone = weight_bytes(judge.variant(Int8Choice(("backbone",))))
     only_head = weight_bytes(judge.variant(Int8Choice(("head",))))
 
-    loose = search(judge, ("backbone", "head"), Budget(whole, "bytes", weight_bytes))
-    tight = search(
-        judge, ("backbone", "head"), Budget(only_backbone, "bytes", weight_bytes)
-    )
-    tighter = search(
-        judge, ("backbone", "head"), Budget(only_head, "bytes", weight_bytes)
+    loose, tight, tighter = (
+        search(judge, ("backbone", "head"), [Budget(limit, "bytes", weight_bytes)])
+        for limit in (whole, only_backbone, only_head)
     )
 
     assert loose[-1].modules == ()
@@ -274,8 +271,8 @@ def test_the_search_keeps_the_budget_and_loses_least(tmp_path: Path) -> None:
     assert tighter[-1].modules == ("head",)
     for each in (loose[-1], tight[-1], tighter[-1]):
         assert each.score is not None
-        assert each.measured_cost is not None
-    assert tight[-1].measured_cost == only_backbone
+        assert each.measured_costs is not None
+    assert tight[-1].measured_costs == (only_backbone,)
 
 
 def test_the_last_that_is_tried_is_the_cheapest(tmp_path: Path) -> None:
@@ -288,7 +285,7 @@ def test_the_last_that_is_tried_is_the_cheapest(tmp_path: Path) -> None:
         weighed.append(weight_bytes(made))
         return weighed[-1] + (whole if len(weighed) > 3 and weighed[-1] > least else 0)
 
-    found = search(judge, both, Budget(whole, "bytes", cost), most_tried=2)
+    found = search(judge, both, [Budget(whole, "bytes", cost)], most_tried=2)
 
     assert [each.modules for each in found] == [(), both]
 
@@ -296,7 +293,23 @@ def test_the_last_that_is_tried_is_the_cheapest(tmp_path: Path) -> None:
 def test_a_budget_that_nothing_fits_is_an_error(tmp_path: Path) -> None:
     judge = trials(tmp_path, 3)
     with pytest.raises(EvaluationError, match=r"nothing fits 10 bytes: the float"):
-        search(judge, ("backbone", "head"), Budget(10, "bytes", weight_bytes))
+        search(judge, ("backbone", "head"), [Budget(10, "bytes", weight_bytes)])
+
+
+def test_every_one_of_several_budgets_is_kept(tmp_path: Path) -> None:
+    judge = trials(tmp_path, 3)
+    size = Budget(weight_bytes(judge.model), "bytes", weight_bytes)
+    float_head = weight_bytes(judge.variant(Int8Choice(("backbone",))))
+    nodes = Budget(float_head - 1, "other bytes", weight_bytes)
+
+    found = search(judge, ("backbone", "head"), [size, nodes])
+    both = [size, Budget(1, "s", lambda _: 2.0)]
+
+    assert found[-1].measured_costs is not None
+    assert found[-1].modules == ("head",)
+    message = r"nothing fits \d+ bytes and 1 s: .*least found is .* and 2 s; each alone"
+    with pytest.raises(EvaluationError, match=message):
+        search(judge, ("backbone", "head"), both)
 
 
 def test_a_model_without_a_plan_is_judged_by_its_worst_output(tmp_path: Path) -> None:

@@ -15,6 +15,9 @@ MaxMs = Annotated[
     float | None, typer.Option(help="most milliseconds a frame, on this CPU")
 ]
 
+MAX_JOULES = "most joules a frame: measured by a counter, else modelled"
+MaxJoules = Annotated[float | None, typer.Option(help=MAX_JOULES)]
+
 
 def search(
     model: given.FloatModel,
@@ -22,6 +25,7 @@ def search(
     output: given.RecipeOutput,
     max_mb: MaxMb = None,
     max_ms: MaxMs = None,
+    max_joules: MaxJoules = None,
     scheme: given.TrialScheme = "full",
     rules: given.TrialRules = "safe",
     target: given.Target = None,
@@ -35,9 +39,10 @@ def search(
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
-    """Find the modules whose int8 meets a budget and costs the plan least."""
+    """Find the modules whose int8 meets the budgets and costs the plan least."""
     options = workflow.SearchOptions(
-        max_mb=max_mb, max_ms=max_ms, scheme=scheme, rules=rules, target=target,
+        max_mb=max_mb, max_ms=max_ms, max_joules=max_joules, scheme=scheme,
+        rules=rules, target=target,
         ranges=ranges, module_map=module_map, count=count, threads=threads,
         dims=sizes(set_dim or ()), force=force,
         provider=provider_named(provider, plugins or ()),
