@@ -161,8 +161,13 @@ def held_frames(study: Study, condition: Condition) -> int:
     """
     if condition.latency_model == LatencyModel.FIFO:
         return 1
+    if condition.mean_of:
+        under = condition.mean_cell[1]
+        return held_frames(
+            study, next(each for each in study.conditions if each.name == under)
+        )
     latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
-    if not condition.mean_of:
+    if True:
         source = condition.source(study.seed).with_trace((latency_us,), 1.0)
         nobody = DecisionFacts(latency_us, np.empty((0, 2)))
         latency_us = source.on_route("")(nobody)

@@ -1,7 +1,8 @@
 """The paper's study on drivers that need no images."""
 
 import json
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ from me2e_compress.errors import StudyError
 from me2e_compress.study import Condition, Listener, Study, Timing, Variant
 from me2e_compress.study.blocks import Block, FramesToRecord
 from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.paper.accident import Accident
+from me2e_compress.study.paper.accident_figure import plans_before
 from me2e_compress.study.paper.paper_run import read_paper, run_paper
 from me2e_compress.study.workload import workload
 from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here
@@ -30,20 +33,35 @@ ASKED = Study(
 )
 
 
+@dataclass(frozen=True)
+class First:
+    """The first run in a folder."""
+
+    folder: Path
+    engine: Here
+    landed: list[int]
+
+
 @pytest.fixture(scope="module")
-def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("paper")
-    run_paper(ASKED, folder, Here())
-    return folder
+def first(tmp_path_factory: pytest.TempPathFactory) -> First:
+    made = First(tmp_path_factory.mktemp("paper"), Here(), [])
+    run_paper(
+        ASKED,
+        made.folder,
+        made.engine,
+        on_block=lambda found: made.landed.append(len(found.cells)),
+    )
+    return made
 
 
-def test_a_block_drives_what_no_other_has_driven(tmp_path: Path) -> None:
-    engine, landed = Here(), list[int]()
+@pytest.fixture
+def driven(first: First) -> Path:
+    return first.folder
 
-    run_paper(ASKED, tmp_path, engine, on_block=lambda r: landed.append(len(r.cells)))
 
-    assert landed == [2, 3]
-    assert len(engine.driven) == 3 * len(ROUTES)
+def test_a_block_drives_what_no_other_has_driven(first: First) -> None:
+    assert first.landed == [2, 3]
+    assert len(first.engine.driven) == 3 * len(ROUTES)
 
 
 def test_a_variant_that_fails_leaves_the_others(driven: Path) -> None:
@@ -65,11 +83,11 @@ def test_a_variant_that_fails_leaves_the_others(driven: Path) -> None:
 
 def test_a_finished_cell_needs_no_frames_to_go_on(driven: Path) -> None:
     engine = Here()
-    first = run_paper(ASKED, driven, engine)
+    before = run_paper(ASKED, driven, engine)
     for path in (driven / "results").glob("*/routes/*.json"):
         path.unlink()
 
-    assert run_paper(ASKED, driven, engine) == first
+    assert run_paper(ASKED, driven, engine) == before
     assert engine.driven == []
 
 
@@ -189,3 +207,21 @@ def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
     assert sum(map(len, fact.modules_us.values())) > 0
     assert found.preview == " (preview: 1 of 220 routes)"
     assert all("preview" in table.title for table in found.tables())
+
+
+def test_an_accident_keeps_its_last_seconds(driven: Path, tmp_path: Path) -> None:
+    accident = run_paper(ASKED, driven, Here()).accident
+
+    assert accident is not None
+    assert (accident.variant, accident.condition) == ("blind", "ideal")
+    times = [each.time_us for each in accident.moments]
+    assert times == list(range(times[0], times[-1] + 1, 500_000))
+    last = accident.moments[-1]
+    ahead = math.dist(last.plan[0], (last.ego.x, last.ego.y))
+    assert ahead == pytest.approx(3.0, abs=0.5)  # half a second at 6 m/s
+    assert last.others
+    assert read_paper(ASKED, driven / "records").accident == accident
+    assert plans_before(accident).axes[0].lines
+    (tmp_path / "cut.json").write_text("{}")
+    with pytest.raises(StudyError, match="not an accident"):
+        Accident.load(tmp_path / "cut.json")

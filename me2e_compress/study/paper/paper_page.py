@@ -7,6 +7,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from me2e_compress.study.paper import paper_figures
+from me2e_compress.study.paper.accident_figure import plans_before
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.paper.questions import findings_table
 from me2e_compress.study.report.page import template
@@ -14,6 +15,12 @@ from me2e_compress.study.report.style import styled, svg
 from me2e_compress.workflows.result import Table
 
 TEMPLATE = "paper.html"
+
+
+def _figure_6(result: PaperResult) -> Figure | None:
+    return None if result.accident is None else plans_before(result.accident)
+
+
 Drawn: TypeAlias = tuple[Markup, str]
 """An SVG and what is said below it."""
 FIGURES: dict[str, tuple[tuple[Callable[[PaperResult], Figure | None], str], ...]] = {
@@ -30,6 +37,13 @@ FIGURES: dict[str, tuple[tuple[Callable[[PaperResult], Figure | None], str], ...
             paper_figures.where_the_time_goes,
             "Figure 7. Left, the modules of the whole driver, inference by inference;"
             " right, the longest tails: the share of decisions that take longer.",
+        ),
+    ),
+    "Collisions by partner": (
+        (
+            _figure_6,
+            "Figure 6. One driver's successive plans before its own accident, the later"
+            " the darker: filled boxes are the ego, dotted ones who was near.",
         ),
     ),
 }
@@ -66,11 +80,11 @@ def _section(
     table: Table, result: PaperResult
 ) -> tuple[str, tuple[Table, ...], tuple[Drawn, ...]]:
     """Return heading, tables and the figures that there are drives for."""
-    heading, _, _ = table.title.partition(":")
+    heading = table.title.removesuffix(result.preview).partition(":")[0]
     with styled():  # the same figure gives the same names in its SVG
         drawn = [
             (Markup(svg(figure)), f"{note}{result.preview}")
             for draw, note in FIGURES.get(heading, ())
             if (figure := draw(result)) is not None
         ]
-    return heading.removesuffix(result.preview), (table,), tuple(drawn)
+    return heading, (table,), tuple(drawn)

@@ -7,6 +7,7 @@ from typing import Any
 
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.paper.accident import Accident
 from me2e_compress.study.paper.model_facts import ModelFacts
 from me2e_compress.study.paper.paper_findings import findings
 from me2e_compress.study.paper.paper_tables import all_paper_tables
@@ -29,6 +30,7 @@ class PaperResult(Result):
         failures: Why a cell was not.
         device_scale: How many times slower the device is than the machine timed on.
         machine: What it was made on, in words.
+        accident: Of the baseline, for figure 6; None where it had none.
     """
 
     study: Study
@@ -37,6 +39,7 @@ class PaperResult(Result):
     failures: Mapping[CellKey, str]
     device_scale: float
     machine: str
+    accident: Accident | None = None
 
     @property
     def title(self) -> str:

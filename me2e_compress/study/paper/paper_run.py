@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet
@@ -14,6 +15,8 @@ from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.outcome import this_machine
+from me2e_compress.study.paper.accident import FILE as ACCIDENT
+from me2e_compress.study.paper.accident import Accident, first_accident, watched
 from me2e_compress.study.paper.model_facts import (
     FILE,
     ModelFacts,
@@ -26,6 +29,7 @@ from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.recorded import recorded
 from me2e_compress.study.timing import Clock, time_all
+from me2e_compress.study.workload import held_frames
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
 from me2e_compress.workflows.checks import check_folder
 from me2e_compress.workflows.claims import check_ours, writing
@@ -100,6 +104,7 @@ def read_paper(study: Study, records: str | Path) -> PaperResult:
         {},
         float(scale),
         str(about.get("machine", "")),
+        Accident.load(folder / ACCIDENT) if (folder / ACCIDENT).is_file() else None,
     )
 
 
@@ -143,8 +148,33 @@ def _all_driven(
 ) -> PaperResult:
     for block in setup.study.blocks:
         result = _driven(block, setup, prepared, result)
+        if result.accident is None:
+            result = replace(result, accident=_accident(setup, prepared, result))
         on_block(result)
     return result
+
+
+def _accident(
+    setup: DriveSetup, prepared: Sequence[PreparedVariant], result: PaperResult
+) -> Accident | None:
+    """Return the baseline's first accident, at the highest rate that has one."""
+    path = setup.workspace.folder / "records" / ACCIDENT
+    if path.is_file():
+        return Accident.load(path)
+    study = setup.study
+    driver = next(each for each in prepared if each.variant is study.reference)
+    for condition in sorted(study.conditions, key=partial(held_frames, study)):
+        record = result.cell(study.baseline, condition.name)
+        happened = None if record is None else first_accident(record)
+        job = setup.job(driver, condition)
+        if record is None or happened is None or job is None:
+            continue
+        route = next(each for each in study.routes if each.id == happened.route)
+        found = watched(record, happened, route, job)
+        if found.moments:
+            found.save(path)
+            return found
+    return None
 
 
 def _driven(
