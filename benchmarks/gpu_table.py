@@ -33,7 +33,8 @@ class Found:
 def write(out: Path, rows: list[Found]) -> None:
     """Write the results so far, and their tables."""
     where = f"{processor()}; {', '.join(gpus()) or 'no NVIDIA GPU'}"
-    parts = [f"{where}; {versions()}"]
+    packages = ", ".join(f"{name} {each}" for name, each in versions().items())
+    parts = [f"{where}; {packages}"]
     for name in dict.fromkeys(row.subject for row in rows):
         ours = [row for row in rows if row.subject == name]
         parts.append(f"## {name}\n\n{table(ours)}")
