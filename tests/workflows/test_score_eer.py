@@ -177,9 +177,9 @@ def test_the_command_prints_what_the_page_says(tmp_path: Path) -> None:
             folder.save(Driven(each, 0.0, 0))
     app = typer.Typer()
     app.command()(command)
-    words = [str(tmp_path / "fast"), str(tmp_path / "slow"), "--energy", "fast=2"]
+    words = [str(tmp_path / "fast"), str(tmp_path / "slow"), "--joules", "fast=2"]
 
-    result = CliRunner().invoke(app, [*words, "--energy", "slow=3", "--json"])
+    result = CliRunner().invoke(app, [*words, "--joules", "slow=3", "--json"])
 
     document = json.loads(result.stdout)
     assert faults("score", document) == []

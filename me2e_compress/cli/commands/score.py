@@ -25,7 +25,7 @@ AbilityRules = Annotated[
 Penalties = Annotated[
     str | None, typer.Option(help="of infractions: b2d, 1.0, 2.0 or 2.1")
 ]
-Energy = Annotated[
+Joules = Annotated[
     list[str] | None,
     typer.Option(help="NAME=JOULES or NAME=FILE: of an inference; gives EER_AV"),
 ]
@@ -47,7 +47,7 @@ def score(
     junctions: Junctions = None,
     rules: AbilityRules = None,
     penalties: Penalties = None,
-    energy: Energy = None,
+    joules: Joules = None,
     modelled: Modelled = None,
     weights: Weights = None,
     save_weights: SaveWeights = None,
@@ -55,7 +55,7 @@ def score(
 ) -> None:
     """Print driving score, success rate, efficiency, comfort and abilities.
 
-    With --energy or --modelled also EER_AV, which compares all folders. The other
+    With --joules or --modelled also EER_AV, which compares all folders. The other
     options but --json are about results of real Bench2Drive or CARLA runs.
     """
     options = Bench2DriveOptions(
@@ -71,7 +71,7 @@ def score(
             listener=listener,
             real=options if asked else None,
             eer=EerOptions(
-                joules_named(energy or ()),
+                joules_named(joules or ()),
                 joules_named(modelled or ()),
                 weights,
                 save_weights,

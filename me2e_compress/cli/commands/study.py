@@ -10,7 +10,7 @@ from me2e_compress.cli.console import listening, say, show, tell
 
 STUDY = "STUDY.toml, or a shipped study's name: paper"
 Provider = Annotated[
-    str | None, typer.Option(help="runs the models: cpu, cuda, ...; not the study's")
+    str | None, typer.Option(help="runs the graph: cpu, cuda, ...; default the study's")
 ]
 Routes = Annotated[str | None, typer.Option(help=f"{given.ROUTES}; not the study's")]
 Tables = Annotated[
