@@ -75,6 +75,7 @@ def test_every_section_is_there(page: str) -> None:
         "Scoreboard",
         "Paired differences",
         "What a point of driving score costs",
+        "Near misses",
         "Abilities",
         "Where they part",
         "How it was made",
