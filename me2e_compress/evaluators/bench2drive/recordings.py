@@ -6,7 +6,7 @@ CARLA's left-handed world. There is no time in it: it follows from the motion it
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,11 +23,12 @@ INTERVALS_S = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0)
 _PARTS = ("acceleration", "angular_velocity", "forward_vector", "right_vector")
 _LOCATION = "location"
 _STEP = re.compile(r"-?\d{1,15}")
-_LIKENESS = 0.5
-"""Correlation from which two signals are taken to tell of the same motion."""
+_LIKENESS, _SURE = 0.3, 0.95
+"""Correlations from which two signals are taken to tell of the same motion, and from
+which nothing else is asked."""
 _LEAST_MPS2, _LEAST_RADPS = 0.05, 0.01
 """Root mean squares below which a signal is noise."""
-_AGREES, _EQUALS = float(np.log(1.5)), float(np.log(1.1))
+_AGREES, _EQUALS = float(np.log(2.5)), float(np.log(1.1))
 
 Floats = npt.NDArray[np.float64]
 
@@ -98,45 +99,62 @@ class Recording:
     def interval_s(self, duration_s: float | None = None) -> float:
         """Return the seconds from one step to the next.
 
-        They are taken from what position and acceleration say of the same motion, or
-        else heading and yaw rate. The duration divided by the steps decides where it
-        is one of the usual intervals and roughly agrees, and decides alone for an ego
-        that never moved. Without any of them a step is a tick.
+        Position and acceleration tell of the same motion, and so do heading and yaw
+        rate; what they say decides where they are alike. Where they are only roughly,
+        as at 2 Hz, the duration divided by the steps decides if it is one of the usual
+        intervals and roughly agrees; it decides alone for an ego that never moved.
+        Without any of them a step is a tick.
 
         Args:
             duration_s: Simulated seconds of the whole route.
         """
-        moved = self._from_positions() or self._from_headings()
+        found = [each for each in self._ties() if each.likeness > _LIKENESS]
+        moved = max(found, key=lambda each: each.likeness, default=None)
         lasted = None if duration_s is None else _usual(duration_s / len(self.steps))
-        if lasted and (moved is None or abs(np.log(lasted / moved)) < _AGREES):
+        if moved is None:
+            return lasted or self._from_steps()
+        apart = abs(np.log(lasted / moved.interval_s)) if lasted else np.inf
+        if lasted and moved.likeness < _SURE and apart < _AGREES:
             return lasted
-        return self._from_steps() if moved is None else _nearest(moved)
+        return _nearest(moved.interval_s)
 
-    def _from_positions(self) -> float | None:
-        """Compare second differences of the position with the acceleration, dt2 * a.
+    def _ties(self) -> Iterator["_Tie"]:
+        """Compare pairs of signals that differ by a power of the interval.
 
-        CARLA's acceleration is that of the step that led here; one that was computed
-        may be that of the moment between.
+        Second differences of the position are dt2 times the acceleration: CARLA's is
+        that of the step that led to a moment, one that was computed may be that of the
+        moment between. First differences of the heading are dt times the yaw rate.
         """
-        bends = np.diff(self.position_m, 2, axis=0)
-        if not bends.size:
-            return None
-        squares = (
-            _slope(bends.ravel(), self.acceleration_mps2[part].ravel(), _LEAST_MPS2)
-            for part in (slice(2, None), slice(1, -1))
-        )
-        square = max((each for each in squares if each is not None), default=None)
-        return None if square is None else float(np.sqrt(square))
-
-    def _from_headings(self) -> float | None:
-        turns = np.diff(self.heading_rad)
+        bends, turns = np.diff(self.position_m, 2, axis=0), np.diff(self.heading_rad)
         between = (self.yaw_rate_radps[1:] + self.yaw_rate_radps[:-1]) / 2.0
-        return _slope(turns, between, _LEAST_RADPS) if turns.size else None
+        for part in (slice(2, None), slice(1, -1)):
+            pulls = self.acceleration_mps2[part]
+            yield _Tie.of(bends.ravel(), pulls.ravel(), 0.5, _LEAST_MPS2)
+        yield _Tie.of(turns, between, 1.0, _LEAST_RADPS)
 
     def _from_steps(self) -> float:
         between = np.diff(self.steps)
         ticks = float(np.median(between)) if between.size else 1.0
         return TICK_S * max(1.0, min(ticks, 20.0))
+
+
+@dataclass(frozen=True)
+class _Tie:
+    """What two signals say of the interval, and how alike they are, -1 to 1."""
+
+    interval_s: float
+    likeness: float
+
+    @classmethod
+    def of(cls, of: Floats, over: Floats, power: float, least: float) -> "_Tie":
+        """Compare their root mean squares: noise in either moves that the least."""
+        if not over.size:
+            return cls(0.0, 0.0)
+        left, right = (float(np.sqrt((each * each).mean())) for each in (of, over))
+        if right < least or left == 0.0:
+            return cls(0.0, 0.0)
+        likeness = float((of * over).mean()) / (left * right)
+        return cls((left / right) ** power, likeness)
 
 
 def _lengths(vectors: Any) -> Floats:
@@ -152,16 +170,6 @@ def _usual(interval_s: float) -> float | None:
     """Return the interval that is within a tenth of one of the usual, if it is."""
     nearest = _nearest(interval_s)
     return nearest if abs(np.log(nearest / interval_s)) < _EQUALS else None
-
-
-def _slope(of: Floats, over: Floats, least: float) -> float | None:
-    """Return the positive factor that ties two signals, None if none does."""
-    power = float((over * over).sum())
-    if np.sqrt(power / over.size) < least:
-        return None
-    both = float((of * over).sum())
-    likeness = both / np.sqrt(power * float((of * of).sum()) or np.inf)
-    return both / power if likeness > _LIKENESS else None
 
 
 def read_recording(raw: object) -> Recording:
