@@ -30,11 +30,8 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.compare import CompareResult, compare
     from me2e_compress.workflows.compress import CompressOptions, compress
     from me2e_compress.workflows.compress_result import CompressResult
-    from me2e_compress.workflows.evaluate import (
-        EvaluateOptions,
-        EvaluateResult,
-        evaluate,
-    )
+    from me2e_compress.workflows.evaluate import EvaluateOptions, evaluate
+    from me2e_compress.workflows.evaluate_result import EvaluateResult
     from me2e_compress.workflows.frames import FramesOptions, record_frames
     from me2e_compress.workflows.inspect import InspectResult, inspect
     from me2e_compress.workflows.lint import LintOptions, LintResult, lint
@@ -137,7 +134,8 @@ _ROOMS = {
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),
-    "workflows.evaluate": ("EvaluateOptions", "EvaluateResult", "evaluate"),
+    "workflows.evaluate": ("EvaluateOptions", "evaluate"),
+    "workflows.evaluate_result": ("EvaluateResult",),
     "workflows.frames": ("FramesOptions", "record_frames"),
     "workflows.inspect": ("InspectResult", "inspect"),
     "workflows.lint": ("LintOptions", "LintResult", "lint"),

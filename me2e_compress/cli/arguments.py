@@ -69,3 +69,6 @@ JudgedFrames = Annotated[
 ]
 ROUTES = "routes: all, a number, ID,ID"
 Routes = Annotated[str, typer.Option(help=f"{ROUTES}; or a file of routes")]
+Budget = Annotated[
+    float, typer.Option("--budget-ms", help="what a decision may take; 20 Hz: 50")
+]

@@ -14,12 +14,13 @@ from me2e_compress.evaluators.highway.evaluation_options import (
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress
 from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
-from me2e_compress.metrics.scores import Scores
+from me2e_compress.metrics.deadlines import charged
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.workflows.checks import check_folder, check_number, model_path
 from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.evaluate_result import EvaluateResult
 from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.other_evaluators import (
@@ -31,8 +32,7 @@ from me2e_compress.workflows.other_evaluators import (
     is_highway,
     keep,
 )
-from me2e_compress.workflows.result import Result, Table, number
-from me2e_compress.workflows.score import driving_score, score_records, scores_table
+from me2e_compress.workflows.result import number
 from me2e_compress.zoo.shipped import SHIPPED
 
 _FLAGS = {"frame_limit_s": "frame-limit"}
@@ -110,44 +110,6 @@ class EvaluateOptions:
                 )
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
-class EvaluateResult(Result):
-    """How a policy drives.
-
-    Attributes:
-        policy: as it was named; the evaluator, where that drives none.
-        output: the folder of results.
-        scores: over the routes.
-        pictures: that were drawn.
-    """
-
-    policy: str
-    output: Path
-    scores: Scores
-    pictures: tuple[Path, ...] = ()
-
-    @property
-    def headline(self) -> str:
-        """Policy, driving score, routes."""
-        return f"{self.policy}: {driving_score(self.scores)}"
-
-    def lines(self) -> tuple[str, ...]:
-        """Return none: the table says it."""
-        return ()
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return every score with its interval."""
-        return (scores_table(self.policy, self.scores),)
-
-    def records(self) -> list[dict[str, object]]:
-        """Return a row a score."""
-        return score_records(self.scores)
-
-    def to_json(self) -> object:
-        """Return the scores."""
-        return self.scores.to_json()
-
-
 def evaluate(
     policy: str | Path | None,
     output: str | Path,
@@ -198,7 +160,8 @@ def _by_another(
         episodes = driven_episodes(evaluator)
         keep(evaluator, episodes, output, policy or "")
     scores = score_episodes(episodes, expected_of(evaluator, episodes))
-    return EvaluateResult(policy or evaluator.name, output, scores)
+    late = charged(episodes)
+    return EvaluateResult(policy or evaluator.name, output, scores, late=late)
 
 
 def _evaluated(
@@ -234,9 +197,10 @@ def _evaluated(
         address=options.address,
     )
     evaluator = asked.evaluator(on_progress, listener.on_warning, driver)
-    scores = score_episodes(tuple(evaluator.episodes()), evaluator.set_size)
+    episodes = tuple(evaluator.episodes())
+    scores = score_episodes(episodes, evaluator.set_size)
     pictures = _pictures(evaluator.job, shown, output)
-    return EvaluateResult(policy, output, scores, pictures)
+    return EvaluateResult(policy, output, scores, pictures, charged(episodes))
 
 
 def with_stage(driver: Driver, host_stage: str) -> Driver:

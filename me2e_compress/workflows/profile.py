@@ -9,6 +9,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
+from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.modules import assign
 from me2e_compress.runtime.breakdown import Breakdown, break_down
 from me2e_compress.runtime.energy import EnergyResult
@@ -30,6 +31,7 @@ from me2e_compress.workflows.checks import (
     model_path,
 )
 from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.deadlines_table import check_budget
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
@@ -56,10 +58,12 @@ class ProfileOptions:
         energy: then measure joules by ``auto`` or a counter; None does not.
         energy_output: file of these; None is beside the trace, ``.energy.json``.
         schedule: how long energy is measured, and how often; None takes the defaults.
+        budget_ms: what a decision may take: latencies are held against it.
 
     Raises:
         RecipeError: a number below 0, or beyond all measure; or a file of joules
             that nobody measures.
+        EvaluationError: a budget that is not positive.
     """
 
     samples: int | None = None
@@ -73,11 +77,13 @@ class ProfileOptions:
     energy: str | None = None
     energy_output: str | Path | None = None
     schedule: EnergySchedule | None = None
+    budget_ms: float = BUDGET_MS
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         if self.energy is None and self.energy_output is not None:
             raise RecipeError("--energy-out: there is no --energy to write")
+        check_budget(self.budget_ms)
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
         check_count("--warm-up", self.warm_up, most=MOST_SAMPLES)
@@ -134,6 +140,7 @@ def profile(
         *(source, trace, written, load.cores, load.of, operators, figure),
         energy=energy,
         energy_output=joules,
+        budget_ms=options.budget_ms,
     )
 
 

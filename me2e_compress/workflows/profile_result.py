@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from me2e_compress.metrics.deadlines import BUDGET_MS, Deadlines, deadlines
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import (
     LatencyTrace,
@@ -11,6 +12,7 @@ from me2e_compress.runtime.latency_trace import (
     shares_table,
 )
 from me2e_compress.runtime.others_load import BUSY, is_busy
+from me2e_compress.workflows.deadlines_table import deadlines_table
 from me2e_compress.workflows.result import Result, Table
 
 _SHOWN = 12
@@ -34,6 +36,7 @@ class ProfileResult(Result):
         cores: of the machine.
         energy: joules, or why there are none; None: not asked for.
         energy_output: the file they were written to; None if they were not.
+        budget_ms: what a decision may take.
     """
 
     model: Path
@@ -45,6 +48,12 @@ class ProfileResult(Result):
     figure: Path | None = None
     energy: EnergyResult | None = None
     energy_output: Path | None = None
+    budget_ms: float = BUDGET_MS
+
+    @property
+    def deadlines(self) -> Deadlines:
+        """The samples held against the budget."""
+        return deadlines(self.trace.samples_us, self.budget_ms)
 
     @property
     def headline(self) -> str:
@@ -79,7 +88,9 @@ class ProfileResult(Result):
         """Return the percentiles in milliseconds, by module and operator too."""
         whole, *modules = self.trace.tables()
         energy = () if self.energy is None else self.energy.tables()
-        found = (dataclasses.replace(whole, title=self.headline), *modules, *energy)
+        late = deadlines_table("Against the budget", self.deadlines)
+        whole = dataclasses.replace(whole, title=self.headline)
+        found = (whole, late, *modules, *energy)
         if not self.operators_us:
             return found
         rest = len(self.operators_us) - _SHOWN
@@ -95,6 +106,7 @@ class ProfileResult(Result):
         """Return what the trace holds, shares, joules, how busy the machine was."""
         return {
             **self.trace.to_json(),
+            "deadlines": self.deadlines.to_json(),
             "modules": shares(self.trace.modules_us),
             "operators": shares(self.operators_us),
             "energy": None if self.energy is None else self.energy.to_json(),

@@ -9,9 +9,11 @@ from me2e_compress.evaluators.bench2drive.result_files import holds_records
 from me2e_compress.evaluators.highway.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import scores as metrics
 from me2e_compress.metrics.comfort import stood_most
+from me2e_compress.metrics.deadlines import BUDGET_MS, Deadlines, charged
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
+from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, number, table
 from me2e_compress.workflows.score_bench2drive import (
@@ -32,11 +34,14 @@ class ScoreResult(Result):
         scores: in the order in which the folders were named.
         real: more of those that hold the results of real runs.
         eer: EER_AV of all of them together; None where it was not asked for.
+        late: what decisions took, held against a budget; without folders whose
+            decisions cost nothing.
     """
 
     scores: Mapping[str, Scores]
     real: Mapping[str, RealRun] = dataclasses.field(default_factory=dict)
     eer: EerScores | None = None
+    late: Mapping[str, Deadlines] = dataclasses.field(default_factory=dict)
 
     @property
     def headline(self) -> str:
@@ -75,7 +80,11 @@ class ScoreResult(Result):
     def to_json(self) -> object:
         """Return the scores of every folder, and EER_AV of all together."""
         found = [
-            {"results": name, **self.real.get(name, scores).to_json()}
+            {
+                "results": name,
+                **self.real.get(name, scores).to_json(),
+                "deadlines": self.late[name].to_json() if name in self.late else None,
+            }
             for name, scores in self.scores.items()
         ]
         return {
@@ -84,12 +93,16 @@ class ScoreResult(Result):
         }
 
     def _of(self, name: str, scores: Scores) -> tuple[Table, ...]:
+        late = [
+            deadlines_table(name, each) for at, each in self.late.items() if at == name
+        ]
         if name not in self.real:
-            return (scores_table(name, scores),)
+            return (scores_table(name, scores), *late)
         real = self.real[name]
         return (
             *real.tables(name),
             scores_table(f"{name}, abilities by the rules {real.rules}", scores),
+            *late,
         )
 
 
@@ -98,6 +111,7 @@ def score(
     listener: Listener = SILENT,
     real: Bench2DriveOptions | None = None,
     eer: EerOptions | None = None,
+    budget_ms: float = BUDGET_MS,
 ) -> ScoreResult:
     """Score the episodes in folders of results.
 
@@ -107,11 +121,14 @@ def score(
         real: how results of real runs are read; None takes the defaults. Given, all
             folders are taken to be of real runs.
         eer: joules of the folders, for EER_AV of all of them together.
+        budget_ms: what a decision may take.
 
     Raises:
-        EvaluationError: not a folder of results, or EER_AV cannot compare them.
+        EvaluationError: not a folder of results, EER_AV cannot compare them, or a
+            budget that is not positive.
         EnergyError: a file of joules is not usable.
     """
+    check_budget(budget_ms)
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
     driven = dict[str, Sequence[Episode]]()
     for path in map(Path, results):
@@ -127,7 +144,12 @@ def score(
         run = score_real_run(path, real or Bench2DriveOptions())
         scores[str(path)], runs[str(path)] = run.scores, run
         driven[str(path)] = run.collected.episodes
-    return ScoreResult(scores, runs, score_eer(driven, eer or EerOptions()))
+    late = {
+        name: found
+        for name, episodes in driven.items()
+        if (found := charged(episodes, budget_ms)) is not None
+    }
+    return ScoreResult(scores, runs, score_eer(driven, eer or EerOptions()), late)
 
 
 def _episodes(path: Path, listener: Listener) -> tuple[tuple[Episode, ...], int]:

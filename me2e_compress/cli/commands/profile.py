@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show, tell
+from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import profile as workflow
@@ -32,6 +33,7 @@ def profile(
     energy_out: Annotated[
         Path | None, typer.Option(help="joules as JSON; beside the trace if not named")
     ] = None,
+    budget_ms: given.Budget = BUDGET_MS,
     module_map: given.ModuleMap = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
@@ -44,6 +46,7 @@ def profile(
         *(samples, warm_up, threads, device, by_module, module_map, figure, force),
         energy=energy,
         energy_output=energy_out,
+        budget_ms=budget_ms,
     )
     with listening() as listener:
         found = workflow.profile(model, frames, output, options, listener)

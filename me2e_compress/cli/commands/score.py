@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.metrics.penalties import Version
 from me2e_compress.metrics.traffic_signs import Rules
 from me2e_compress.workflows import score as workflow
@@ -51,12 +52,13 @@ def score(
     modelled: Modelled = None,
     weights: Weights = None,
     save_weights: SaveWeights = None,
+    budget_ms: given.Budget = BUDGET_MS,
     as_json: given.Json = False,
 ) -> None:
     """Print driving score, success rate, efficiency, comfort and abilities.
 
     With --joules or --modelled also EER_AV, which compares all folders. The other
-    options but --json are about results of real Bench2Drive or CARLA runs.
+    options but --budget-ms and --json are about results of real runs in CARLA.
     """
     options = Bench2DriveOptions(
         metrics,
@@ -76,5 +78,6 @@ def score(
                 weights,
                 save_weights,
             ),
+            budget_ms=budget_ms,
         )
     show(found, as_json)

@@ -1,0 +1,37 @@
+"""A table of deadlines: of a trace, or of the decisions of an evaluation."""
+
+from collections.abc import Iterator
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.deadlines import Deadlines
+from me2e_compress.metrics.measure import Measure
+from me2e_compress.workflows.result import Table, number, table
+
+
+def deadlines_table(title: str, found: Deadlines) -> Table:
+    """Show percentiles and how many decisions took longer than the budget."""
+    rows = [(name, *_cells(measure)) for name, measure in _each(found)]
+    return table(f"{title}: {found.count} decisions", ("latency", "", "unit"), rows)
+
+
+def check_budget(budget_ms: float) -> None:
+    """Check the budget of a decision.
+
+    Raises:
+        EvaluationError: It is not a positive number.
+    """
+    if not 0.0 < budget_ms < float("inf"):
+        raise EvaluationError(f"--budget-ms {budget_ms:g}: must be a positive number")
+
+
+def _each(found: Deadlines) -> Iterator[tuple[str, Measure]]:
+    yield from ((f"p{p:g}", each) for p, each in found.percentiles_ms.items())
+    yield "max", found.worst_ms
+    yield "mean", found.mean_ms
+    yield f"over {found.budget_ms:g} ms", found.over_percent
+
+
+def _cells(measure: Measure) -> tuple[str, str]:
+    if measure.value is None:
+        return "-", f"not measured: {measure.reason}"
+    return number(measure.value, ".2f"), measure.unit

@@ -1,0 +1,53 @@
+"""How a policy drives, as it is shown."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.metrics.deadlines import Deadlines
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.workflows.deadlines_table import deadlines_table
+from me2e_compress.workflows.result import Result, Table
+from me2e_compress.workflows.score import driving_score, score_records, scores_table
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class EvaluateResult(Result):
+    """How a policy drives.
+
+    Attributes:
+        policy: as it was named; the evaluator, where that drives none.
+        output: the folder of results.
+        scores: over the routes.
+        pictures: that were drawn.
+        late: what decisions were charged, held against a frame; None where nothing.
+    """
+
+    policy: str
+    output: Path
+    scores: Scores
+    pictures: tuple[Path, ...] = ()
+    late: Deadlines | None = None
+
+    @property
+    def headline(self) -> str:
+        """Policy, driving score, routes."""
+        return f"{self.policy}: {driving_score(self.scores)}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return none: the table says it."""
+        return ()
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return every score with its interval, and what decisions were charged."""
+        late = None if self.late is None else deadlines_table(self.policy, self.late)
+        scores = scores_table(self.policy, self.scores)
+        return (scores,) if late is None else (scores, late)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a score."""
+        return score_records(self.scores)
+
+    def to_json(self) -> object:
+        """Return the scores, and what decisions were charged."""
+        late = None if self.late is None else self.late.to_json()
+        return {**self.scores.to_json(), "deadlines": late}

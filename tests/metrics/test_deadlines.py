@@ -1,0 +1,49 @@
+import pytest
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.deadlines import deadlines
+from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
+
+
+def test_percentiles_and_the_share_over_budget() -> None:
+    found = deadlines([1_000 * ms for ms in range(1, 1001)], 50.0)
+
+    assert found.to_json() == {
+        "budget_ms": 50.0,
+        "decisions": 1000,
+        "p50_ms": 500.0,
+        "p99_ms": 990.0,
+        "p99.9_ms": 999.0,
+        "mean_ms": 500.5,
+        "max_ms": 1000.0,
+        "over_budget_percent": 95.0,
+    }
+
+
+def test_exactly_the_budget_is_in_time() -> None:
+    assert deadlines([50_000, 50_001]).over_percent.value == 50.0
+
+
+def test_a_percentile_of_too_few_is_not_measured() -> None:
+    found = deadlines([40_000] * 150)
+
+    assert found.percentiles_ms[99.0].value == 40.0
+    assert found.percentiles_ms[99.9].reason == "150 decisions, 1000 needed"
+    rows = deadlines_table("trace", found).rows
+    assert [cell.text for cell in rows[2]] == [
+        *("p99.9", "-", "not measured: 150 decisions, 1000 needed")
+    ]
+
+
+def test_nothing_decided_is_not_zero() -> None:
+    found = deadlines([])
+
+    assert found.count == 0
+    assert found.over_percent.value is None
+    assert set(found.to_json().values()) == {50.0, 0, None}
+
+
+@pytest.mark.parametrize("budget_ms", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_budget_is_positive(budget_ms: float) -> None:
+    with pytest.raises(EvaluationError, match="--budget-ms"):
+        check_budget(budget_ms)
