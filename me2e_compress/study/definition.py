@@ -12,7 +12,6 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.simulator.routes import Route
-from me2e_compress.study.blocks import Block, FramesToRecord
 from me2e_compress.study.condition import (
     Condition,
     check_conditions,
@@ -20,6 +19,7 @@ from me2e_compress.study.condition import (
     check_pairs,
 )
 from me2e_compress.study.names import check_name, check_unique
+from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 
 
@@ -141,7 +141,7 @@ class Study:
     seed: int = 0
     provider: Provider = CPU
     to_record: FramesToRecord | None = None
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[StudyBlock, ...] = ()
     pairs: tuple[tuple[str, str], ...] = ()
     report: Literal["comparison", "paper"] = "comparison"
     evaluator: str = HIGHWAY
@@ -255,7 +255,7 @@ class Study:
             StudyError: No such block.
         """
         there = {each.name: each for each in self.blocks}
-        chosen = list[Block]()
+        chosen = list[StudyBlock]()
         for name in names:
             block = there.get(name) or there.get(f"table-{name}")
             if block is None:

@@ -33,7 +33,7 @@ _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 
 @with_config(_STRICT)
 @dataclass(frozen=True)
-class RouteRecord:
+class RouteSummary:
     """One route of one drive.
 
     Attributes:
@@ -111,7 +111,7 @@ class RouteRecord:
         )
 
 
-_ROUTE = TypeAdapter(RouteRecord)
+_ROUTE = TypeAdapter(RouteSummary)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class DriveRecord:
     condition: str
     set_size: int
     made_by: Mapping[str, Any]
-    routes: tuple[RouteRecord, ...]
+    routes: tuple[RouteSummary, ...]
 
     @classmethod
     def of(
@@ -151,7 +151,7 @@ class DriveRecord:
             episodes: One a route.
         """
         kept = {key: value for key, value in made_by.items() if key != "routes"}
-        routes = tuple(map(RouteRecord.of, episodes))
+        routes = tuple(map(RouteSummary.of, episodes))
         return cls(variant, condition, int(made_by["set_size"]), kept, routes)
 
     @property

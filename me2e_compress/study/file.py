@@ -13,9 +13,9 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
-from me2e_compress.study.blocks import Block, FramesToRecord
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
+from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
 from me2e_compress.zoo.shipped import SHIPPED
@@ -196,7 +196,7 @@ class _Reader:
             provider=provider_named(table.provider, libraries),
             to_record=self._to_record(table),
             blocks=tuple(
-                Block(each.name, tuple(each.variants), tuple(each.conditions))
+                StudyBlock(each.name, tuple(each.variants), tuple(each.conditions))
                 for each in table.block
             ),
             pairs=tuple((each.of, each.against) for each in table.pair),

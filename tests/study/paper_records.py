@@ -6,7 +6,7 @@ import numpy as np
 
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.study import Study
-from me2e_compress.study.drive_record import DriveRecord, RouteRecord
+from me2e_compress.study.drive_record import DriveRecord, RouteSummary
 from me2e_compress.study.paper.model_facts import (
     FILE,
     Int8Counts,
@@ -35,7 +35,9 @@ def write_records(study: Study, folder: Path) -> Path:
     return folder
 
 
-def _routes(study: Study, lost: float, late: int, name: str) -> tuple[RouteRecord, ...]:
+def _routes(
+    study: Study, lost: float, late: int, name: str
+) -> tuple[RouteSummary, ...]:
     made = []
     for number, route in enumerate(study.routes):
         random = np.random.default_rng([number, late, len(name)])
@@ -43,7 +45,7 @@ def _routes(study: Study, lost: float, late: int, name: str) -> tuple[RouteRecor
         score = float(np.clip(100 - lost * random.random() * 2, 0, 100))
         kind = KINDS[int(random.random() < (0.6 if "map" in name else 0.2))]
         made.append(
-            RouteRecord(
+            RouteSummary(
                 route.id,
                 route.scenario,
                 round(score * (0.6 if hit else 1.0), 3),

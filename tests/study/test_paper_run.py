@@ -9,11 +9,11 @@ import pytest
 
 from me2e_compress.errors import StudyError
 from me2e_compress.study import Condition, Listener, Study, Timing, Variant
-from me2e_compress.study.blocks import Block, FramesToRecord
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.paper.accident import Accident
 from me2e_compress.study.paper.accident_figure import plans_before
 from me2e_compress.study.paper.paper_run import read_paper, run_paper
+from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.study.workload import workload
 from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here
 
@@ -27,8 +27,8 @@ ASKED = Study(
     ROUTES,
     220,
     blocks=(
-        Block("table-2", ("blind",), ("ideal", "slow")),
-        Block("table-3", ("blind", "faster", "broken"), ("ideal",)),
+        StudyBlock("table-2", ("blind",), ("ideal", "slow")),
+        StudyBlock("table-3", ("blind", "faster", "broken"), ("ideal",)),
     ),
 )
 
@@ -178,9 +178,9 @@ def test_records_of_other_routes_do_not_stand_together(
 
 def test_what_a_block_or_a_recording_cannot_be() -> None:
     with pytest.raises(StudyError, match="block table-9: no variant gone; there are b"):
-        replace(ASKED, blocks=(Block("table-9", ("gone",), ("ideal",)),))
+        replace(ASKED, blocks=(StudyBlock("table-9", ("gone",), ("ideal",)),))
     with pytest.raises(StudyError, match="block a: there is nothing to drive"):
-        Block("a", (), ("ideal",))
+        StudyBlock("a", (), ("ideal",))
     with pytest.raises(StudyError, match="record: 0 frames and 4 held out"):
         FramesToRecord(0, 4)
 
@@ -196,7 +196,7 @@ def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
         220,
         held_out=models / "frames",
         timing=Timing(10, baseline_median_s=0.2),
-        blocks=(Block("table-3", ("slow",), ("device",)),),
+        blocks=(StudyBlock("table-3", ("slow",), ("device",)),),
     )
 
     found = run_paper(study, tmp_path, Here())

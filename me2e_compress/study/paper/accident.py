@@ -17,7 +17,7 @@ from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, Ego
 from me2e_compress.simulator.world import World
-from me2e_compress.study.drive_record import DriveRecord, RouteRecord
+from me2e_compress.study.drive_record import DriveRecord, RouteSummary
 
 FILE = "accident.json"
 BEFORE_US, EVERY_US = 3_000_000, 500_000
@@ -31,7 +31,7 @@ Point = tuple[float, float]
 
 @with_config(_STRICT)
 @dataclass(frozen=True)
-class Box:
+class SeenBox:
     """A road user seen from above: metres and radians in the world."""
 
     kind: str
@@ -55,9 +55,9 @@ class PlannedMoment:
     """
 
     time_us: int
-    ego: Box
+    ego: SeenBox
     plan: tuple[Point, ...]
-    others: tuple[Box, ...]
+    others: tuple[SeenBox, ...]
 
 
 @with_config(_STRICT)
@@ -114,7 +114,7 @@ class Accident:
 _ACCIDENT = TypeAdapter(Accident)
 
 
-def first_accident(record: DriveRecord) -> RouteRecord | None:
+def first_accident(record: DriveRecord) -> RouteSummary | None:
     """Return the first route that ended in a collision with someone who moves."""
     moving = (InfractionKind.COLLISION_VEHICLE, InfractionKind.COLLISION_PEDESTRIAN)
     for each in record.routes:
@@ -125,7 +125,7 @@ def first_accident(record: DriveRecord) -> RouteRecord | None:
 
 
 def watched(
-    record: DriveRecord, happened: RouteRecord, route: Route, job: Job
+    record: DriveRecord, happened: RouteSummary, route: Route, job: Job
 ) -> Accident:
     """Drive a route again, and keep its last seconds.
 
@@ -175,9 +175,9 @@ def _planned(moment: Moment) -> PlannedMoment:
     return PlannedMoment(time_us, _box("ego", ego), waypoints, tuple(others))
 
 
-def _box(kind: str, seen: Ego | Actor) -> Box:
+def _box(kind: str, seen: Ego | Actor) -> SeenBox:
     x, y, heading = round(seen.x, 3), round(seen.y, 3), round(seen.heading, 4)
-    return Box(kind, x, y, heading, seen.length, seen.width)
+    return SeenBox(kind, x, y, heading, seen.length, seen.width)
 
 
 def _in_world(

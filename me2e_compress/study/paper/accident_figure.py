@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from me2e_compress.study.paper.accident import Accident, Box, PlannedMoment
+from me2e_compress.study.paper.accident import Accident, PlannedMoment, SeenBox
 from me2e_compress.study.report.figures import WIDTH_IN
 from me2e_compress.study.report.style import MUTED, RULE, styled
 
@@ -55,7 +55,7 @@ def plans_before(accident: Accident) -> Figure:
 def _moment(
     axes: Axes,
     moment: PlannedMoment,
-    here: Box,
+    here: SeenBox,
     shade: Sequence[float],
     until_us: int,
 ) -> None:
@@ -76,7 +76,7 @@ def _moment(
 
 
 def _draw(
-    axes: Axes, box: Box, here: Box, colour: tuple[float, ...], *, filled: bool
+    axes: Axes, box: SeenBox, here: SeenBox, colour: tuple[float, ...], *, filled: bool
 ) -> None:
     cos, sin = math.cos(box.heading), math.sin(box.heading)
     half = np.array([box.length, box.width]) / 2
@@ -94,14 +94,14 @@ def _draw(
     )
 
 
-def _seen(points: npt.ArrayLike, here: Box) -> Floats:
+def _seen(points: npt.ArrayLike, here: SeenBox) -> Floats:
     """Return points of the world in the frame of a box, x forward, y to its left."""
     cos, sin = math.cos(here.heading), math.sin(here.heading)
     moved = np.asarray(points, np.float64) - (here.x, here.y)
     return np.asarray(moved @ np.array([[cos, -sin], [sin, cos]]))
 
 
-def _frame(axes: Axes, moments: Sequence[PlannedMoment], here: Box) -> None:
+def _frame(axes: Axes, moments: Sequence[PlannedMoment], here: SeenBox) -> None:
     """Show what the ego drove and planned, and a little around it."""
     driven = [(moment.ego.x, moment.ego.y) for moment in moments]
     planned = [point for moment in moments for point in moment.plan]

@@ -12,7 +12,7 @@ from me2e_compress.metrics.efficiency import CHECKPOINTS
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_measures import RouteMeasures
-from me2e_compress.study.drive_record import DriveRecord, RouteRecord
+from me2e_compress.study.drive_record import DriveRecord, RouteSummary
 from me2e_compress.study.tables import estimate_cell, measure_cell
 from me2e_compress.workflows.result import Cell
 
@@ -106,30 +106,30 @@ def _scores(
     return found
 
 
-def _efficiency(route: RouteRecord) -> float:
+def _efficiency(route: RouteSummary) -> float:
     if route.efficiency is not None:
         return route.efficiency
     begun = route.completion >= 100.0 / CHECKPOINTS
     return math.nan if begun or not _recorded(route) else 0.0
 
 
-def _comfort(route: RouteRecord) -> float:
+def _comfort(route: RouteSummary) -> float:
     if route.comfort is not None:
         return route.comfort
     return 0.0 if _recorded(route) else math.nan
 
 
-def _route_joules(route: RouteRecord, j_per_frame: float | None) -> float:
+def _route_joules(route: RouteSummary, j_per_frame: float | None) -> float:
     if j_per_frame is None or not (route.decisions or _failed(route)):
         return math.nan
     return j_per_frame * route.decisions
 
 
-def _recorded(route: RouteRecord) -> bool:
+def _recorded(route: RouteSummary) -> bool:
     return bool(route.duration_us or _failed(route))
 
 
-def _failed(route: RouteRecord) -> bool:
+def _failed(route: RouteSummary) -> bool:
     return route.ending == Ending.POLICY_FAILED.value
 
 

@@ -13,7 +13,7 @@ from me2e_compress.study.paper.published import (
 from me2e_compress.study.paper.questions import (
     Evidence,
     Finding,
-    Question,
+    PaperQuestion,
     Rule,
     UntestedError,
     falls,
@@ -57,19 +57,19 @@ def _keeps(cell: tuple[str, str], share: float) -> Callable[[Evidence], Rule]:
 
 
 RATE_QUESTIONS = (
-    Question(
+    PaperQuestion(
         "More decisions a second drive better, up to 20",
         "DS +20.33 % from 1 to 20 FPS (table 2)",
         "DS at 20 FPS minus DS at 1 FPS",
         lambda e: e.difference(IDEAL, ONE),
     ),
-    Question(
+    PaperQuestion(
         "Most of that is gained below 10 a second",
         "gains diminish above about 10 FPS",
         "what DS gains from 1 to 10 FPS, minus what it gains from 10 to 20",
         lambda e: e.change_of_change(ONE, TEN, IDEAL),
     ),
-    Question(
+    PaperQuestion(
         "Beyond 24 a second driving gets worse",
         "DS peaks at 20 to 24 FPS, 40.63, and is 40.15 at 30",
         "none",
@@ -78,14 +78,14 @@ RATE_QUESTIONS = (
             " as here: the paper's difference is chance or a finer step"
         ),
     ),
-    Question(
+    PaperQuestion(
         "Comfort falls as the rate rises",
         f"DC {MINUS}33.33 % at 20 FPS against below 5",
         "DC at 20 FPS minus DC at 1 FPS",
         lambda e: e.difference(IDEAL, ONE, DC),
         lambda _: falls,
     ),
-    Question(
+    PaperQuestion(
         "Efficiency does not depend on the rate",
         "DE remains largely constant, 126.89 to 141.38",
         f"DE at 20 FPS minus DE at 1 FPS, within ±{HALF_SPREAD_OF_DE:.1f} points, half"
@@ -93,21 +93,21 @@ RATE_QUESTIONS = (
         lambda e: e.difference(IDEAL, ONE, DE),
         lambda _: within(HALF_SPREAD_OF_DE),
     ),
-    Question(
+    PaperQuestion(
         "10 decisions a second cost little against 22",
         f"DS {MINUS}{_lost(LIMITED[1], LIMITED[0]):.2%} (table 6)",
         "DS at 10 FPS minus DS at 22 FPS, no more lost than that share",
         lambda e: e.difference(TEN, IDEAL),
         lambda e: _keeps(IDEAL, _lost(LIMITED[1], LIMITED[0]))(e),
     ),
-    Question(
+    PaperQuestion(
         "4 decisions a second cost driving score",
         f"DS {MINUS}{_lost(LIMITED[2], LIMITED[0]):.2%} (table 6)",
         "DS at 4 FPS minus DS at 22 FPS",
         lambda e: e.difference(FOUR, IDEAL),
         lambda _: falls,
     ),
-    Question(
+    PaperQuestion(
         "Power falls in proportion to the rate",
         "613.58 W at 22 FPS, 246.21 at 10, 138.56 at 4",
         "none",
@@ -119,14 +119,14 @@ RATE_QUESTIONS = (
     ),
 )
 LATENCY_QUESTIONS = (
-    Question(
+    PaperQuestion(
         "At equal mean latency, a long tail costs driving score",
         "UniAD at its own latency, 2.31 FPS: DS 30.69; at fixed 2 FPS: 33.50",
         "float under its own latencies minus float at their mean, every decision",
         lambda e: e.difference(DEVICE, CONSTANT),
         lambda _: falls,
     ),
-    Question(
+    PaperQuestion(
         "Spikes in critical frames cost driving score at equal mean latency",
         "the collision optimisation takes over 150 ms where obstacles are near",
         "DS of the driver with that stage, charged where it is called, minus the same"
@@ -134,13 +134,13 @@ LATENCY_QUESTIONS = (
         lambda e: e.difference(("optimizer", "tail"), ("optimizer", "even")),
         lambda _: falls,
     ),
-    Question(
+    PaperQuestion(
         "Without the stage it drives better at equal mean latency",
         "DS +16.94 % without occupancy, which only triggers the stage (scheme 1)",
         "DS without the stage at its mean latency, minus with it as it is charged",
         lambda e: e.difference(("float", "even"), ("optimizer", "tail")),
     ),
-    Question(
+    PaperQuestion(
         "Without the stage it drives better, and faster for it",
         "the same",
         "DS without the stage and its time, minus with both",
@@ -148,33 +148,33 @@ LATENCY_QUESTIONS = (
     ),
 )
 MODULE_QUESTIONS = (
-    Question(
+    PaperQuestion(
         "Without occupancy it drives better",
         "DS +16.94 % (scheme 1)",
         "DS of minus-occ minus float, each at its own latency",
         lambda e: e.difference(("minus-occ", "device"), DEVICE),
     ),
-    Question(
+    PaperQuestion(
         "Without motion it drives worse",
         "DS 28.81 of 30.69 (scheme 3)",
         "DS of minus-motion minus float",
         lambda e: e.difference(("minus-motion", "device"), DEVICE),
         lambda _: falls,
     ),
-    Question(
+    PaperQuestion(
         "Without motion it drives worse, occupancy away too",
         "DS 17.24 (scheme 5) of 35.89 (scheme 1)",
         "DS of minus-occ-motion minus minus-occ",
         lambda e: e.difference(("minus-occ-motion", "device"), ("minus-occ", "device")),
         lambda _: falls,
     ),
-    Question(
+    PaperQuestion(
         "Without the map it drives no worse",
         "DS 32.24 of 30.69 (scheme 2)",
         "DS of minus-map minus float",
         lambda e: e.difference(("minus-map", "device"), DEVICE),
     ),
-    Question(
+    PaperQuestion(
         "Without the map more of the collisions are with static things",
         "55.07 % of all collisions (schemes 2 and 6)",
         "their share without the map minus their share with it",
@@ -182,7 +182,7 @@ MODULE_QUESTIONS = (
     ),
 )
 INT8_QUESTIONS = (
-    Question(
+    PaperQuestion(
         "Int8 feature extraction keeps the driving score",
         f"DS {MINUS}{_lost(INT8['feature-ext'], INT8['exact']):.1%} (table 5, UniAD)",
         "DS of feature-ext minus exact where decisions are free, no more lost than"
@@ -192,26 +192,26 @@ INT8_QUESTIONS = (
             e
         ),
     ),
-    Question(
+    PaperQuestion(
         "Int8 in the whole network costs driving score",
         f"DS {MINUS}{_lost(INT8['full'], INT8['exact']):.1%} (UniAD)",
         "DS of full minus exact where decisions are free",
         lambda e: e.difference(("full", "ideal"), ("exact", "ideal")),
         lambda _: falls,
     ),
-    Question(
+    PaperQuestion(
         "Prediction suffers more from int8 than feature extraction",
         "DS 29.53 against 36.59",
         "DS of feature-ext minus prediction where decisions are free",
         lambda e: e.difference(("feature-ext", "ideal"), ("prediction", "ideal")),
     ),
-    Question(
+    PaperQuestion(
         "Int8 feature extraction saves more time than int8 prediction",
         "28.3 against 25 FPS",
         "median latency of prediction minus that of feature-ext",
         lambda e: e.faster_by("feature-ext", "prediction"),
     ),
-    Question(
+    PaperQuestion(
         "A module away and int8 features drive better on a slow device",
         "DS 36.59 at 28.3 FPS against 30.69 at 2.31",
         "DS of minus-occ-feature-ext minus float, each at its own latency",

@@ -10,7 +10,6 @@ from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.runtime.energy.models import measure_energy
 from me2e_compress.runtime.providers import CPU
-from me2e_compress.study.blocks import Block
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.drives import DriveSetup
@@ -28,6 +27,7 @@ from me2e_compress.study.paper.model_facts import (
 from me2e_compress.study.paper.paper_result import PaperResult
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.recorded import recorded
+from me2e_compress.study.study_blocks import StudyBlock
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workload import held_frames
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
@@ -178,7 +178,7 @@ def _accident(
 
 
 def _driven(
-    block: Block,
+    block: StudyBlock,
     setup: DriveSetup,
     prepared: Sequence[PreparedVariant],
     result: PaperResult,

@@ -20,8 +20,8 @@ from me2e_compress.study.workload import held_frames
 from me2e_compress.workflows.result import Cell, Table
 
 if TYPE_CHECKING:
-    from me2e_compress.study.blocks import Block
     from me2e_compress.study.paper.paper_result import PaperResult
+    from me2e_compress.study.study_blocks import StudyBlock
 
 SCORES = tuple(each.name for each in COLUMNS)
 GIVEN = ("paper's DS", "paper's DE %", "paper's DC")
@@ -52,7 +52,7 @@ def all_paper_tables(result: "PaperResult") -> tuple[Table, ...]:
     return (*found, partners(result))
 
 
-def table_2(result: "PaperResult", block: "Block") -> Table:
+def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show one driver at the paper's rates, and at latencies of its own."""
     study, name = result.study, block.variants[0]
     conditions = [each for each in study.conditions if each.name in block.conditions]
@@ -95,7 +95,7 @@ def table_2(result: "PaperResult", block: "Block") -> Table:
     )
 
 
-def table_3(result: "PaperResult", block: "Block") -> Table:
+def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show the driver without modules, each at its own latency."""
     condition = block.conditions[0]
     base = result.fact("exact")
@@ -139,7 +139,7 @@ def table_3(result: "PaperResult", block: "Block") -> Table:
     )
 
 
-def table_5(result: "PaperResult", block: "Block") -> Table:
+def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show int8 by module, under each condition."""
     base = block.variants[0]
     rows = []
@@ -173,7 +173,7 @@ def table_5(result: "PaperResult", block: "Block") -> Table:
     )
 
 
-def table_6(result: "PaperResult", block: "Block") -> Table:
+def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show the driver with its rate limited."""
     study, name = result.study, block.variants[0]
     held = {
@@ -215,7 +215,7 @@ def table_6(result: "PaperResult", block: "Block") -> Table:
     )
 
 
-def tail(result: "PaperResult", block: "Block") -> Table:
+def tail(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show a stage that is called in critical frames, and its mean at every one."""
     base = result.study.baseline
     rows = [

@@ -204,7 +204,7 @@ def _static_and_all(drive: DriveRecord) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True)
-class Question:
+class PaperQuestion:
     """A finding of the paper before it is tested.
 
     Attributes:

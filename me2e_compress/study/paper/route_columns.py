@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from me2e_compress.metrics.intervals import Bounds, mean_estimate
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study.drive_record import DriveRecord, RouteRecord
+from me2e_compress.study.drive_record import DriveRecord, RouteSummary
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class RouteColumn:
 
     name: str
     unit: str
-    of: Callable[[RouteRecord], float | None]
+    of: Callable[[RouteSummary], float | None]
     bounds: Bounds | None = None
 
 

@@ -8,7 +8,7 @@ from me2e_compress.study.names import check_name
 
 
 @dataclass(frozen=True)
-class Block:
+class StudyBlock:
     """A part of a study: some of its variants under some of its conditions.
 
     Args:

@@ -1,0 +1,88 @@
+"""docs/paper.md, from the finished drives of the paper's study.
+
+    me2e-compress study paper -o OUT --workers 2     # hours; goes on where it was ended
+    python -m benchmarks.bench_paper OUT/records     # keeps them here, writes the page
+    python -m benchmarks.bench_paper                 # writes the page of what is kept
+
+Nothing is driven. What is kept, ``benchmarks/paper/``, is a line a route.
+"""
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+
+from me2e_compress.errors import Me2eError
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.study import load_study
+from me2e_compress.study.paper.model_facts import FILE
+from me2e_compress.study.paper.paper_run import read_paper
+from me2e_compress.study.paper.questions import Verdict
+
+ROOT = Path(__file__).parents[1]
+KEPT, PAGE = ROOT / "benchmarks" / "paper", ROOT / "docs" / "paper.md"
+HEAD = """\
+# The paper, re-tested
+
+    me2e-compress study paper -o paper --workers 2
+
+asks the questions of the paper that this toolkit follows (*Software-hardware co-optimization of modular end-to-end driving*, arXiv 2601.07393) of the driver that ships, on the 220 routes of highway-env: its tables 2 to 6, figures 5 to 7, the share of collisions by partner, and each of its findings as a question: *confirmed* where the whole 95 % interval of a paired difference lies on its side, *opposite* where it lies on the other, *not confirmed* where it holds both. `--dry-run` says what that drives: 32 drives of 220 routes, about four hours on two cores. It goes on where it was ended, `--tables 2,3` drives a part, and `--routes 44` is a preview, which every title says.
+
+Energy is measured where the machine has a counter; what is modelled from MACs and bytes stands in columns of its own. `--weigh FOLDER` counts another stack's files in table 4, such as VAD-tiny's:
+
+    me2e-compress export vad-tiny -o vad-tiny.onnx
+    me2e-compress frames vad-tiny -n 8 -o vad-frames
+    for scheme in prediction feature-ext full; do
+      me2e-compress compress vad-tiny.onnx -r $scheme --frames vad-frames -o vad-tiny/$scheme.onnx
+    done
+
+"""  # noqa: E501 - a paragraph of the page is one line
+NOTHING = "Not driven yet. Its answers will stand here.\n"
+
+
+def page(records: Path) -> str:
+    """Write the page of a folder of finished drives; of none it says so.
+
+    Raises:
+        StudyError: A file cannot be read.
+    """
+    if not (records / FILE).is_file():
+        return HEAD + NOTHING
+    found = read_paper(load_study("paper"), records)
+    verdicts = [each.verdict for each in found.findings]
+    counts = ", ".join(
+        f"{verdicts.count(each)} {each.value}" for each in Verdict if each in verdicts
+    )
+    answer = (
+        f"Of its {len(verdicts)} findings {counts}. {found.headline}; driven on"
+        f" {found.machine}. All of this is written by `python -m"
+        " benchmarks.bench_paper` from [every route](../benchmarks/paper), and `study"
+        " paper --records benchmarks/paper -o OUT` draws the figures.\n\n"
+    )
+    return HEAD + answer + "\n".join(each.markdown() for each in found.tables())
+
+
+def keep(records: Path) -> None:
+    """Copy finished drives beside this file."""
+    KEPT.mkdir(exist_ok=True)
+    for path in sorted((*records.glob("*.jsonl"), *records.glob("*.json"))):
+        shutil.copyfile(path, KEPT / path.name)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("records", type=Path, nargs="?", help="of a run: OUT/records")
+    given = parser.parse_args()
+    try:
+        if given.records is not None:
+            page(given.records)  # what cannot be read is not kept
+            keep(given.records)
+        write_bytes(PAGE, page(KEPT).encode())
+    except Me2eError as error:
+        sys.exit(f"bench_paper: {error}")
+
+
+if __name__ == "__main__":
+    main()
