@@ -108,7 +108,7 @@ def test_both_columns_are_shown(run: Run, results: Path) -> None:
 def test_what_is_wrong_is_said(run: Run, tmp_path: Path) -> None:
     write(tmp_path / "m.json", merged(GOOD, said={"eval num": 5}))
     write(tmp_path / "w.json", checkpoint(record(score=(50, 1.0, 50)), record(469)))
-    slow = recording(40, 0.5, yaw_degps=0.0, speed_mps=0.0)
+    slow = recording(40, 0.5, yaw_degps=0.0, speed_mps=0.0, every=10)
     write(tmp_path / GOOD["save_name"] / "metric_info.json", slow)
     (tmp_path / "half.json").write_text('{"_checkpoint": {"records": [{"route_id"')
 

@@ -26,6 +26,7 @@ _STEP = re.compile(r"-?\d{1,15}")
 _LIKENESS, _SURE = 0.3, 0.95
 """Correlations from which two signals are taken to tell of the same motion, and from
 which nothing else is asked."""
+_STOOD_M = 1.0
 _LEAST_MPS2, _LEAST_RADPS = 0.05, 0.01
 """Root mean squares below which a signal is noise."""
 _AGREES, _EQUALS = float(np.log(2.5)), float(np.log(1.1))
@@ -102,8 +103,9 @@ class Recording:
         Position and acceleration tell of the same motion, and so do heading and yaw
         rate; what they say decides where they are alike. Where they are only roughly,
         as at 2 Hz, the duration divided by the steps decides if it is one of the usual
-        intervals and roughly agrees; it decides alone for an ego that never moved.
-        Without any of them a step is a tick.
+        intervals and roughly agrees; it decides alone for an ego that went straight
+        ahead at one speed. Without any of them, as for one that stood, the agent's
+        steps are ticks.
 
         Args:
             duration_s: Simulated seconds of the whole route.
@@ -112,7 +114,8 @@ class Recording:
         moved = max(found, key=lambda each: each.likeness, default=None)
         lasted = None if duration_s is None else _usual(duration_s / len(self.steps))
         if moved is None:
-            return lasted or self._from_steps()
+            stood = float(np.ptp(self.position_m, axis=0).max()) < _STOOD_M
+            return self._from_steps() if stood or lasted is None else lasted
         apart = abs(np.log(lasted / moved.interval_s)) if lasted else np.inf
         if lasted and moved.likeness < _SURE and apart < _AGREES:
             return lasted

@@ -58,16 +58,16 @@ def test_the_rate_follows_from_braking_alone(interval_s: float) -> None:
     assert read_recording(brake(interval_s)).interval_s() == interval_s
 
 
-def test_a_duration_decides_for_who_stood() -> None:
-    still = read_recording(recording(steps=40, yaw_degps=0.0, speed_mps=0.0))
+def test_a_duration_decides_at_one_speed() -> None:
+    steady = read_recording(recording(steps=40, interval_s=0.5, yaw_degps=0.0))
 
-    assert still.interval_s(duration_s=40 * 0.5) == 0.5
+    assert steady.interval_s(duration_s=40 * 0.5) == 0.5
 
 
-def test_without_motion_and_duration_a_step_is_a_tick() -> None:
+def test_for_who_stood_the_steps_are_ticks() -> None:
     every_tenth = recording(steps=40, yaw_degps=0.0, speed_mps=0.0, every=10)
 
-    assert read_recording(every_tenth).interval_s() == 0.5
+    assert read_recording(every_tenth).interval_s(duration_s=40 * 0.1) == 0.5
     assert read_recording(recording(steps=1)).interval_s() == 0.05
 
 
