@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.profile_result import ProfileResult
     from me2e_compress.workflows.score import ScoreResult, score
     from me2e_compress.workflows.score_bench2drive import Bench2DriveOptions
+    from me2e_compress.workflows.score_eer import EerOptions
     from me2e_compress.workflows.search import SearchOptions, SearchResult, search
     from me2e_compress.workflows.sensitivity import (
         SensitivityOptions,
@@ -59,6 +60,7 @@ __all__ = [
     "CompressOptions",
     "CompressResult",
     "Context",
+    "EerOptions",
     "EngineResult",
     "EvaluateOptions",
     "EvaluateResult",
@@ -145,6 +147,7 @@ _ROOMS = {
     "workflows.profile_result": ("ProfileResult",),
     "workflows.score": ("ScoreResult", "score"),
     "workflows.score_bench2drive": ("Bench2DriveOptions",),
+    "workflows.score_eer": ("EerOptions",),
     "workflows.search": ("SearchOptions", "SearchResult", "search"),
     "workflows.sensitivity": (
         "SensitivityOptions",

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import MEASURES, EerResult, EerScale, eer, rankings
 from me2e_compress.metrics.episode import Episode
@@ -30,7 +31,8 @@ class EerOptions:
     Attributes:
         energy: measured joules of one inference, by folder: a number, or a file that
             ``profile --energy`` wrote. A folder's last part is enough as its name.
-        modelled: joules of one inference that follow from MACs and bytes, by folder.
+        modelled: joules of one inference that follow from MACs and bytes, by folder: a
+            number, or a file of what ``inspect --modelled-energy 7nm --json`` prints.
             They make a score of their own, never one with measured joules.
         weights: file of weights and scales that an earlier call saved.
         save_weights: where to write those of this call.
@@ -117,7 +119,7 @@ class EerScores:
         others = {n: order for n, order in self.rankings[kind].items() if order != own}
         said = f"EER_AV with {kind} energy, best first: {', '.join(own)}"
         if not others:
-            return f"{said}; the same under every normalization"
+            return f"{said}; the same under every normalization that has weights"
         turned = "; ".join(f"{n}: {', '.join(order)}" for n, order in others.items())
         return f"{said}; but {turned}"
 
@@ -146,13 +148,10 @@ def score_eer(
     if not asked:
         asked["measured"] = {}
     scales = _scales(options.weights, asked)
-    for name, each in options.modelled.items():
-        if isinstance(each, (str, Path)):
-            raise EvaluationError(f"modelled energy of {name}: {each} is no number")
     types, found = _types(folders), dict[Kind, EerResult]()
     orders = dict[Kind, dict[str, tuple[str, ...]]]()
     for kind, joules in asked.items():
-        variants = _variants(folders, joules)
+        variants = _variants(folders, kind, joules)
         found[kind] = eer(variants, scales.get(kind), types=types)
         orders[kind] = {str(n): order for n, order in rankings(variants).items()}
     if options.save_weights is not None:
@@ -195,11 +194,12 @@ def joules_named(words: Sequence[str]) -> dict[str, str | float]:
 
 
 def _variants(
-    folders: Mapping[str, Sequence[Episode]], joules: Joules
+    folders: Mapping[str, Sequence[Episode]], kind: Kind, joules: Joules
 ) -> dict[str, RouteMeasures]:
     """Return the measures of every folder, routes in the order of the first."""
     named = {
-        _folder(name, folders): _joules(name, each) for name, each in joules.items()
+        _folder(name, folders): _joules(name, kind, each)
+        for name, each in joules.items()
     }
     order = [episode.route for episode in next(iter(folders.values()), ())]
     found = dict[str, RouteMeasures]()
@@ -226,12 +226,30 @@ def _folder(name: str, folders: Mapping[str, Sequence[Episode]]) -> str:
     return fitting[0]
 
 
-def _joules(name: str, given: str | Path | float) -> float | None:
+def _joules(name: str, kind: Kind, given: str | Path | float) -> float | None:
     if isinstance(given, (str, Path)):
+        if kind == "modelled":
+            return _modelled(Path(given))
         return EnergyResult.load(Path(given)).j_per_frame
     if not 0.0 <= given < float("inf"):
         raise EvaluationError(f"energy of {name}: {given} is no number of joules")
     return given
+
+
+def _modelled(path: Path) -> float | None:
+    """Read the joules of the document that `inspect` prints."""
+    try:
+        document = documents.from_json(documents.content(path))
+        joules = document["modelled_energy"]["modelled_j_per_frame"]
+    except OSError as error:
+        raise EvaluationError(f"{path}: {error.strerror}") from error
+    except (documents.MalformedError, KeyError, TypeError) as error:
+        raise EvaluationError(
+            f"{path}: not what inspect --modelled-energy --json prints: {error}"
+        ) from error
+    if joules is not None and not (isinstance(joules, float) and joules >= 0.0):
+        raise EvaluationError(f"{path}: modelled_j_per_frame: {joules} is no number")
+    return joules
 
 
 def _types(folders: Mapping[str, Sequence[Episode]]) -> list[str]:

@@ -80,6 +80,35 @@ def test_joules_come_from_a_file(tmp_path: Path) -> None:
     assert found.to_json() == given.to_json()
 
 
+def test_modelled_joules_come_from_what_inspect_prints(tmp_path: Path) -> None:
+    file = tmp_path / "inspected.json"
+    file.write_text('{"modelled_energy": {"modelled_j_per_frame": 0.5}}')
+
+    found = score_eer(FOLDERS, EerOptions(modelled={"fast": file, "slow": 1.0}))
+    given = score_eer(FOLDERS, EerOptions(modelled={"fast": 0.5, "slow": 1.0}))
+
+    assert found is not None
+    assert given is not None
+    assert found.to_json() == given.to_json()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}",
+        '{"modelled_energy": null}',
+        '{"modelled_energy": {"modelled_j_per_frame": "1"}}',
+        "[",
+    ],
+)
+def test_a_document_without_modelled_joules_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "inspected.json").write_text(text)
+    options = EerOptions(modelled={"fast": tmp_path / "inspected.json"})
+
+    with pytest.raises(EvaluationError, match=r"inspected\.json: "):
+        score_eer(FOLDERS, options)
+
+
 def test_weights_are_saved_and_used_again(tmp_path: Path) -> None:
     joules, file = {"fast": 2.0, "slow": 3.0}, tmp_path / "weights.json"
     first = score_eer(FOLDERS, EerOptions(joules, save_weights=file))
@@ -134,7 +163,7 @@ def test_no_joules_no_score() -> None:
         (EerOptions({"other": 2.0}), "energy of other: 0 folders of that name"),
         (EerOptions({"fast": -1.0}), "energy of fast: -1.0 is no number of joules"),
         (EerOptions({"fast": float("nan")}), "nan is no number of joules"),
-        (EerOptions(modelled={"fast": "a.json"}), "of fast: a.json is no number"),
+        (EerOptions(modelled={"fast": "a.json"}), "a.json: No such file"),
         (EerOptions(weights="no.json"), "no.json: No such file"),
     ],
 )

@@ -32,7 +32,7 @@ Joules = Annotated[
 ]
 Modelled = Annotated[
     list[str] | None,
-    typer.Option(help="NAME=JOULES by MACs and bytes; an EER_AV of its own"),
+    typer.Option(help="NAME=JOULES or FILE, by MACs and bytes; an EER_AV of its own"),
 ]
 Weights = Annotated[
     Path | None, typer.Option(help="of EER_AV, as --save-weights wrote them")
