@@ -118,8 +118,7 @@ def score(
     Args:
         results: folders that ``evaluate`` wrote, or that real runs of Bench2Drive left.
         listener: is called with the files that are damaged and left out.
-        real: how results of real runs are read; None takes the defaults. Given, all
-            folders are taken to be of real runs.
+        real: how results of real runs are read; None takes the defaults.
         eer: joules of the folders, for EER_AV of all of them together.
         budget_ms: what a decision may take.
 
@@ -132,7 +131,7 @@ def score(
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
     driven = dict[str, Sequence[Episode]]()
     for path in map(Path, results):
-        if real is None and (path / MANIFEST).exists():
+        if (path / MANIFEST).exists():
             driven[str(path)], size = _episodes(path, listener)
             scores[str(path)] = metrics.score(driven[str(path)], size)
             continue
@@ -144,6 +143,11 @@ def score(
         run = score_real_run(path, real or Bench2DriveOptions())
         scores[str(path)], runs[str(path)] = run.scores, run
         driven[str(path)] = run.collected.episodes
+    if real is not None and not runs:
+        raise EvaluationError(
+            f"{', '.join(scores)}: no results of a real run, which --metrics, "
+            "--junctions, --abilities and --penalties are about"
+        )
     late = {
         name: found
         for name, episodes in driven.items()

@@ -127,6 +127,15 @@ def test_wrong_words_are_one_line_and_leave_nothing(
     assert not results.exists()
 
 
+def test_options_of_real_runs_want_one(
+    run: Run, manifest: Path, tmp_path: Path
+) -> None:
+    run("evaluate", "blind", "--routes", manifest, "-o", tmp_path / "results")
+
+    with pytest.raises(EvaluationError, match="no results of a real run, which --metr"):
+        run("score", tmp_path / "results", "--penalties", "2.0")
+
+
 def test_score_of_another_folder(run: Run, tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="not a results folder"):
         run("score", tmp_path)

@@ -56,8 +56,8 @@ class RouteRecord:
         number: The route's id in its file of routes: ``1711``.
         recording: Name of the folder of its ``metric_info.json``; None if it has none.
         duration_s: Simulated seconds; None where it does not tell.
-        content: What was read, to tell a copy from another drive; not the index, which
-            merging takes away.
+        content: How the route ended, its infractions and scores, to tell a copy from
+            a drive with another result.
         notes: What of it could not be understood, one line each.
     """
 
@@ -118,7 +118,7 @@ def read_record(raw: object) -> RouteRecord:
         number_of(record.route_id),
         record.save_name or None,
         duration_s if duration_s and duration_s > 0.0 else None,
-        record.model_dump_json(),
+        record.model_dump_json(exclude={"save_name", "meta"}),
         notes,
     )
 

@@ -70,6 +70,17 @@ def test_a_merged_file_beside_its_parts_counts_once(tmp_path: Path) -> None:
     assert found.contradictory == ()
 
 
+def test_the_same_result_once_more_is_no_contradiction(tmp_path: Path) -> None:
+    again = {**GOOD, "save_name": "RouteScenario_1711_rep0_later"}
+    write(tmp_path / "first.json", checkpoint(GOOD))
+    write(tmp_path / "second.json", checkpoint(again))
+
+    found = collect(tmp_path)
+
+    assert found.repeated == ("RouteScenario_1711_rep0",)
+    assert found.contradictory == ()
+
+
 def test_the_worst_of_contradictory_drives_counts(tmp_path: Path) -> None:
     rammed = record(
         score=(100, 0.6, 60.0), collisions_vehicle=[RAMMED], duration_s=19.0
