@@ -72,3 +72,6 @@ Routes = Annotated[str, typer.Option(help=f"{ROUTES}; or a file of routes")]
 Budget = Annotated[
     float, typer.Option("--budget-ms", help="what a decision may take; 20 Hz: 50")
 ]
+Import = Annotated[
+    Path | None, typer.Option("--import", help="what another tool measured")
+]

@@ -37,6 +37,7 @@ class ProfileResult(Result):
         energy: joules, or why there are none; None: not asked for.
         energy_output: the file they were written to; None if they were not.
         budget_ms: what a decision may take.
+        told: what else was read, in words: the power of a device.
     """
 
     model: Path
@@ -49,6 +50,7 @@ class ProfileResult(Result):
     energy: EnergyResult | None = None
     energy_output: Path | None = None
     budget_ms: float = BUDGET_MS
+    told: tuple[str, ...] = ()
 
     @property
     def deadlines(self) -> Deadlines:
@@ -63,14 +65,19 @@ class ProfileResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return how far the last percentile can be trusted, and the joules."""
         energy = () if self.energy is None else (self.energy.headline,)
+        energy = (*self.told, *energy)
         count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
         if count >= needed:
             return energy
         return (
             *energy,
             f"p99 rests on too few samples: {count}, and {needed} are needed for"
-            f" {BEYOND_P99} beyond it (--samples {needed})",
+            f" {BEYOND_P99} beyond it{self._remedy(needed)}",
         )
+
+    def _remedy(self, needed: int) -> str:
+        """Say how there would be more samples, where they were measured here."""
+        return "" if self.others_cores is None else f" (--samples {needed})"
 
     def alerts(self) -> tuple[str, ...]:
         """Return whether the machine was busy, and what puts joules in doubt."""

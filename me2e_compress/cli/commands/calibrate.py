@@ -21,7 +21,6 @@ Recipe = Annotated[str, typer.Option("-r", "--recipe", help=given.RECIPE)]
 Method = Annotated[str, typer.Option(help=given.METHOD)]
 Shard = Annotated[str | None, typer.Option(help="2/4: the second of four shards")]
 Merge = Annotated[list[Path] | None, typer.Option(help="a SHARD.npz; once for each")]
-Import = Annotated[Path | None, typer.Option("--import", help="another tool's cache")]
 Cache = Annotated[Path | None, typer.Option(help="write a TensorRT cache too")]
 Table = Annotated[Path | None, typer.Option(help="write onnxruntime's too: a folder")]
 
@@ -38,7 +37,7 @@ def calibrate(
     set_dim: given.SetDim = None,
     shard: Shard = None,
     merge: Merge = None,
-    imported: Import = None,
+    imported: given.Import = None,
     tensorrt_cache: Cache = None,
     onnxruntime_table: Table = None,
     threads: given.Threads = 0,

@@ -7,16 +7,21 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show, tell
+from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.deadlines import BUDGET_MS
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import profile as workflow
+from me2e_compress.workflows.import_profile import import_profile, refuse_both
 
 
 def profile(
     model: given.Model,
-    frames: given.Recording,
     output: Annotated[Path, typer.Option("-o", "--output", help="the trace")],
+    frames: Annotated[
+        Path | None, typer.Argument(help="the recorded FRAMES; none for --import")
+    ] = None,
+    imported: given.Import = None,
     samples: Annotated[int | None, typer.Option(help="how many latencies")] = None,
     warm_up: Annotated[int, typer.Option(help="inferences before")] = WARM_UP,
     threads: given.Threads = 1,
@@ -40,7 +45,10 @@ def profile(
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
-    """Measure a model alone and warm, and write its latencies as a trace."""
+    """Measure a model alone and warm, and write its latencies as a trace.
+
+    With --import nothing is run: the latencies are those that another tool measured.
+    """
     device = provider_named(provider, plugins or ())
     options = workflow.ProfileOptions(
         *(samples, warm_up, threads, device, by_module, module_map, figure, force),
@@ -49,7 +57,15 @@ def profile(
         budget_ms=budget_ms,
     )
     with listening() as listener:
-        found = workflow.profile(model, frames, output, options, listener)
+        if imported is not None:
+            refuse_both(frames, options)
+            found = import_profile(
+                model, [imported], output, budget_ms=budget_ms, force=force
+            )
+        elif frames is None:
+            raise EvaluationError("profile: give recorded FRAMES, or --import FILE")
+        else:
+            found = workflow.profile(model, frames, output, options, listener)
     show(found, as_json)
     if found.figure is not None:
         tell(f"wrote {found.figure}")

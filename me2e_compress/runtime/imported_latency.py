@@ -1,0 +1,168 @@
+"""Latencies and power that other tools wrote, found by what a file holds.
+
+* ``trtexec --exportTimes``: a list of inferences with ``latencyMs`` (copying in,
+  computing, copying out; TensorRT's ``samples/common/sampleReporting.cpp``);
+* ``trtexec --exportProfile``: ``count``, then layers with ``averageMs``: no inference
+  by itself, so the average of them all is one sample;
+* a latency trace of our own, made elsewhere;
+* the log of ``tegrastats``: milliwatts of the rails of a Jetson; it has no latencies.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean
+from typing import Annotated
+
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+
+from me2e_compress import documents
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.latency_trace import LatencyTrace
+
+FORMATS = (
+    "times or a profile of trtexec, a latency trace, or the log of tegrastats is"
+    " expected"
+)
+_RAIL = re.compile(r"\b([A-Z][A-Z0-9_]*) (\d+)mW/\d+mW")
+"""Now and on average; newer releases leave the unit out of neither."""
+_LONGEST_MS = 1e9
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What files of other tools say.
+
+    Attributes:
+        samples_us: One an inference; empty where none are told.
+        layers_us: What each layer takes on average.
+        rails_w: Watts of each rail, one a line of the log.
+        machine: That is named; empty if none is.
+        sources: What each file is, in words.
+    """
+
+    samples_us: tuple[int, ...] = ()
+    layers_us: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    rails_w: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    machine: str = ""
+    sources: tuple[str, ...] = ()
+
+    @property
+    def power(self) -> tuple[str, ...]:
+        """Each rail's mean and peak, in words; the input rail holds the others."""
+        return tuple(
+            f"{name}: {fmean(watts):.2f} W on average, {max(watts):.2f} W at most, over"
+            f" {len(watts)} samples (tegrastats)"
+            for name, watts in self.rails_w.items()
+        )
+
+
+def read_imports(paths: Sequence[Path]) -> Imported:
+    """Read files of other tools, at most one that tells latencies of inferences.
+
+    Raises:
+        EvaluationError: A file is missing, broken or of another kind, two tell the
+            same, or none tells a latency.
+    """
+    found = Imported()
+    for path in paths:
+        found = _joined(found, read_import(path), path)
+    if found.samples_us:
+        return found
+    if found.layers_us:
+        whole = sum(taken for (taken,) in found.layers_us.values())
+        return _with(found, samples_us=(whole,))
+    names = ", ".join(map(str, paths))
+    raise EvaluationError(f"{names}: no latency in it: give the times of trtexec, too")
+
+
+def read_import(path: Path) -> Imported:
+    """Read one file.
+
+    Raises:
+        EvaluationError: It is missing, broken or of another kind.
+    """
+    try:
+        content = documents.content(path)
+        text = content.decode("utf-8-sig", errors="replace")
+        if text.lstrip()[:1] not in ("[", "{"):
+            return _tegrastats(path, text)
+        found = documents.from_json(content)
+    except OSError as error:
+        raise EvaluationError(f"{path}: {error.strerror}") from error
+    except documents.MalformedError as error:
+        raise EvaluationError(f"{path}: {FORMATS}: {error}") from error
+    if isinstance(found, dict):
+        trace = LatencyTrace.load(path)
+        return Imported(trace.samples_us, machine=trace.machine, sources=("a trace",))
+    first = next((each for each in found if isinstance(each, dict)), {})
+    try:
+        return _profile(found) if "count" in first else _times(found)
+    except ValidationError as error:
+        one = error.errors(include_url=False)[0]
+        where = ".".join(map(str, one["loc"])) or "the file"
+        raise EvaluationError(f"{path}: {FORMATS}: {where}: {one['msg']}") from error
+
+
+_Ms = Annotated[float, Field(ge=0.0, le=_LONGEST_MS, allow_inf_nan=False)]
+
+
+class _Time(BaseModel):
+    latencyMs: _Ms  # noqa: N815 - trtexec's name
+
+
+class _Layer(BaseModel):
+    name: str
+    averageMs: _Ms  # noqa: N815 - trtexec's name
+
+
+_TIMES = TypeAdapter(Annotated[list[_Time], Field(min_length=1)])
+_LAYERS = TypeAdapter(Annotated[list[_Layer], Field(min_length=1)])
+
+
+def _times(found: list[object]) -> Imported:
+    times = _TIMES.validate_python(found)
+    samples = tuple(round(1e3 * each.latencyMs) for each in times)
+    return Imported(samples, sources=("times of trtexec",))
+
+
+def _profile(found: list[object]) -> Imported:
+    """Sum layers of one name: trtexec repeats names of loops."""
+    layers = dict[str, int]()
+    for each in _LAYERS.validate_python(found[1:]):
+        layers[each.name] = layers.get(each.name, 0) + round(1e3 * each.averageMs)
+    by_cost = sorted(layers.items(), key=lambda item: -item[1])
+    return Imported(
+        layers_us={name: (taken,) for name, taken in by_cost},
+        sources=("a profile of trtexec",),
+    )
+
+
+def _tegrastats(path: Path, text: str) -> Imported:
+    rails = dict[str, list[float]]()
+    for name, milliwatts in _RAIL.findall(text):
+        rails.setdefault(name, []).append(int(milliwatts) / 1e3)
+    if not rails:
+        raise EvaluationError(f"{path}: {FORMATS}; no power of a rail in it")
+    found = {name: tuple(watts) for name, watts in rails.items()}
+    return Imported(rails_w=found, sources=("tegrastats",))
+
+
+def _joined(one: Imported, other: Imported, path: Path) -> Imported:
+    for name in ("samples_us", "layers_us", "rails_w"):
+        if getattr(one, name) and getattr(other, name):
+            raise EvaluationError(f"{path}: a second file of the same kind")
+    return Imported(
+        one.samples_us or other.samples_us,
+        one.layers_us or other.layers_us,
+        one.rails_w or other.rails_w,
+        one.machine or other.machine,
+        (*one.sources, *other.sources),
+    )
+
+
+def _with(found: Imported, samples_us: tuple[int, ...]) -> Imported:
+    return Imported(
+        samples_us, found.layers_us, found.rails_w, found.machine, found.sources
+    )
