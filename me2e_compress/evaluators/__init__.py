@@ -17,6 +17,6 @@ EVALUATORS: Registry[Evaluator] = Registry(
     EvaluationError,
     {
         "highway": f"{_HERE}.highway.evaluation_options:HighwayEvaluation",
-        "bench2drive": f"{_HERE}.bench2drive.evaluator:Bench2DriveResults",
+        "bench2drive": f"{_HERE}.bench2drive.real_results:Bench2DriveResults",
     },
 )

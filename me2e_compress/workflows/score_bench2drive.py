@@ -7,7 +7,7 @@ from pathlib import Path
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.bench2drive.evaluator import (
+from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
     CollectedResults,
 )

@@ -17,7 +17,7 @@ from me2e_compress.agents import real_time
 from me2e_compress.driving.latency import DecisionFacts, parse_latency
 from me2e_compress.driving.realtime import DT_US, LatencyModel, control_clock
 from me2e_compress.errors import EvaluationError, MissingPackageError
-from me2e_compress.evaluators.bench2drive.evaluator import Bench2DriveResults
+from me2e_compress.evaluators.bench2drive.real_results import Bench2DriveResults
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from tests.agents import small_leaderboard
 from tests.agents.small_leaderboard import (

@@ -127,13 +127,11 @@ def test_wrong_words_are_one_line_and_leave_nothing(
     assert not results.exists()
 
 
-def test_options_of_real_runs_want_one(
-    run: Run, manifest: Path, tmp_path: Path
-) -> None:
-    run("evaluate", "blind", "--routes", manifest, "-o", tmp_path / "results")
+def test_options_of_real_runs_want_one(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "evaluation.json").write_text('{"routes": ["a"]}')
 
     with pytest.raises(EvaluationError, match="no results of a real run, which --metr"):
-        run("score", tmp_path / "results", "--penalties", "2.0")
+        run("score", tmp_path, "--penalties", "2.0")
 
 
 def test_score_of_another_folder(run: Run, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.bench2drive.evaluator import (
+from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
     CollectedResults,
 )
