@@ -12,7 +12,6 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.errors import EvaluationError
@@ -87,6 +86,8 @@ class CollisionOptimizer(HostStage):
         Raises:
             EvaluationError: The network has no such output, or of another shape.
         """
+        from scipy.optimize import minimize  # takes a second to import
+
         cells, step = self.near(plan, self._occupancy(outputs))
         if not len(cells):
             return HostWork(plan)
