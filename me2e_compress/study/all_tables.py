@@ -1,5 +1,6 @@
 """Every table of a study, the one of near misses among them."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from me2e_compress.study.drives import Drive
@@ -20,15 +21,17 @@ COLUMNS = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
 
 
 def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
-    """Every table of a study, in the order of reading."""
+    """Every table of a study, in the order of reading; a preview is named so."""
     compared = [differences(outcome)] if len(outcome.variants) > 1 else []
-    return (
+    found = (
         *scoreboards(outcome),
         *compared,
         *change_tables(outcome),
         near_misses(outcome),
         *abilities(outcome),
     )
+    preview = outcome.study.preview
+    return tuple(replace(each, title=f"{each.title}{preview}") for each in found)
 
 
 def near_misses(outcome: "StudyResult") -> Table:

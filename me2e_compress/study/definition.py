@@ -170,6 +170,13 @@ class Study:
             self._check_frames()
 
     @property
+    def preview(self) -> str:
+        """What titles say of a part of the routes; empty where all are driven."""
+        driven, whole = len(self.routes), self.set_size
+        partial = 0 < driven < whole
+        return f" (preview: {driven} of {whole} routes)" if partial else ""
+
+    @property
     def elsewhere(self) -> bool:
         """Whether another evaluator than highway drives.
 

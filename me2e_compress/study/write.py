@@ -50,7 +50,8 @@ def write_study(
     """
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
-    heading = f"# {in_markdown(outcome.study.title)}\n\n"
+    title = f"{outcome.study.title}{outcome.study.preview}"
+    heading = f"# {in_markdown(title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -64,8 +64,17 @@ def test_the_page_needs_nothing_beside_it(page: str) -> None:
 
 
 def test_what_users_wrote_is_escaped(page: str) -> None:
-    assert "<h1>Slow &amp; &lt;fast&gt;</h1>" in page
+    assert "<h1>Slow &amp; &lt;fast&gt; (preview: 2 of 220 routes)</h1>" in page
     assert "&lt;s&gt;.toml" in page
+
+
+def test_a_preview_is_named_so_in_every_title(page: str) -> None:
+    titles = re.findall(
+        r"<(?:h1|title)>(.*?)<|class=\"table\">\n<figcaption>(.*?)<", page
+    )
+
+    assert len(titles) >= 6
+    assert all("(preview: 2 of 220 routes)" in f"{a}{b}" for a, b in titles)
 
 
 def test_every_section_is_there(page: str) -> None:
@@ -140,7 +149,7 @@ def test_files_are_written_beside_each_other(
 
     assert json.loads(written.record.read_text()) == found.to_json()
     assert written.tables.read_text().startswith(
-        "# Slow &amp; &lt;fast&gt;\n\n**Scoreboard, "
+        "# Slow &amp; &lt;fast&gt; (preview: 2 of 220 routes)\n\n**Scoreboard, "
     )
     assert written.report.read_text().startswith("<!doctype html>")
     found_files = {path.name for path in (tmp_path / "new" / "study").iterdir()}

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
-from me2e_compress.metrics.eer import eer
+from me2e_compress.metrics.eer import eer, rankings
 from me2e_compress.metrics.efficiency import CHECKPOINTS
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.metrics.measure import Estimate, Measure
@@ -19,6 +19,8 @@ from me2e_compress.workflows.result import Cell
 if TYPE_CHECKING:
     from me2e_compress.study.paper.paper_result import PaperResult
 
+Energy = Literal["measured", "modelled"]
+"""Where joules a frame come from."""
 ENERGY = ("J/frame", "EER_AV", "modelled mJ/frame", "EER_AV, modelled")
 EER = (
     "EER_AV (equations 8 to 11) in points, by CRITIC weights over the rows of one"
@@ -48,11 +50,8 @@ class EnergyColumns:
     def of(cls, result: "PaperResult", variants: Sequence[str], condition: str) -> Self:
         """Score the variants that drove; the others have reasons."""
         facts = {name: result.fact(name) for name in variants}
-        measured = {
-            name: None if fact.joules is None else fact.joules[0]
-            for name, fact in facts.items()
-        }
-        modelled = {name: fact.modelled_j for name, fact in facts.items()}
+        measured = joules_by_variant(result, variants, "measured")
+        modelled = joules_by_variant(result, variants, "modelled")
         return cls(
             {
                 name: _joules(fact.joules, fact.failure or fact.no_joules)
@@ -71,6 +70,46 @@ class EnergyColumns:
             measure_cell(self.modelled_mj[name], ".3g"),
             estimate_cell(self.modelled_scores[name]),
         )
+
+
+def joules_by_variant(
+    result: "PaperResult", variants: Sequence[str], energy: Energy
+) -> dict[str, float | None]:
+    """Return joules a frame, of one kind; None where there are none."""
+    facts = {name: result.fact(name) for name in variants}
+    if energy == "modelled":
+        return {name: fact.modelled_j for name, fact in facts.items()}
+    return {
+        name: None if fact.joules is None else fact.joules[0]
+        for name, fact in facts.items()
+    }
+
+
+def measures_by_variant(
+    result: "PaperResult", joules: Mapping[str, float | None], condition: str
+) -> dict[str, RouteMeasures]:
+    """Return the measures of the variants that drove under a condition."""
+    return {
+        name: record_measures(cell, each)
+        for name, each in joules.items()
+        if (cell := result.cell(name, condition)) is not None
+    }
+
+
+def ranking_note(result: "PaperResult", variants: Sequence[str], condition: str) -> str:
+    """Say how the variants rank, and whether the normalization decides it."""
+    energy: Energy = "measured"
+    if all(result.fact(name).joules is None for name in variants):
+        energy = "modelled"
+    joules = joules_by_variant(result, variants, energy)
+    found = rankings(measures_by_variant(result, joules, condition))
+    orders = dict[tuple[str, ...], list[str]]()
+    for normalization, order in found.items():
+        orders.setdefault(order, []).append(normalization.value)
+    if not orders:
+        return ""
+    parts = [f"{' > '.join(order)} ({', '.join(by)})" for order, by in orders.items()]
+    return f"EER_AV, {energy} energy, under {condition}, ranks {'; '.join(parts)}."
 
 
 def record_measures(record: DriveRecord, j_per_frame: float | None) -> RouteMeasures:
@@ -94,11 +133,7 @@ def record_measures(record: DriveRecord, j_per_frame: float | None) -> RouteMeas
 def _scores(
     result: "PaperResult", joules: Mapping[str, float | None], condition: str
 ) -> dict[str, Estimate]:
-    driven = {
-        name: record_measures(cell, each)
-        for name, each in joules.items()
-        if (cell := result.cell(name, condition)) is not None
-    }
+    driven = measures_by_variant(result, joules, condition)
     found = dict(eer(driven, seed=result.study.seed).scores)
     for name in joules:
         why = result.why_not(name, condition)

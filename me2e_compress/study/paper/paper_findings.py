@@ -217,5 +217,17 @@ INT8_QUESTIONS = (
         "DS of minus-occ-feature-ext minus float, each at its own latency",
         lambda e: e.difference(("minus-occ-feature-ext", "device"), DEVICE),
     ),
+    PaperQuestion(
+        "Int8 feature extraction is worth its energy: EER_AV rises",
+        "EER_AV 28.52 against 28.13 (table 5, UniAD)",
+        "EER_AV of feature-ext minus exact on the slow device, measured joules",
+        lambda e: e.eer_gap("feature-ext", "exact", "device", "measured"),
+    ),
+    PaperQuestion(
+        "Int8 feature extraction is worth its energy, so far as a model tells",
+        "the same",
+        "EER_AV of feature-ext minus exact on the slow device, energy modelled",
+        lambda e: e.eer_gap("feature-ext", "exact", "device", "modelled"),
+    ),
 )
 QUESTIONS = RATE_QUESTIONS + LATENCY_QUESTIONS + MODULE_QUESTIONS + INT8_QUESTIONS

@@ -49,8 +49,7 @@ class PaperResult(Result):
     @property
     def preview(self) -> str:
         """What every title says of a part of the routes; empty for all of them."""
-        driven, whole = len(self.study.routes), self.study.set_size
-        return "" if driven == whole else f" (preview: {driven} of {whole} routes)"
+        return self.study.preview
 
     @property
     def headline(self) -> str:

@@ -4,18 +4,32 @@ Its own figures stand beside them, in columns of their own: they are of other st
 other roads, with other traffic.
 """
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from me2e_compress.driving.realtime import DT_US, skipped_decisions
-from me2e_compress.metrics.measure import Measure
+from me2e_compress.driving.realtime import skipped_decisions
 from me2e_compress.study.drive_record import PERCENTS
 from me2e_compress.study.paper import published
-from me2e_compress.study.paper.energy_columns import EER, ENERGY, EnergyColumns
+from me2e_compress.study.paper.energy_columns import (
+    EER,
+    ENERGY,
+    EnergyColumns,
+    ranking_note,
+)
 from me2e_compress.study.paper.paper_counts import partners, table_4
-from me2e_compress.study.paper.published import PublishedDrive
-from me2e_compress.study.paper.route_columns import COLUMNS, DS, mean_of, paired
-from me2e_compress.study.tables import MISSING, estimate_cell, measure_cell
+from me2e_compress.study.paper.score_cells import (
+    GIVEN,
+    GIVEN_ENERGY,
+    SCORES,
+    against,
+    given_cells,
+    given_energy,
+    less_cell,
+    plain_cell,
+    rate_cells,
+    score_cells,
+    times,
+)
+from me2e_compress.study.tables import MISSING
 from me2e_compress.study.workload import held_frames
 from me2e_compress.workflows.result import Cell, Table
 
@@ -23,9 +37,6 @@ if TYPE_CHECKING:
     from me2e_compress.study.paper.paper_result import PaperResult
     from me2e_compress.study.study_blocks import StudyBlock
 
-SCORES = tuple(each.name for each in COLUMNS)
-GIVEN = ("paper's DS", "paper's DE %", "paper's DC")
-GIVEN_ENERGY = ("paper's J/frame", "paper's EER")
 OURS = (
     "Means with their 95 % intervals over these scenario types. The paper's figures"
     " are of UniAD in CARLA, which drives on after a collision; here a route ends at"
@@ -65,9 +76,9 @@ def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
             (
                 Cell(f"{given.fps:g}"),
                 Cell(condition or MISSING),
-                *_rate(frames),
-                *_scores(result, name, condition),
-                *_given(given),
+                *rate_cells(frames),
+                *score_cells(result, name, condition),
+                *given_cells(given),
             )
         )
     own = published.RATES_RT["UniAD"]
@@ -77,9 +88,9 @@ def table_2(result: "PaperResult", block: "StudyBlock") -> Table:
                 (
                     Cell("own" if each.traced else "own mean"),
                     Cell(each.name),
-                    *_rate(held_frames(study, each)),
-                    *_scores(result, name, each.name),
-                    *_given(own if each.traced else None),
+                    *rate_cells(held_frames(study, each)),
+                    *score_cells(result, name, each.name),
+                    *given_cells(own if each.traced else None),
                 )
             )
     return Table(
@@ -108,14 +119,14 @@ def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
         rows.append(
             (
                 Cell(name),
-                Cell("") if whole else _less(base.parameters, fact.parameters, 1e6),
-                Cell("") if whole else _less(base.macs, fact.macs, 1e9),
-                _plain(fact.fps, ".2f", fact.failure or "not measured"),
-                *_scores(result, name, condition),
-                _against(result, name, result.study.baseline, condition),
+                Cell("") if whole else less_cell(base.parameters, fact.parameters, 1e6),
+                Cell("") if whole else less_cell(base.macs, fact.macs, 1e9),
+                plain_cell(fact.fps, ".2f", fact.failure or "not measured"),
+                *score_cells(result, name, condition),
+                against(result, name, result.study.baseline, condition),
                 *energy.cells(name),
-                *_given(given),
-                *_given_energy(given),
+                *given_cells(given),
+                *given_energy(given),
             )
         )
     return Table(
@@ -142,6 +153,7 @@ def table_3(result: "PaperResult", block: "StudyBlock") -> Table:
 def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
     """Show int8 by module, under each condition."""
     base = block.variants[0]
+    rankings = [ranking_note(result, block.variants, each) for each in block.conditions]
     rows = []
     for condition in block.conditions:
         energy = EnergyColumns.of(result, block.variants, condition)
@@ -151,12 +163,12 @@ def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
                 (
                     Cell(name),
                     Cell(condition),
-                    _plain(fact.fps, ".2f", fact.failure or "not measured"),
-                    *_scores(result, name, condition),
-                    _against(result, name, base, condition),
+                    plain_cell(fact.fps, ".2f", fact.failure or "not measured"),
+                    *score_cells(result, name, condition),
+                    against(result, name, base, condition),
                     *energy.cells(name),
-                    *_given(given),
-                    *_given_energy(given),
+                    *given_cells(given),
+                    *given_energy(given),
                 )
             )
     return Table(
@@ -168,7 +180,8 @@ def table_5(result: "PaperResult", block: "StudyBlock") -> Table:
         tuple(rows),
         f"{base} is the paper's Hardware_op: the graph optimized, nothing in int8. At"
         " the paper's 22 to 31 FPS equation 4 skips nothing, as where decisions cost"
-        f" no time; on the slow device int8 pays by being earlier. {EER} {OURS}",
+        " no time; on the slow device int8 pays by being earlier."
+        f" {' '.join(filter(None, (*rankings, EER, OURS)))}",
         words=2,
     )
 
@@ -192,12 +205,12 @@ def table_6(result: "PaperResult", block: "StudyBlock") -> Table:
             (
                 Cell(f"{given.fps:g}"),
                 Cell(condition or MISSING),
-                *_rate(frames),
-                *_scores(result, name, condition),
+                *rate_cells(frames),
+                *score_cells(result, name, condition),
                 Cell(MISSING, reason="power at a limited rate is not measured"),
-                _plain(_times(joules, given.fps), ".3g", fact.no_joules),
-                _plain(_times(modelled, given.fps), ".3g", "not counted"),
-                *_given(given),
+                plain_cell(times(joules, given.fps), ".3g", fact.no_joules),
+                plain_cell(times(modelled, given.fps), ".3g", "not counted"),
+                *given_cells(given),
                 Cell("" if given.watts is None else f"{given.watts:.0f}"),
             )
         )
@@ -223,8 +236,8 @@ def tail(result: "PaperResult", block: "StudyBlock") -> Table:
             Cell(name),
             Cell(condition),
             *_latency(result, name, condition),
-            *_scores(result, name, condition),
-            _against(result, name, base, condition),
+            *score_cells(result, name, condition),
+            against(result, name, base, condition),
         )
         for condition in block.conditions
         for name in block.variants
@@ -251,55 +264,3 @@ def _latency(result: "PaperResult", name: str, condition: str) -> tuple[Cell, Ce
         each.latency_us[PERCENTS.index(99)] for each in cell.routes if each.decisions
     ]
     return Cell(f"{mean_us / 1e3:.0f}"), Cell(f"{max(ends) / 1e3:.0f}")
-
-
-def _scores(result: "PaperResult", name: str, condition: str) -> Iterable[Cell]:
-    cell = result.cell(name, condition)
-    if cell is None:
-        reason = result.why_not(name, condition)
-        return [Cell(MISSING, reason=reason) for _ in COLUMNS]
-    seed = result.study.seed
-    return [estimate_cell(mean_of(cell, each, seed)) for each in COLUMNS]
-
-
-def _against(result: "PaperResult", name: str, other: str, condition: str) -> Cell:
-    one, reference = result.cell(name, condition), result.cell(other, condition)
-    if name == other:
-        return Cell("")
-    if one is None or reference is None:
-        missing = name if one is None else other
-        return Cell(MISSING, reason=result.why_not(missing, condition))
-    return estimate_cell(paired(one, reference, DS, result.study.seed), signed=True)
-
-
-def _given(row: PublishedDrive | None) -> tuple[Cell, ...]:
-    if row is None:
-        return (Cell(""),) * 3
-    return Cell(f"{row.ds:.2f}"), Cell(f"{row.de:.2f}"), Cell(f"{row.dc:.2f}")
-
-
-def _rate(frames: int) -> tuple[Cell, Cell]:
-    return Cell(str(frames - 1)), Cell(f"{1e6 / (frames * DT_US):.3g}")
-
-
-def _less(whole: int | None, left: int | None, unit: float) -> Cell:
-    if whole is None or left is None:
-        return Cell(MISSING, reason="not counted")
-    return Cell(f"{(whole - left) / unit:.3f}")
-
-
-def _plain(value: float | None, form: str, why: str) -> Cell:
-    reason = "" if value is not None else why
-    return measure_cell(Measure(value, "", reason), form)
-
-
-def _given_energy(row: PublishedDrive | None) -> tuple[Cell, Cell]:
-    if row is None:
-        return Cell(""), Cell("")
-    texts = ("" if each is None else f"{each:.2f}" for each in (row.joules, row.eer))
-    joules, score = map(Cell, texts)
-    return joules, score
-
-
-def _times(joules: float | None, fps: float) -> float | None:
-    return None if joules is None else joules * fps

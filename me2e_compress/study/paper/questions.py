@@ -10,10 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from me2e_compress.metrics.eer import eer
 from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.metrics.intervals import intervals
+from me2e_compress.metrics.intervals import intervals, mean_estimate
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.paper.energy_columns import (
+    Energy,
+    joules_by_variant,
+    measures_by_variant,
+)
 from me2e_compress.study.paper.route_columns import (
     DS,
     RouteColumn,
@@ -182,6 +188,25 @@ class Evidence:
         here, anew = intervals(gap, types, self.seed, value, (-1.0, 1.0))
         measure = Measure(value, "ratio")
         return Estimate(measure, *here, len(types), *anew)
+
+    def eer_gap(self, one: str, other: str, condition: str, energy: Energy) -> Estimate:
+        """Return EER_AV of one minus the other's, scored beside all of table 5."""
+        block = next((b for b in self.result.study.blocks if b.name == "table-5"), None)
+        if block is None:
+            raise UntestedError("the study has no block table-5")
+        joules = joules_by_variant(self.result, block.variants, energy)
+        found = eer(measures_by_variant(self.result, joules, condition))
+        for name in (one, other):
+            if name not in found.routes:
+                score = found.scores.get(name)
+                why = self.result.why_not(name, condition)
+                raise UntestedError(why if score is None else score.measure.reason)
+        gaps_by_route = (found.routes[one] - found.routes[other]).tolist()
+        if any(found.left_out.values()):
+            types = [""] * len(gaps_by_route)
+        else:
+            types = [each.scenario for each in self.cell((one, condition)).routes]
+        return mean_estimate(gaps_by_route, types, "points", self.seed)
 
     def faster_by(self, one: str, other: str) -> Estimate:
         """Return by how many ms the median latency of one is below the other's."""

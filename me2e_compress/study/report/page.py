@@ -76,7 +76,8 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
     """
     study = outcome.study
     return template(TEMPLATE).render(
-        title=study.title,
+        title=f"{study.title}{study.preview}",
+        preview=study.preview,
         baseline=study.baseline,
         lede=_lede(outcome),
         findings=findings(outcome),
