@@ -1,16 +1,18 @@
 """How often a decision takes longer than it may."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
 from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.surrogate_safety import TTC_CRITICAL_S
 
 BUDGET_MS = FRAME_US / 1000
 """One frame at 20 Hz."""
 PERCENTILES = (50.0, 99.0, 99.9)
+UNSEEN = Measure(None, "ms", "nobody looked at the road")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +27,9 @@ class Deadlines:
         mean_ms: Of all decisions.
         worst_ms: The longest.
         over_percent: Share of the decisions that took longer than the budget.
+        critical_ms: Mean of the decisions on frames with a time to collision below
+            1.5 s; a tail that falls into critical frames shows here.
+        other_ms: Mean of those on the other frames.
     """
 
     budget_ms: float
@@ -33,6 +38,8 @@ class Deadlines:
     mean_ms: Measure
     worst_ms: Measure
     over_percent: Measure
+    critical_ms: Measure = UNSEEN
+    other_ms: Measure = UNSEEN
 
     def to_json(self) -> dict[str, Any]:
         """Return plain numbers, null where something was not measured."""
@@ -44,6 +51,8 @@ class Deadlines:
             "mean_ms": self.mean_ms.value,
             "max_ms": self.worst_ms.value,
             "over_budget_percent": self.over_percent.value,
+            "critical_mean_ms": self.critical_ms.value,
+            "other_mean_ms": self.other_ms.value,
         }
 
 
@@ -83,8 +92,36 @@ def charged(
     Returns:
         None where decisions cost nothing.
     """
-    taken = [each.latency_us for episode in episodes for each in episode.decisions]
-    return deadlines(taken, budget_ms) if any(taken) else None
+    driven = tuple(episodes)
+    taken = [each.latency_us for episode in driven for each in episode.decisions]
+    if not any(taken):
+        return None
+    critical, other = _by_danger(driven)
+    return replace(
+        deadlines(taken, budget_ms),
+        critical_ms=_mean(critical, "no decision on a frame with TTC below 1.5 s"),
+        other_ms=_mean(other, "no decision on another frame"),
+    )
+
+
+def _by_danger(episodes: Iterable[Episode]) -> tuple[list[int], list[int]]:
+    """Return latencies on frames with a low time to collision, and on others."""
+    critical, other = list[int](), list[int]()
+    for episode in episodes:
+        ttc_s = () if episode.conflicts is None else episode.conflicts.ttc_s
+        for decision in episode.decisions:
+            frame = decision.time_us // FRAME_US
+            if frame < len(ttc_s):
+                seconds = ttc_s[frame]
+                near = seconds is not None and seconds < TTC_CRITICAL_S
+                (critical if near else other).append(decision.latency_us)
+    return critical, other
+
+
+def _mean(latencies_us: Sequence[int], why: str) -> Measure:
+    if not latencies_us:
+        return Measure(None, "ms", why)
+    return Measure(fmean(latencies_us) / 1e3, "ms")
 
 
 def _percentile(latencies_us: Sequence[int], percent: float) -> Measure:

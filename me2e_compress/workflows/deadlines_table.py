@@ -29,6 +29,9 @@ def _each(found: Deadlines) -> Iterator[tuple[str, Measure]]:
     yield "max", found.worst_ms
     yield "mean", found.mean_ms
     yield f"over {found.budget_ms:g} ms", found.over_percent
+    if found.critical_ms.value is not None:
+        yield "mean, TTC below 1.5 s", found.critical_ms
+        yield "mean, other frames", found.other_ms
 
 
 def _cells(measure: Measure) -> tuple[str, str]:

@@ -1,8 +1,13 @@
+from dataclasses import replace
+
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.deadlines import deadlines
+from me2e_compress.metrics.conflict_record import ConflictRecord
+from me2e_compress.metrics.deadlines import charged, deadlines
+from me2e_compress.metrics.episode import InferenceRecord
 from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
+from tests.metrics.drives import drive
 
 
 def test_percentiles_and_the_share_over_budget() -> None:
@@ -17,6 +22,8 @@ def test_percentiles_and_the_share_over_budget() -> None:
         "mean_ms": 500.5,
         "max_ms": 1000.0,
         "over_budget_percent": 95.0,
+        "critical_mean_ms": None,
+        "other_mean_ms": None,
     }
 
 
@@ -47,3 +54,29 @@ def test_nothing_decided_is_not_zero() -> None:
 def test_a_budget_is_positive(budget_ms: float) -> None:
     with pytest.raises(EvaluationError, match="--budget-ms"):
         check_budget(budget_ms)
+
+
+def test_a_tail_in_critical_frames_shows() -> None:
+    looked = ConflictRecord((None,) * 4, (None, 1.4, 1.5, 0.2), ())
+    taken = [(0, 100_000), (50_000, 250_000), (100_000, 100_000), (150_000, 350_000)]
+    episode = replace(
+        drive(conflicts=looked),
+        decisions=tuple(InferenceRecord(*each) for each in taken),
+    )
+
+    found = charged([episode, replace(episode, conflicts=None)])
+
+    assert found is not None
+    assert found.count == 8
+    assert found.critical_ms.value == 300.0
+    assert found.other_ms.value == 100.0
+    assert [row[0].text for row in deadlines_table("r", found).rows][-2:] == [
+        "mean, TTC below 1.5 s",
+        "mean, other frames",
+    ]
+
+
+def test_decisions_that_cost_nothing_have_no_deadlines() -> None:
+    free = replace(drive(), decisions=(InferenceRecord(0, 0),))
+
+    assert charged([free]) is None
