@@ -17,7 +17,7 @@ from me2e_compress.agents.carla_interface import SensorData
 from me2e_compress.agents.carla_rig import GPS, IMU, SPEED, CarlaRig, Triple
 from me2e_compress.agents.geo_reference import GeoReference
 from me2e_compress.agents.route_follower import RouteFollower
-from me2e_compress.driving.can_bus import EgoMotion, can_bus_between
+from me2e_compress.driving.can_bus import EgoKinematics, can_bus_between
 from me2e_compress.driving.contract import Observation
 from me2e_compress.errors import MissingExtraError
 
@@ -39,7 +39,7 @@ class CarlaReading:
         node: The next node of the route, metres to the right and forward.
     """
 
-    motion: EgoMotion
+    motion: EgoKinematics
     command: int
     node: tuple[float, float]
 
@@ -90,7 +90,7 @@ class RouteReader:
         # the compass turns clockwise from north
         heading = math.pi / 2 - imu[6]
         forward, right, up = imu[:3]
-        motion = EgoMotion(
+        motion = EgoKinematics(
             x,
             y,
             heading,
@@ -124,7 +124,7 @@ class CarlaObserver:
     origin_m: Triple
     jpeg_quality: int
     fill: tuple[int, ...] = (0, 0, 0)
-    _last: EgoMotion | None = field(default=None, init=False)
+    _last: EgoKinematics | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         """Compute the projection, which never changes."""

@@ -12,7 +12,7 @@ Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class EgoMotion:
+class EgoKinematics:
     """Where the ego is and how it moves, in a right-handed world (x east, y north).
 
     Args:
@@ -32,7 +32,9 @@ class EgoMotion:
     angular_velocity_radps: Triple
 
 
-def can_bus_between(now: EgoMotion, last: EgoMotion | None) -> npt.NDArray[np.float32]:
+def can_bus_between(
+    now: EgoKinematics, last: EgoKinematics | None
+) -> npt.NDArray[np.float32]:
     """Return float32 [18], laid out as `Observation` says.
 
     Args:

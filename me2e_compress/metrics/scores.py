@@ -9,6 +9,7 @@ import numpy as np
 
 from me2e_compress.metrics import bench2drive, comfort, efficiency, surrogate_safety
 from me2e_compress.metrics.abilities import ABILITIES, successes
+from me2e_compress.metrics.ability_rules import MEAN, ability_rates
 from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.intervals import (
@@ -19,7 +20,6 @@ from me2e_compress.metrics.intervals import (
     mean_estimate,
 )
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.metrics.traffic_signs import MEAN, ability_rates
 
 FULL_SET = 220
 """Routes of a whole benchmark: 44 scenario types with 5 variants each."""

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import importlib
 import importlib.util
 import mmap
 from collections.abc import Sequence
@@ -32,8 +31,7 @@ _CPU = "CPUExecutionProvider"
 _CUDA = "CUDAExecutionProvider"
 _GPU_PACKAGE = "pip uninstall onnxruntime; pip install onnxruntime-gpu"
 _NO_LIBRARY = (_native.Fail, _native.RuntimeException, RuntimeError)
-_ENTRY = b"RegisterCustomOps"
-"""The function that a library of onnxruntime operators must have."""
+_ENTRY = b"RegisterCustomOps"  # of every library of onnxruntime operators
 
 
 @dataclasses.dataclass(frozen=True)
@@ -257,7 +255,6 @@ class TensorRtRtxProvider(Provider):
 
     def chain(self) -> None:
         """Return none: the options of the session name its device."""
-        return
 
 
 def _holds(library: Path, word: bytes) -> bool:
@@ -298,7 +295,6 @@ def provider_named(text: str, plugins: Sequence[Path] = ()) -> Provider:
         ProviderError: no such provider or option, not installed, or no such library.
     """
     found = PROVIDERS.parse(text)
-    if plugins:
-        found = dataclasses.replace(found, plugins=(*found.plugins, *plugins))
+    found = dataclasses.replace(found, plugins=(*found.plugins, *plugins))
     found.check()
     return found

@@ -13,6 +13,7 @@ from me2e_compress.evaluators.bench2drive.real_results import (
 )
 from me2e_compress.evaluators.bench2drive.records import number_of
 from me2e_compress.metrics import scores as metrics
+from me2e_compress.metrics.ability_rules import MEAN, RULES, Rules, ability_rates
 from me2e_compress.metrics.comfort import stood_most
 from me2e_compress.metrics.leaderboard_scores import (
     LeaderboardScores,
@@ -22,7 +23,6 @@ from me2e_compress.metrics.leaderboard_scores import (
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.penalties import VERSIONS, Version
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.metrics.traffic_signs import MEAN, RULES, Rules, ability_rates
 from me2e_compress.workflows.result import Table, number, table
 
 STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"

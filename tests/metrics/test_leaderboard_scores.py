@@ -2,10 +2,10 @@ import dataclasses
 
 import pytest
 
+from me2e_compress.metrics.ability_rules import Rules, ability_rates
 from me2e_compress.metrics.episode import Ending, Episode, Given
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.leaderboard_scores import leaderboard_scores
-from me2e_compress.metrics.traffic_signs import Rules, ability_rates
 from tests.metrics.drives import drive, infraction
 
 SIGNS = ("Merging", "Traffic_Signs")

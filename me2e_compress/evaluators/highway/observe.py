@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.can_bus import EgoMotion, can_bus_between
+from me2e_compress.driving.can_bus import EgoKinematics, can_bus_between
 from me2e_compress.driving.contract import Observation, Policy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CameraRig, Cameras
@@ -95,8 +95,8 @@ def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:
     return can_bus_between(_motion(ego), None if last is None else _motion(last))
 
 
-def _motion(ego: Ego) -> EgoMotion:
-    return EgoMotion(
+def _motion(ego: Ego) -> EgoKinematics:
+    return EgoKinematics(
         ego.x,
         ego.y,
         ego.heading,
