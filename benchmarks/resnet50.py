@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.resnet import ResNet50
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import frames
-from me2e_compress.zoo.vad.backbone import OUT_CHANNELS, ResNet50
 
 SIDE = 224
 CLASSES = 1000
@@ -32,7 +32,7 @@ class Classifier(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.backbone = ResNet50()
-        self.head = nn.Linear(OUT_CHANNELS, CLASSES)
+        self.head = nn.Linear(self.backbone.channels[-1], CLASSES)
 
     def forward(self, image: Tensor) -> Tensor:
         """[1, 3, 224, 224] -> [1, 1000]."""

@@ -37,7 +37,8 @@ class ExportOptions:
 
     Attributes:
         opset: ONNX opset of the file.
-        heads: classes and ego modes of vad-tiny; None is nuScenes'.
+        heads: which last layers: ``nuscenes`` or ``bench2drive`` of vad-tiny,
+            ``bench2drive`` or ``beta`` of tcp; None is the first.
         seed: of the initial weights; None is 0.
         force: replace outputs that are not as we left them, too.
         operators: ``plugin`` writes deformable attention as one node.
@@ -49,7 +50,7 @@ class ExportOptions:
     """
 
     opset: int = OPSET
-    heads: Literal["nuscenes", "bench2drive"] | None = None
+    heads: str | None = None
     seed: int | None = None
     force: bool = False
     operators: Literal["standard", "plugin"] = "standard"
@@ -111,10 +112,10 @@ class ExportResult(Result):
 def export_stack(
     stack: str, output: str | Path, options: ExportOptions | None = None
 ) -> Path:
-    """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver.
+    """Write a reference stack as ONNX, drawn from a seed, or our driver.
 
     Args:
-        stack: ``vad-tiny`` or ``highway``.
+        stack: ``vad-tiny``, ``tcp`` or ``highway``.
         output: the file; its folder is made.
         options: None takes the defaults.
 
@@ -122,8 +123,8 @@ def export_stack(
         The file.
 
     Raises:
-        GraphError: no such stack or opset, options for a trained model, or an output
-            that cannot be written.
+        GraphError: no such stack, heads or opset, options for a trained model, or an
+            output that cannot be written.
         MissingExtraError: exporting needs the extra ``zoo``.
     """
     options, output = options or ExportOptions(), Path(output)
@@ -154,7 +155,7 @@ def _drawn(stack: str, output: Path, options: ExportOptions) -> Path:
         output,
         opset=options.opset,
         seed=options.seed or 0,
-        heads=options.heads or "nuscenes",
+        heads=options.heads,
         fused=options.operators == "plugin",
     )
 

@@ -101,8 +101,9 @@ def record_frames(
 
     A run that was killed goes on after its last whole scene.
 
-    Of ``vad-tiny`` a synthetic world is drawn; for ``highway``, or any ONNX file that
-    keeps the policy contract, the expert drives fresh routes of highway-env.
+    Of ``vad-tiny`` and ``tcp`` a synthetic world is drawn; for ``highway``, or any
+    ONNX file that keeps the policy contract, the expert drives fresh routes of
+    highway-env.
 
     Args:
         source: a stack of the zoo, or an ONNX file that keeps the policy contract.

@@ -1,22 +1,24 @@
 """Write a stack of the zoo as ONNX."""
 
 import importlib.util
+import logging
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import onnx
 
 from me2e_compress.errors import GraphError, MissingExtraError
 from me2e_compress.zoo.model_files import write
-from me2e_compress.zoo.stacks import Stack, find
+from me2e_compress.zoo.stacks import TCP, Stack, find
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
+    from me2e_compress.zoo.tcp.config import ActionHeads
     from me2e_compress.zoo.vad.config import HeadsName, Sampling
 
 GRID_SAMPLE_OPSET = 16
@@ -25,9 +27,12 @@ GRID_SAMPLE_OPSET = 16
 FUSED_DOMAIN = "me2e"
 """Of the nodes that stand for a whole operator."""
 
-OPSETS = range(13, 18)
-"""From the first that onnxruntime and TensorRT agree on to the last that torch's
-TorchScript exporter writes as asked (17: LayerNormalization)."""
+DYNAMO_OPSET = 18
+"""The only one that torch's dynamo exporter writes as asked; the TorchScript exporter
+writes those below."""
+
+OPSETS = range(13, DYNAMO_OPSET + 1)
+"""From the first that onnxruntime and TensorRT agree on."""
 
 
 def export(
@@ -36,7 +41,7 @@ def export(
     *,
     opset: int = 17,
     seed: int = 0,
-    heads: "HeadsName" = "nuscenes",
+    heads: str | None = None,
     fused: bool = False,
 ) -> Path:
     """Build a stack from a seed and write it as one ONNX file.
@@ -48,9 +53,10 @@ def export(
     Args:
         stack: Name in `STACKS`.
         path: The ``.onnx`` to write; replaced in one step.
-        opset: 13 to 17; below 16 grid sampling is decomposed into gathers.
+        opset: 13 to 18; below 16 grid sampling is decomposed into gathers, and 18 is
+            what the dynamo exporter writes.
         seed: Of all weights.
-        heads: Sizes of the last layers.
+        heads: Which last layers; None is the default of the stack.
         fused: Whether deformable attention is one node, of the domain ``me2e``.
 
     Returns:
@@ -61,13 +67,18 @@ def export(
         GraphError: Unknown stack or opset, the exporter wrote another opset, or the
             file cannot be written.
     """
-    spec = find(stack)
+    spec = find(stack).with_heads(heads)
     if opset not in OPSETS:
         raise GraphError(
             f"cannot export {stack} at opset {opset}: {OPSETS[0]} to {OPSETS[-1]} work"
         )
+    if fused and opset == DYNAMO_OPSET:
+        raise GraphError(
+            f"cannot export {stack} at opset {opset} with plugins, which take up to"
+            f" {DYNAMO_OPSET - 1}"
+        )
     model = build(stack, opset=opset, seed=seed, heads=heads, fused=fused)
-    return save(trace(spec, model, opset), spec.metadata(heads), path)
+    return save(trace(spec, model, opset), spec.metadata(), path)
 
 
 def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Path:
@@ -91,25 +102,35 @@ def build(
     *,
     opset: int = 17,
     seed: int = 0,
-    heads: "HeadsName" = "nuscenes",
+    heads: str | None = None,
     fused: bool = False,
 ) -> "nn.Module":
     """Return the torch module of a stack, initialised from a seed, ready to run.
 
     Raises:
         MissingExtraError: torch is not installed.
-        GraphError: Unknown stack or heads, or a stack whose trained weights ship.
+        GraphError: Unknown stack or heads, a stack whose trained weights ship, or one
+            without deformable attention that is asked to fuse it.
     """
-    if find(stack).trained:
+    spec = find(stack).with_heads(heads)
+    if spec.trained:
         raise GraphError(
             f"{stack} has trained weights, not a seed's: zoo.shipped has its file"
         )
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
+    (chosen,) = spec.heads
+    if spec.name == TCP.name:
+        if fused:
+            raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
+        from me2e_compress.zoo.tcp.initialise import build_tcp
+
+        return build_tcp(seed=seed, heads=cast("ActionHeads", chosen))
     from me2e_compress.zoo.vad.initialise import build as build_vad
 
     native: Sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
-    return build_vad(seed=seed, heads=heads, sampling="fused" if fused else native)
+    sampling = "fused" if fused else native
+    return build_vad(seed=seed, heads=cast("HeadsName", chosen), sampling=sampling)
 
 
 def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
@@ -120,11 +141,19 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
     """
     import torch
 
-    with (
-        tempfile.TemporaryDirectory(prefix="me2e-trace-") as folder,
-        _quiet_exporter(),
-        torch.no_grad(),
-    ):
+    with _quiet_exporter(), torch.no_grad():
+        write_graph = _by_dynamo if opset == DYNAMO_OPSET else _by_torchscript
+        graph = write_graph(spec, model, opset)
+    written = {entry.domain: entry.version for entry in graph.opset_import}
+    if written not in ({"": opset}, {"": opset, FUSED_DOMAIN: 1}):
+        raise GraphError(f"{spec.name}: asked for opset {opset}, torch wrote {written}")
+    return graph
+
+
+def _by_torchscript(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
+    import torch
+
+    with tempfile.TemporaryDirectory(prefix="me2e-trace-") as folder:
         file = Path(folder) / "traced.onnx"
         torch.onnx.export(
             model,
@@ -136,11 +165,26 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
             input_names=list(spec.inputs),
             output_names=list(spec.outputs),
         )
-        graph = onnx.load(file)
-    written = {entry.domain: entry.version for entry in graph.opset_import}
-    if written not in ({"": opset}, {"": opset, FUSED_DOMAIN: 1}):
-        raise GraphError(f"{spec.name}: asked for opset {opset}, torch wrote {written}")
-    return graph
+        return onnx.load(file)
+
+
+def _by_dynamo(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
+    """Scopes are in the nodes' metadata; the exporter's own passes are left out."""
+    import torch
+
+    program = torch.onnx.export(
+        model,
+        example(spec),
+        dynamo=True,
+        opset_version=opset,
+        input_names=list(spec.inputs),
+        output_names=list(spec.outputs),
+        optimize=False,
+        verbose=False,
+    )
+    if program is None:
+        raise GraphError(f"{spec.name}: torch wrote no graph of opset {opset}")
+    return program.model_proto
 
 
 def example(spec: Stack) -> "tuple[Tensor, ...]":
@@ -160,4 +204,18 @@ def _quiet_exporter() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You are using the legacy TorchScript")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
+        warnings.filterwarnings("ignore", ".*LeafSpec.* is deprecated")
+        with _quiet_registry():
+            yield
+
+
+@contextmanager
+def _quiet_registry() -> Iterator[None]:
+    """Silence the dynamo exporter's wish for torchvision, which no stack here uses."""
+    log = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
         yield
+    finally:
+        log.setLevel(level)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from me2e_compress.errors import GraphError
@@ -39,14 +39,16 @@ class Stack:
         name: Its name on the command line.
         inputs: Shapes by input name.
         outputs: Names of the outputs, in order.
+        other_outputs: The same, of heads whose outputs are others.
         recurrent: Output that answers each recurrent input.
         plan: Name of the output that is the plan.
         plan_deltas: The plan is metres a step, not positions.
-        default_mode: Row of the plan that is driven without a command, by heads;
-            empty where the plan has one row.
+        heads: Names of the last layers to choose from, the default first, each with
+            the row of the plan that is driven without a command.
         image: How the image input is normalised.
         dtypes: Element type of the inputs that are not float32.
         trained: The weights ship; else they are drawn from a seed.
+        sees: The six cameras one by one, or three of them as one wide image.
     """
 
     name: str
@@ -55,22 +57,37 @@ class Stack:
     recurrent: Mapping[str, str]
     plan: str
     plan_deltas: bool
-    default_mode: Mapping[str, int]
+    heads: Mapping[str, int]
     image: ImageNorm
     dtypes: Mapping[str, Literal["int64"]] = field(default_factory=dict)
     trained: bool = False
+    other_outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    sees: Literal["surround", "strip"] = "surround"
 
-    def metadata(self, heads: str | None = None) -> dict[str, str]:
-        """Return the ONNX metadata properties that describe the exported file.
+    def with_heads(self, heads: str | None) -> "Stack":
+        """Return the stack with these heads alone; None is the default.
 
-        Args:
-            heads: Key of `default_mode`; None where the plan has one row.
+        Raises:
+            GraphError: There are no heads of that name.
         """
+        if heads is None:
+            heads = next(iter(self.heads), None)
+        if heads is None:
+            return self
+        if heads not in self.heads:
+            raise GraphError(
+                f"{self.name} has no heads {heads!r}: there is {', '.join(self.heads)}"
+            )
+        outputs = self.other_outputs.get(heads, self.outputs)
+        return replace(self, outputs=outputs, heads={heads: self.heads[heads]})
+
+    def metadata(self) -> dict[str, str]:
+        """Return the ONNX metadata properties that describe the exported file."""
         plan = {
             "output": self.plan,
             "deltas": self.plan_deltas,
             "command_input": None,
-            "default_mode": 0 if heads is None else self.default_mode[heads],
+            "default_mode": next(iter(self.heads.values()), 0),
         }
         image = {
             "input": "img",
@@ -108,7 +125,7 @@ VAD_TINY = Stack(
     recurrent={"prev_bev": "bev_embed"},
     plan="ego_fut_preds",
     plan_deltas=True,
-    default_mode={"nuscenes": 2, "bench2drive": 3},
+    heads={"nuscenes": 2, "bench2drive": 3},
     image=IMAGENET,
 )
 """hustvl/VAD, VAD_tiny_e2e.py: image statistics of ImageNet; commands right, left and
@@ -138,7 +155,7 @@ HIGHWAY = Stack(
     recurrent={"prev_bev": "prev_bev_out", "prev_memory": "prev_memory_out"},
     plan="plan",
     plan_deltas=False,
-    default_mode={},
+    heads={},
     image=ImageNorm(mean=(110.0, 110.0, 110.0), std=(60.0, 60.0, 60.0), order="rgb"),
     dtypes={"command": "int64"},
     trained=True,
@@ -146,7 +163,30 @@ HIGHWAY = Stack(
 """The toolkit's own driver: the policy contract of highway-env, 32 x 24 cells of 64
 channels and how well each is known, and two numbers of memory about the ego."""
 
-STACKS: dict[str, Stack] = {stack.name: stack for stack in (VAD_TINY, HIGHWAY)}
+TCP = Stack(
+    name="tcp",
+    inputs={"img": (1, 3, 256, 900), "state": (1, 9), "target_point": (1, 2)},
+    outputs=("pred_wp", "action_index", "future_action_index"),
+    recurrent={},
+    plan="pred_wp",
+    plan_deltas=False,
+    heads={"bench2drive": 0, "beta": 0},
+    image=IMAGENET,
+    other_outputs={
+        "beta": (
+            "pred_wp",
+            "mu_branches",
+            "sigma_branches",
+            "future_mu",
+            "future_sigma",
+        )
+    },
+    sees="strip",
+)
+"""OpenDriveLab/TCP, whose control head gives Beta distributions, and Bench2DriveZoo,
+branch tcp/admlp, where it scores 39 actions. Outputs are named as there."""
+
+STACKS: dict[str, Stack] = {stack.name: stack for stack in (VAD_TINY, TCP, HIGHWAY)}
 
 
 def find(name: str) -> Stack:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from me2e_compress.errors import FramesError
 from me2e_compress.zoo.stacks import Stack
 from me2e_compress.zoo.synthetic_cameras import render, rig
+from me2e_compress.zoo.synthetic_strip import route_state, strip
 from me2e_compress.zoo.synthetic_world import (
     FRAME_S,
     LANE_M,
@@ -51,24 +52,29 @@ def frames(
             noise = np.random.default_rng([seed, scene, step + 1])
             seconds = step * FRAME_S
             seen = render(world, world.ego(seconds), world.boxes_at(seconds))
+            if spec.sees == "strip":
+                state, target = route_state(world, step)
+                image = _normalise(spec, strip(seen)[None], noise)
+                yield {"img": image, "state": state, "target_point": target}
+                continue
             yield {
-                "img": _normalise(spec, seen, noise),
+                "img": _normalise(spec, seen, noise)[None],
                 "lidar2img": lidar2img,
                 "can_bus": _can_bus(world, step),
             }
 
 
 def _normalise(
-    spec: Stack, seen: NDArray[np.uint8], noise: np.random.Generator
+    spec: Stack, seen: NDArray[np.uint8 | np.float32], noise: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Turn [6, h, w, 3] RGB pixels into the image input, zero-padded below."""
+    """Turn [n, h, w, 3] RGB pixels into [n, 3, H, W], zero-padded below."""
     grain = noise.normal(0, SENSOR_NOISE, seen.shape[:3])[..., None]
     pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
     mean = np.array(spec.image.mean, np.float32)
     std = np.array(spec.image.std, np.float32)
-    out = np.zeros(spec.inputs["img"], np.float32)
+    out = np.zeros((len(seen), 3, *spec.inputs["img"][-2:]), np.float32)
     height, width = seen.shape[1:3]
-    out[0, :, :, :height, :width] = ((pixels - mean) / std).transpose(0, 3, 1, 2)
+    out[:, :, :height, :width] = ((pixels - mean) / std).transpose(0, 3, 1, 2)
     return out
 
 

@@ -23,8 +23,6 @@ from me2e_compress.zoo.stacks import Stack, find
 if TYPE_CHECKING:
     from torch import nn
 
-    from me2e_compress.zoo.vad.config import HeadsName
-
 MARK = "region@"
 """Begins the scope that a region pushes, and @ ends the name of the module in it: no
 attribute has an @, and the exporter appends a number when it enters a scope again."""
@@ -49,7 +47,7 @@ class Truth:
 
 
 def record(
-    stack: str, *, seed: int = 0, heads: "HeadsName" = "nuscenes", opset: int = 17
+    stack: str, *, seed: int = 0, heads: str | None = None, opset: int = 17
 ) -> Truth:
     """Export a stack with and without marks, and count its MACs in one run.
 
@@ -57,8 +55,16 @@ def record(
         MissingExtraError: torch is not installed.
         GraphError: Unknown stack, or the two exports differ in more than names.
     """
-    spec = find(stack)
     model = build(stack, opset=opset, seed=seed, heads=heads)
+    return truth_of(find(stack).with_heads(heads), model, opset)
+
+
+def truth_of(spec: Stack, model: "nn.Module", opset: int = 17) -> Truth:
+    """Record what the trace of a module knows, as `record` does of a stack.
+
+    Raises:
+        GraphError: The two exports differ in more than names.
+    """
     plain = trace(spec, model, opset)
     with listening(_push_scope):
         marked = trace(spec, model, opset)

@@ -8,7 +8,7 @@ from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame
 from me2e_compress.zoo.vad.stack import VadTiny
 
-COMMAND = VAD_TINY.default_mode["nuscenes"]
+COMMAND = VAD_TINY.heads["nuscenes"]
 SHAPES = {
     "bev_embed": (10000, 1, 256),
     "all_cls_scores": (3, 1, 300, 10),

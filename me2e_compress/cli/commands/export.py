@@ -10,8 +10,14 @@ from me2e_compress.cli.console import listening, show
 from me2e_compress.workflows import export as workflow
 
 Heads = Annotated[
-    Literal["nuscenes", "bench2drive"] | None,
-    typer.Option(help="classes and ego modes of vad-tiny; default nuscenes"),
+    str | None,
+    typer.Option(
+        help="vad-tiny: nuscenes or bench2drive; tcp: bench2drive or beta; default the"
+        " first"
+    ),
+]
+Opset = Annotated[
+    int, typer.Option(help="of the file: 13 to 18, the last by torch's dynamo exporter")
 ]
 Seed = Annotated[
     int | None,
@@ -29,9 +35,9 @@ DialectName = Annotated[
 
 
 def export(
-    stack: Annotated[str, typer.Argument(help="vad-tiny or highway")],
+    stack: Annotated[str, typer.Argument(help="vad-tiny, tcp or highway")],
     output: Annotated[Path, typer.Option("-o", "--output", help="the ONNX file")],
-    opset: Annotated[int, typer.Option(help="ONNX opset of the file")] = workflow.OPSET,
+    opset: Opset = workflow.OPSET,
     heads: Heads = None,
     seed: Seed = None,
     operators: Operators = "standard",
@@ -39,7 +45,7 @@ def export(
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
-    """Write a reference stack as ONNX: VAD-tiny drawn from a seed, or our driver."""
+    """Write a reference stack as ONNX: drawn from a seed, or our driver."""
     options = workflow.ExportOptions(opset, heads, seed, force, operators, dialect)
     with listening() as listener:
         listener.on_progress(f"exporting {stack}", 0, 1, "")

@@ -13,14 +13,14 @@ from me2e_compress.workflows import frames as workflow
 Length = Annotated[
     int | None,
     typer.Option(
-        help=f"frames a scene; default {workflow.SCENE_LENGTH} for vad-tiny, else"
-        f" {workflow.DRIVEN_SCENE_LENGTH}"
+        help=f"frames a scene; default {workflow.SCENE_LENGTH} for vad-tiny and tcp,"
+        f" else {workflow.DRIVEN_SCENE_LENGTH}"
     ),
 ]
 
 
 def frames(
-    stack: Annotated[str, typer.Argument(help="vad-tiny, highway or M.onnx")],
+    stack: Annotated[str, typer.Argument(help="vad-tiny, tcp, highway or M.onnx")],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     count: given.Count = 256,
     scene_length: Length = None,
@@ -32,7 +32,7 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    For vad-tiny a synthetic world is drawn; for highway, or any ONNX file that
+    For vad-tiny and tcp a synthetic world is drawn; for highway, or any ONNX file that
     keeps the policy contract, the expert drives fresh routes of highway-env.
     """
     options = workflow.FramesOptions(

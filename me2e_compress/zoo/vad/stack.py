@@ -3,8 +3,9 @@
 from torch import Tensor, nn
 
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.vad.backbone import FeaturePyramid, ResNet50
+from me2e_compress.zoo.resnet import ResNet50
 from me2e_compress.zoo.vad.config import HEADS, HeadsName, Sampling
+from me2e_compress.zoo.vad.neck import FeaturePyramid
 from me2e_compress.zoo.vad.planner import Outputs, PlanningHead
 
 

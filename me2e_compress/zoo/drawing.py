@@ -1,0 +1,131 @@
+"""Weights drawn from a seed, so that no two tensors are equal and none is constant.
+
+An exporter merges equal tensors, and trained ones are never equal.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+BIAS_STD = 0.1
+EMBEDDING_STD = 0.3
+DEFAULT_GAIN = math.sqrt(2)
+RESIDUAL_SCALE = 0.35
+"""Of the last normalisation of a residual block, so that 16 blocks do not explode."""
+
+ATTENTION_HEADS = 8
+
+
+@dataclass(frozen=True)
+class Gains:
+    """How strong weights are.
+
+    Attributes:
+        by_name: Standard deviation of an output for a unit input, by a pattern in the
+            name: the first that matches; 1.4 (ReLU, He et al. 2015) where none does.
+        last_norm: Pattern of the normalisations that end a residual block.
+    """
+
+    by_name: Sequence[tuple[str, float]]
+    last_norm: str
+
+    def of(self, name: str) -> float:
+        """Return the gain of a parameter."""
+        matches = (gain for part, gain in self.by_name if re.search(part, name))
+        return next(matches, DEFAULT_GAIN)
+
+
+def draw_weights(model: nn.Module, gains: Gains, seed: int) -> None:
+    """Draw all parameters of a model, in place."""
+    generator = torch.Generator().manual_seed(seed)
+    modules: Mapping[str, nn.Module] = dict(model.named_modules())
+    for name, parameter in model.named_parameters():
+        owner = modules[name.rpartition(".")[0]]
+        parameter.copy_(_drawn(name, parameter, owner, gains, generator))
+
+
+def _drawn(
+    name: str,
+    parameter: Tensor,
+    owner: nn.Module,
+    gains: Gains,
+    generator: torch.Generator,
+) -> Tensor:
+    noise = torch.empty_like(parameter).normal_(generator=generator)
+    if isinstance(owner, nn.BatchNorm2d | nn.LayerNorm) or "code_weights" in name:
+        noise = noise.clamp(-3, 3) * BIAS_STD
+        if name.endswith("bias"):
+            return noise
+        return (1 + noise) * (RESIDUAL_SCALE if re.search(gains.last_norm, name) else 1)
+    if isinstance(owner, nn.Embedding) or "_embeds" in name:
+        return noise * EMBEDDING_STD
+    if name.endswith("sampling_offsets.bias"):
+        return _spread(parameter) + noise * BIAS_STD
+    if parameter.dim() == 1:
+        return noise * BIAS_STD
+    if parameter.dim() == 4:
+        noise = _smooth(noise)
+    elif isinstance(owner, nn.Linear):
+        noise = noise - noise.mean(1, keepdim=True)
+    return noise * (gains.of(name) / math.sqrt(parameter[0].numel()))
+
+
+def _smooth(kernels: Tensor) -> Tensor:
+    """Blur the kernels, at the same standard deviation: [out, in, k, k].
+
+    White-noise kernels respond to pixel noise more than to shapes; trained ones are
+    smooth.
+    """
+    blurred = kernels
+    for _ in range(kernels.shape[-1] // 3):
+        blurred = functional.avg_pool2d(blurred, 3, 1, 1, count_include_pad=False)
+    return blurred * (kernels.std() / blurred.std())
+
+
+def _spread(bias: Tensor) -> Tensor:
+    """Return deformable DETR's offsets: a direction a head, a step more a point."""
+    angles = torch.arange(ATTENTION_HEADS) * (2 * math.pi / ATTENTION_HEADS)
+    directions = torch.stack([angles.cos(), angles.sin()], -1)
+    directions = directions / directions.abs().amax(-1, keepdim=True)
+    points = bias.numel() // (ATTENTION_HEADS * 2)
+    steps = torch.arange(points) % 8 + 1
+    return (directions[:, None] * steps[:, None]).flatten()
+
+
+def take_statistics(backbone: nn.Module, images: Tensor) -> Tensor:
+    """Set the batch normalisations to the statistics of images, in place.
+
+    Args:
+        backbone: Maps the images to features.
+        images: [N, 3, H, W], normalised.
+
+    Returns:
+        The features.
+    """
+    norms = [each for each in backbone.modules() if isinstance(each, nn.BatchNorm2d)]
+    for norm in norms:
+        norm.train()
+        norm.momentum = 1.0
+    features: Tensor = backbone(images)
+    for norm in norms:
+        norm.eval()
+        norm.momentum = 0.1
+    return features
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run on one thread, so that sums do not depend on the machine's load."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,1 @@
+"""TCP, trajectory-guided control prediction, in torch at its published dimensions."""

@@ -1,0 +1,161 @@
+"""The whole of TCP."""
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.regions import region
+from me2e_compress.zoo.tcp.branches import (
+    ImageTrunk,
+    MapReader,
+    RecurrentCell,
+    layers,
+    scorer,
+)
+from me2e_compress.zoo.tcp.config import (
+    ACTION_SIZE,
+    DISTRIBUTIONS,
+    EXPERT_FEATURES,
+    STATE,
+    ActionHeads,
+    TcpConfig,
+)
+
+PUBLISHED = TcpConfig()
+
+
+class Tcp(nn.Module):
+    """A strip of three cameras and the ego state to waypoints and to actions.
+
+    Wu et al. 2022, written from the published description, at the published dimensions
+    and with the parameter names of the original. Nothing is remembered between frames.
+    PID control of the waypoints, the choice or the mode of an action and the fusion of
+    both heads are the host's.
+
+    Args:
+        heads: ``bench2drive`` scores 39 actions, ``beta``, the original, gives Beta
+            distributions of acceleration and steer.
+        training_branches: Hold the weights of the branches that only training reads:
+            1,375,491 parameters of Bench2DriveZoo's 26,593,444, which never run here.
+        config: Sizes.
+    """
+
+    def __init__(
+        self,
+        heads: ActionHeads = "bench2drive",
+        *,
+        training_branches: bool = False,
+        config: TcpConfig = PUBLISHED,
+    ) -> None:
+        super().__init__()
+        self.heads: ActionHeads = heads
+        self.config = config
+        joint, hidden, measured = config.joint, config.hidden, config.measured
+        self.perception = ImageTrunk(config)
+        channels = self.perception.channels[-1]
+        self.measurements = layers(STATE, measured, measured)
+        self.join_traj = layers(measured + config.classes, joint, joint, hidden)
+        self.join_ctrl = layers(measured + channels, joint, joint, hidden)
+        self.policy_head = nn.Sequential(
+            nn.Linear(hidden, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, hidden),
+            nn.Dropout(0.5),
+            nn.ReLU(),
+        )
+        self.decoder_ctrl = RecurrentCell(hidden + ACTION_SIZE[heads], hidden)
+        self.output_ctrl = layers(hidden, hidden, hidden)
+        self._add_action_head(hidden)
+        self.decoder_traj = RecurrentCell(2 + 2, hidden)
+        self.output_traj = nn.Linear(hidden, 2)
+        self.init_att = MapReader(measured, config)
+        self.wp_att = MapReader(2 * hidden, config)
+        self.merge = nn.Sequential(
+            nn.Linear(channels + hidden, joint), nn.ReLU(), nn.Linear(joint, hidden)
+        )
+        if training_branches:
+            self._add_training_branches()
+
+    def _add_action_head(self, hidden: int) -> None:
+        if self.heads == "bench2drive":
+            self.action_head = nn.Linear(hidden, ACTION_SIZE[self.heads])
+            return
+        for name in ("dist_mu", "dist_sigma"):
+            positive = nn.Sequential(nn.Linear(hidden, DISTRIBUTIONS), nn.Softplus())
+            self.add_module(name, positive)
+
+    def _add_training_branches(self) -> None:
+        hidden = self.config.hidden
+        self.speed_branch = scorer(self.config.classes, hidden)
+        self.value_branch_traj = scorer(hidden, hidden)
+        self.value_branch_ctrl = scorer(hidden, hidden)
+        if self.heads == "bench2drive":
+            self.feature_branch_traj = layers(hidden, EXPERT_FEATURES)
+            self.feature_branch_ctrl = layers(hidden, EXPERT_FEATURES)
+
+    def forward(
+        self, img: Tensor, state: Tensor, target_point: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Drive one frame.
+
+        Args:
+            img: [1, 3, 256, 900] float32, normalised: front left, front, front right.
+            state: [1, 9] float32: speed over 12 m/s, target point, command one-hot.
+            target_point: [1, 2] float32, metres: x forward, y right, as in CARLA.
+
+        Returns:
+            Waypoints [1, 4, 2], metres, in the frame of the target point; then, of
+            ``bench2drive``, the logits of 39 actions now [1, 39] and in the four steps
+            after [1, 4, 39]; of ``beta``, alpha and beta of acceleration and steer now
+            and in the four steps after, [1, 2], [1, 2], [1, 4, 2] and [1, 4, 2].
+        """
+        with region("backbone"):
+            vector, features = self.perception(img)
+        with region("measurements"):
+            measured = self.measurements(state)
+        with region("planner"):
+            waypoints, planned = self._trajectory(vector, measured, target_point)
+        with region("control"):
+            now, later = self._actions(features, measured, planned)
+            if self.heads == "bench2drive":
+                return waypoints, now, later
+            return waypoints, *now.chunk(2, -1), *later.chunk(2, -1)
+
+    def _trajectory(
+        self, vector: Tensor, measured: Tensor, target_point: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Return the waypoints [1, 4, 2] and the cell's state [1, 256] at each."""
+        hidden = self.join_traj(torch.cat([vector, measured], 1))
+        at = torch.zeros_like(target_point)
+        waypoints, states = [], []
+        for _ in range(self.config.steps):
+            hidden = self.decoder_traj(torch.cat([at, target_point], 1), hidden)
+            at = self.output_traj(hidden) + at
+            waypoints.append(at)
+            states.append(hidden)
+        return torch.stack(waypoints, 1), states
+
+    def _actions(
+        self, features: Tensor, measured: Tensor, planned: list[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the action now [1, A] and after each step of the plan [1, 4, A]."""
+        seen = self.init_att.read(features, measured)
+        x = self.join_ctrl(torch.cat([seen, measured], 1))
+        now = action = self._action(x)
+        hidden = torch.zeros_like(x)
+        later = []
+        for state in planned:
+            hidden = self.decoder_ctrl(torch.cat([x, action], 1), hidden)
+            seen = self.wp_att.read(features, torch.cat([hidden, state], 1))
+            merged = self.merge(torch.cat([hidden, seen], 1))
+            x = self.output_ctrl(merged) + x
+            action = self._action(x)
+            later.append(action)
+        return now, torch.stack(later, 1)
+
+    def _action(self, x: Tensor) -> Tensor:
+        policy = self.policy_head(x)
+        if self.heads == "bench2drive":
+            out: Tensor = self.action_head(policy)
+            return out
+        parameters = [self.get_submodule(n)(policy) for n in ("dist_mu", "dist_sigma")]
+        return torch.cat(parameters, -1)

@@ -1,0 +1,29 @@
+"""TCP in small: the same classes, fewer pixels and channels."""
+
+import dataclasses
+
+import torch
+
+from me2e_compress.zoo.drawing import draw_weights, take_statistics
+from me2e_compress.zoo.stacks import TCP, Stack
+from me2e_compress.zoo.tcp.config import ActionHeads, TcpConfig
+from me2e_compress.zoo.tcp.initialise import GAINS
+from me2e_compress.zoo.tcp.stack import Tcp
+
+SMALL = TcpConfig(
+    image_hw=(64, 96), stem=8, classes=20, measured=8, joint=24, hidden=16
+)
+
+
+def small_spec(heads: ActionHeads) -> Stack:
+    inputs = {**TCP.inputs, "img": (1, 3, *SMALL.image_hw)}
+    return dataclasses.replace(TCP.with_heads(heads), inputs=inputs)
+
+
+def small_tcp(heads: ActionHeads) -> Tcp:
+    model = Tcp(heads, config=SMALL).requires_grad_(False).eval()
+    draw_weights(model, GAINS, seed=0)
+    noise = torch.Generator().manual_seed(0)
+    images = torch.randn(4, 3, *SMALL.image_hw, generator=noise)
+    take_statistics(model.perception, images)
+    return model
