@@ -8,11 +8,13 @@ from scipy.optimize import check_grad
 from me2e_compress.driving.collision_optimizer import CollisionOptimizer, _Problem
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.latency import parse_latency
+from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.evaluators.highway.drivers import ExpertDriver, OnnxDriver
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.testing import check_form
+from me2e_compress.workflows.evaluate import with_stage
 from tests.evaluators.highway.drivers import PARKED, straight_on
 
 Floats = npt.NDArray[np.float64]
@@ -101,6 +103,20 @@ def test_a_model_without_the_output_is_refused_when_it_is_opened(
 
     with pytest.raises(EvaluationError, match=r"m.onnx: .* no output occupancy; there"):
         OnnxDriver(model, host_stage="collision-optimizer").open()
+
+
+@pytest.mark.parametrize(
+    ("driver", "stage", "words"),
+    [
+        (ExpertDriver(), "collision-optimizer", "expert has no network"),
+        (OnnxDriver(Path("m.onnx")), "smoother", "no host stage 'smoother'"),
+    ],
+)
+def test_a_stage_that_does_not_fit_is_refused_before_anything_drives(
+    driver: Driver, stage: str, words: str
+) -> None:
+    with pytest.raises(EvaluationError, match=words):
+        with_stage(driver, stage)
 
 
 def test_a_host_stage_is_part_of_what_identifies_a_driver(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from me2e_compress.driving.latency import LATENCY_SOURCES, parse_latency
 from me2e_compress.driving.latency_source import DecisionFacts, LatencySource
 from me2e_compress.driving.layered_latency import AgentsLatency
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.testing import check_form
 
 AROUND = np.array([(10.0, 0.0), (0.0, 30.0), (-5.0, 0.0), (60.0, 0.0)])
@@ -109,3 +110,8 @@ def test_an_option_that_the_source_below_has_not_is_refused() -> None:
 def test_a_layer_on_a_measurement_is_measured() -> None:
     assert parse_latency("limited{source=measured, fps=10}").measures
     assert not parse_latency("limited{source=none, fps=10}").measures
+
+
+def test_a_trace_without_a_file_is_a_study_s() -> None:
+    with pytest.raises(EvaluationError, match=r"names no file \(trace:FILE\)"):
+        Conditions(parse_latency("limited{source=trace, fps=10}"))
