@@ -41,7 +41,8 @@ def test_the_demo_compresses_drives_and_reports(
     ):
         assert title in shown
     assert "held-out frames)" in shown
-    assert "on the road: +0.0 points of driving score: no difference shown" in shown
+    assert "on the road: +0.0 points of driving score; 0 of 1 routes differ" in shown
+    assert ": no difference shown; " in shown
     assert "1 route cannot show one below 24 points, all 220 (--routes all) n" in shown
     record = json.loads((out / "study.json").read_text())
     assert [each["name"] for each in record["schemes"]] == ["float", "full"]

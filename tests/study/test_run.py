@@ -89,7 +89,10 @@ def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
 
     assert slow is None
     assert again is not None
-    assert again.driving_score.value == again.driving_score.high == 0.0
+    assert again.driving_score.value == 0.0
+    assert (
+        again.driving_score.low != again.driving_score.high
+    )  # two routes prove little
     assert fast is not None
     assert blind is not None
     assert fast.better + fast.worse > 0

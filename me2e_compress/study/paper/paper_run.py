@@ -166,8 +166,10 @@ def _accident(
     for condition in sorted(study.conditions, key=partial(held_frames, study)):
         record = result.cell(study.baseline, condition.name)
         happened = None if record is None else first_accident(record)
+        if record is None or happened is None:
+            continue
         job = setup.job(driver, condition)
-        if record is None or happened is None or job is None:
+        if job is None:
             continue
         route = next(each for each in study.routes if each.id == happened.route)
         found = watched(record, happened, route, job)
