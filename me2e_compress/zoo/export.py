@@ -18,8 +18,9 @@ from me2e_compress.zoo.stacks import TCP, Stack, find
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
+    from me2e_compress.zoo.bev.sizes import Sampling
     from me2e_compress.zoo.tcp.config import ActionHeads
-    from me2e_compress.zoo.vad.config import HeadsName, Sampling
+    from me2e_compress.zoo.vad.config import HeadsName
 
 GRID_SAMPLE_OPSET = 16
 """GridSample exists from here on; below, sampling is spelled with Gather."""

@@ -18,10 +18,10 @@ from me2e_compress.operators import expand, find, fused_nodes, import_domains
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.workflows.export import ExportOptions, export_stack, in_dialect
 from me2e_compress.zoo import export as exporting
+from me2e_compress.zoo.bev.attention import DecoderAttention
 from me2e_compress.zoo.export import build, trace
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame
-from me2e_compress.zoo.vad.attention import DecoderAttention
 from tests.operators.running import run
 
 DIALECTS = [each.name for each in DeformableAttention().all_dialects()]

@@ -9,15 +9,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional
 
-from me2e_compress.zoo.vad.attention import deformable_attention
-from me2e_compress.zoo.vad.reference_points import (
+from me2e_compress.zoo.bev.attention import deformable_attention
+from me2e_compress.zoo.bev.reference_points import (
     cell_positions,
     ego_shift,
     pillars,
     project,
     turn,
 )
-from me2e_compress.zoo.vad.sampling import sample
+from me2e_compress.zoo.bev.sampling import sample
+from me2e_compress.zoo.vad.config import GRID
 
 
 def can_bus(dx: float, dy: float, yaw: float, turned_deg: float = 0.0) -> Tensor:
@@ -38,20 +39,20 @@ def test_shift_is_the_one_of_the_original(dx: float, dy: float, yaw: float) -> N
         length * math.sin(yaw - angle) / 30,
         length * math.cos(yaw - angle) / 60,
     ]
-    got = ego_shift(can_bus(dx, dy, yaw))[0].tolist()
+    got = ego_shift(can_bus(dx, dy, yaw), GRID)[0].tolist()
     assert got == pytest.approx(expected, abs=1e-5)
 
 
 def test_no_turn_changes_nothing() -> None:
     bev = torch.randn(10000, 1, 256, generator=torch.Generator().manual_seed(0))
-    same = turn(bev, can_bus(0, 0, 0), cell_positions(), "operator")
+    same = turn(bev, can_bus(0, 0, 0), cell_positions(GRID), GRID, "operator")
     assert torch.equal(same[0], bev[:, 0])
 
 
 def test_quarter_turn_is_about_the_corner() -> None:
     """About cell (100, 100) of a 100 x 100 grid, 90 degrees leave only outside."""
     bev = torch.ones(10000, 1, 256)
-    turned = turn(bev, can_bus(0, 0, 0, 90.0), cell_positions(), "operator")
+    turned = turn(bev, can_bus(0, 0, 0, 90.0), cell_positions(GRID), GRID, "operator")
     assert float(turned.abs().sum()) == 0
 
 
@@ -90,7 +91,7 @@ def test_deformable_attention_against_a_loop() -> None:
         expected[0, query, head * 3 : head * 3 + 3] += part
     got = deformable_attention(
         torch.from_numpy(value),
-        (3, 4),
+        ((3, 4),),
         torch.from_numpy(centres),
         torch.from_numpy(weights),
         "operator",

@@ -3,32 +3,29 @@
 from dataclasses import dataclass
 from typing import Literal
 
-HeadsName = Literal["nuscenes", "bench2drive"]
-Sampling = Literal["operator", "gather", "fused"]
+from me2e_compress.zoo.bev.sizes import BevGrid
 
-CAMERAS = 6
+HeadsName = Literal["nuscenes", "bench2drive"]
+
 IMAGE_HW = (384, 640)
 """Pixels: 0.4 of 900 x 1600, padded to a multiple of 32."""
 
-EMBED = 256
-ATTENTION_HEADS = 8
-FEED_FORWARD = 512
+GRID = BevGrid(
+    hw=(100, 100),
+    pc_range=(-15.0, -30.0, -2.0, 15.0, 30.0, 2.0),
+    rotation_centre=(100.0, 100.0),
+)
+"""The previous BEV turns about the centre of the 200 x 200 base model, which all public
+tiny models keep although it is the corner of their 100 x 100 grid."""
+
+FEATURE_HWS = ((IMAGE_HW[0] // 32, IMAGE_HW[1] // 32),)
+"""Rows and columns of the only feature level."""
+
 LAYERS = 3
 """Of the BEV encoder, of the detection decoder and of the map decoder."""
 
-BEV_HW = (100, 100)
-PC_RANGE = (-15.0, -30.0, -2.0, 15.0, 30.0, 2.0)
-"""x, y, z minima then maxima in metres; lidar frame, x right, y forward, z up."""
-
-PILLAR_POINTS = 4
-"""Heights at which a BEV cell is projected into the cameras."""
-
-FEATURE_LEVELS = 4
-"""Rows of the level embedding; only the first is used by the tiny model."""
 
 AGENTS = 300
-BOX_CODE = 10
-"""cx, cy, log w, log l, cz, log h, sin, cos, vx, vy."""
 
 VECTORS = 100
 VECTOR_POINTS = 20
@@ -42,10 +39,6 @@ MAP_SCORE = 0.5
 
 MAP_REACH = 0.2
 """An agent sees map vectors within this distance, in normalised BEV coordinates."""
-
-ROTATION_CENTRE = (100.0, 100.0)
-"""Of the previous BEV, in cells: the centre of the 200 x 200 base model, which all
-public tiny models keep although it is the corner of their 100 x 100 grid."""
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ from collections.abc import Iterator
 import torch
 from torch import nn
 
+from me2e_compress.zoo.bev.sizes import Sampling
 from me2e_compress.zoo.drawing import Gains, draw_weights, one_thread, take_statistics
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import frames
-from me2e_compress.zoo.vad.config import HeadsName, Sampling
+from me2e_compress.zoo.vad.config import HeadsName
 from me2e_compress.zoo.vad.stack import VadTiny
 
 GAINS = (

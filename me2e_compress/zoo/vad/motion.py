@@ -5,19 +5,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.decoder import Interaction
+from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.vad.config import (
     AGENT_MODES,
     AGENTS,
-    EMBED,
     LAYERS,
     MAP_REACH,
     MAP_SCORE,
     STEPS,
     Heads,
-    Sampling,
 )
-from me2e_compress.zoo.vad.decoder import Interaction
 from me2e_compress.zoo.vad.perception import (
     Agents,
     Map,

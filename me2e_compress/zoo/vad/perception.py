@@ -6,19 +6,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.encoder import GridPosition
+from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.vad.bev_encoder import GridPosition
 from me2e_compress.zoo.vad.config import (
     AGENTS,
-    BEV_HW,
-    BOX_CODE,
-    EMBED,
+    GRID,
     LAYERS,
-    PC_RANGE,
     VECTOR_POINTS,
     VECTORS,
     Heads,
-    Sampling,
 )
 from me2e_compress.zoo.vad.transformer import PerceptionTransformer
 
@@ -72,9 +69,9 @@ class PerceptionHead(nn.Module):
         super().__init__()
         self.code_weights = nn.Parameter(torch.empty(BOX_CODE))
         self.map_code_weights = nn.Parameter(torch.empty(4))
-        self.positional_encoding = GridPosition()
+        self.positional_encoding = GridPosition(GRID.hw)
         self.transformer = PerceptionTransformer(sampling)
-        self.bev_embedding = nn.Embedding(BEV_HW[0] * BEV_HW[1], EMBED)
+        self.bev_embedding = nn.Embedding(GRID.cells, EMBED)
         self.query_embedding = nn.Embedding(AGENTS, 2 * EMBED)
         self.map_instance_embedding = nn.Embedding(VECTORS, 2 * EMBED)
         self.map_pts_embedding = nn.Embedding(VECTOR_POINTS, 2 * EMBED)
@@ -141,7 +138,7 @@ def _repeat(make: Callable[[int], nn.Module], outputs: int) -> nn.ModuleList:
 
 def _box(raw: Tensor, at: Tensor) -> Tensor:
     """Convert raw regression and refined centre (0..1) to a box in metres."""
-    x0, y0, z0, x1, y1, z1 = PC_RANGE
+    x0, y0, z0, x1, y1, z1 = GRID.pc_range
     x = at[..., 0:1] * (x1 - x0) + x0
     y = at[..., 1:2] * (y1 - y0) + y0
     z = at[..., 2:3] * (z1 - z0) + z0

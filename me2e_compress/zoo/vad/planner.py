@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.decoder import Interaction
+from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.vad.config import AGENT_MODES, EMBED, STEPS, Heads, Sampling
-from me2e_compress.zoo.vad.decoder import Interaction
+from me2e_compress.zoo.vad.config import AGENT_MODES, STEPS, Heads
 from me2e_compress.zoo.vad.motion import Motion, MotionHead
 from me2e_compress.zoo.vad.perception import Agents, regressor
 

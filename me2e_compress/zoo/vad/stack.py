@@ -2,10 +2,11 @@
 
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.neck import FeaturePyramid
+from me2e_compress.zoo.bev.sizes import Sampling
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.resnet import ResNet50
-from me2e_compress.zoo.vad.config import HEADS, HeadsName, Sampling
-from me2e_compress.zoo.vad.neck import FeaturePyramid
+from me2e_compress.zoo.vad.config import HEADS, HeadsName
 from me2e_compress.zoo.vad.planner import Outputs, PlanningHead
 
 
@@ -23,7 +24,7 @@ class VadTiny(nn.Module):
     ) -> None:
         super().__init__()
         self.img_backbone = ResNet50()
-        self.img_neck = FeaturePyramid()
+        self.img_neck = FeaturePyramid(self.img_backbone.channels[-1:])
         self.pts_bbox_head = PlanningHead(HEADS[heads], sampling)
 
     def forward(
@@ -45,6 +46,6 @@ class VadTiny(nn.Module):
         with region("backbone"):
             features = self.img_backbone(img.flatten(0, 1))
         with region("neck"):
-            features = self.img_neck(features)
+            (features,) = self.img_neck([features])
         out: Outputs = self.pts_bbox_head(features, lidar2img, can_bus, prev_bev)
         return out

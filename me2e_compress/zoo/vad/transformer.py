@@ -3,11 +3,12 @@
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.decoder import Decoder
+from me2e_compress.zoo.bev.encoder import BevEncoder
+from me2e_compress.zoo.bev.reference_points import cell_positions, ego_shift, turn
+from me2e_compress.zoo.bev.sizes import CAMERAS, EMBED, FEATURE_LEVELS, Sampling
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.vad.bev_encoder import BevEncoder
-from me2e_compress.zoo.vad.config import CAMERAS, EMBED, FEATURE_LEVELS, Sampling
-from me2e_compress.zoo.vad.decoder import Decoder
-from me2e_compress.zoo.vad.reference_points import cell_positions, ego_shift, turn
+from me2e_compress.zoo.vad.config import FEATURE_HWS, GRID, IMAGE_HW, LAYERS
 
 CAN_BUS = 18
 
@@ -36,12 +37,12 @@ class PerceptionTransformer(nn.Module):
         self.level_embeds = nn.Parameter(torch.empty(FEATURE_LEVELS, EMBED))
         self.cams_embeds = nn.Parameter(torch.empty(CAMERAS, EMBED))
         self.can_bus_mlp = CanBusEncoder()
-        self.encoder = BevEncoder(sampling)
+        self.encoder = BevEncoder(GRID, IMAGE_HW, FEATURE_HWS, LAYERS, sampling)
         self.reference_points = nn.Linear(EMBED, 3)
-        self.decoder = Decoder(sampling, height=True)
+        self.decoder = Decoder(GRID.hw, LAYERS, sampling, height=True)
         self.map_reference_points = nn.Linear(EMBED, 2)
-        self.map_decoder = Decoder(sampling, height=False)
-        self.register_buffer("cells", cell_positions(), False)
+        self.map_decoder = Decoder(GRID.hw, LAYERS, sampling, height=False)
+        self.register_buffer("cells", cell_positions(GRID), False)
 
     def bev(
         self,
@@ -56,9 +57,9 @@ class PerceptionTransformer(nn.Module):
         tokens = features.flatten(2).transpose(1, 2)
         tokens = tokens + self.cams_embeds[:, None] + self.level_embeds[0]
         first = torch.logical_not(torch.any(prev_bev != 0))
-        previous = turn(prev_bev, can_bus, self.cells, self.sampling)
+        previous = turn(prev_bev, can_bus, self.cells, GRID, self.sampling)
         query = query + self.can_bus_mlp(can_bus.unsqueeze(0))
-        shift = ego_shift(can_bus)
+        shift = ego_shift(can_bus, GRID)
         bev: Tensor = self.encoder(
             query, pos, previous, first, shift, tokens, lidar2img
         )

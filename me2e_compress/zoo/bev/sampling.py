@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from me2e_compress.zoo.vad.config import Sampling
+from me2e_compress.zoo.bev.sizes import Sampling
 
 
 def sample(

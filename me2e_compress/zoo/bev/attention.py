@@ -4,14 +4,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from me2e_compress.zoo.vad.config import (
-    ATTENTION_HEADS,
-    EMBED,
-    FEED_FORWARD,
-    Sampling,
-)
-from me2e_compress.zoo.vad.fused_attention import fused_deformable_attention
-from me2e_compress.zoo.vad.sampling import sample
+from me2e_compress.zoo.bev.fused_attention import fused_deformable_attention
+from me2e_compress.zoo.bev.sampling import sample
+from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, FEED_FORWARD, Sampling
+
+Levels = tuple[tuple[int, int], ...]
+"""Height and width of each feature level."""
 
 MASKED_LOGIT = -1.0e4
 """Softmax makes it 0, and unlike minus infinity it fits float16 and any observer."""
@@ -101,30 +99,39 @@ class FeedForward(nn.Module):
 
 def deformable_attention(
     value: Tensor,
-    hw: tuple[int, int],
+    hws: Levels,
     locations: Tensor,
     weights: Tensor,
     sampling: Sampling,
 ) -> Tensor:
-    """Sum samples of one feature level, weighted (Zhu et al. 2021, equation 2).
+    """Sum samples of feature levels, weighted (Zhu et al. 2021, equation 2).
 
     Args:
-        value: [B, h * w, heads, 32].
-        hw: Height and width of the level.
-        locations: [B, Q, heads, 1, P, 2], x then y; 0 and 1 are the outer edges.
-        weights: [B, Q, heads, 1, P], summing to 1 over the last two axes.
+        value: [B, cells of all levels, heads, 32].
+        hws: Height and width of each level.
+        locations: [B, Q, heads, L, P, 2], x then y; 0 and 1 are the outer edges.
+        weights: [B, Q, heads, L, P], summing to 1 over the last two axes.
         sampling: See `sample`; ``fused`` exports one node for all of it.
 
     Returns:
         [B, Q, heads * 32].
     """
     if sampling == "fused":
-        return fused_deformable_attention(value, hw, locations, weights).flatten(2)
+        return fused_deformable_attention(value, hws, locations, weights).flatten(2)
     batch, _, heads, channels = value.shape
-    queries, points = locations.shape[1], locations.shape[4]
-    image = value.flatten(2).transpose(1, 2).reshape(batch * heads, channels, *hw)
-    grid = (2 * locations - 1)[:, :, :, 0].transpose(1, 2).flatten(0, 1)
-    sampled = sample(image, grid, sampling)
+    queries, points = locations.shape[1], len(hws) * locations.shape[4]
+    cells = value.flatten(2).transpose(1, 2)
+    maps = [cells] if len(hws) == 1 else cells.split([h * w for h, w in hws], 2)
+    images = [
+        each.reshape(batch * heads, channels, *hw)
+        for each, hw in zip(maps, hws, strict=True)
+    ]
+    grids = 2 * locations - 1
+    parts = [
+        sample(image, grids[:, :, :, level].transpose(1, 2).flatten(0, 1), sampling)
+        for level, image in enumerate(images)
+    ]
+    sampled = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
     weights = weights.transpose(1, 2).reshape(batch * heads, 1, queries, points)
     out = (sampled * weights).sum(-1).view(batch, heads * channels, queries)
     return out.transpose(1, 2)
@@ -167,6 +174,6 @@ class DecoderAttention(nn.Module):
         weights = weights.view(batch, queries, ATTENTION_HEADS, self.points).softmax(-1)
         weights = weights.view(batch, queries, ATTENTION_HEADS, 1, self.points)
         locations = at[:, :, None, None, None, :] + offsets / self.size_xy
-        out = deformable_attention(value, self.hw, locations, weights, self.sampling)
+        out = deformable_attention(value, (self.hw,), locations, weights, self.sampling)
         read: Tensor = self.output_proj(out)
         return query + read

@@ -3,18 +3,15 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.vad.attention import FeedForward, deformable_attention
-from me2e_compress.zoo.vad.config import (
+from me2e_compress.zoo.bev.attention import FeedForward, Levels, deformable_attention
+from me2e_compress.zoo.bev.reference_points import pillars, project
+from me2e_compress.zoo.bev.sizes import (
     ATTENTION_HEADS,
-    BEV_HW,
     EMBED,
-    IMAGE_HW,
-    LAYERS,
-    PC_RANGE,
     PILLAR_POINTS,
+    BevGrid,
     Sampling,
 )
-from me2e_compress.zoo.vad.reference_points import pillars, project
 
 
 class TemporalSelfAttention(nn.Module):
@@ -23,15 +20,16 @@ class TemporalSelfAttention(nn.Module):
     points = 4
     queue = 2
 
-    def __init__(self, sampling: Sampling) -> None:
+    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
         super().__init__()
+        self.hw = hw
         self.sampling: Sampling = sampling
         samples = self.queue * ATTENTION_HEADS * self.points
         self.sampling_offsets = nn.Linear(self.queue * EMBED, samples * 2)
         self.attention_weights = nn.Linear(self.queue * EMBED, samples)
         self.value_proj = nn.Linear(EMBED, EMBED)
         self.output_proj = nn.Linear(EMBED, EMBED)
-        self.register_buffer("size_xy", torch.tensor(BEV_HW[::-1]).float(), False)
+        self.register_buffer("size_xy", torch.tensor(hw[::-1]).float(), False)
 
     def forward(self, query: Tensor, pos: Tensor, queue: Tensor, at: Tensor) -> Tensor:
         """Attend.
@@ -56,7 +54,8 @@ class TemporalSelfAttention(nn.Module):
         weights = weights.view(1, cells, heads, self.queue, points).softmax(-1)
         weights = weights.permute(0, 3, 1, 2, 4).flatten(0, 1).unsqueeze(3)
         locations = at[:, :, None, None, None, :] + offsets / self.size_xy
-        out = deformable_attention(value, BEV_HW, locations, weights, self.sampling)
+        hws = (self.hw,)
+        out = deformable_attention(value, hws, locations, weights, self.sampling)
         read: Tensor = self.output_proj(out.mean(0, keepdim=True))
         return query + read
 
@@ -66,39 +65,49 @@ class CameraAttention(nn.Module):
 
     points = 8
 
-    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+    def __init__(self, hws: Levels, sampling: Sampling) -> None:
         super().__init__()
-        self.hw = hw
+        self.hws = hws
         self.sampling: Sampling = sampling
-        self.sampling_offsets = nn.Linear(EMBED, ATTENTION_HEADS * self.points * 2)
-        self.attention_weights = nn.Linear(EMBED, ATTENTION_HEADS * self.points)
+        samples = ATTENTION_HEADS * len(hws) * self.points
+        self.sampling_offsets = nn.Linear(EMBED, samples * 2)
+        self.attention_weights = nn.Linear(EMBED, samples)
         self.value_proj = nn.Linear(EMBED, EMBED)
-        self.register_buffer("size_xy", torch.tensor(hw[::-1]).float(), False)
+        sizes = torch.tensor([hw[::-1] for hw in hws]).float()
+        size_xy = sizes[0] if len(hws) == 1 else sizes[:, None]
+        self.register_buffer("size_xy", size_xy, False)
 
     def forward(self, query: Tensor, tokens: Tensor, at: Tensor) -> Tensor:
         """Read every camera for every cell, visible or not.
 
         Args:
             query: [1, cells, 256].
-            tokens: [cameras, h * w, 256].
+            tokens: [cameras, tokens of all levels, 256].
             at: [cameras, cells, pillar points, 2] in the image, 0..1.
 
         Returns:
             [cameras, cells, 256].
         """
-        heads, points = ATTENTION_HEADS, self.points
+        heads, points, levels = ATTENTION_HEADS, self.points, len(self.hws)
         cameras, cells = at.shape[:2]
         value = self.value_proj(tokens).view(cameras, tokens.shape[1], heads, -1)
-        offsets = self.sampling_offsets(query).view(1, cells, heads, 1, points, 2)
+        offsets = self.sampling_offsets(query)
+        offsets = offsets.view(1, cells, heads, levels, points, 2)
+        groups = levels * points // PILLAR_POINTS
         offsets = (offsets / self.size_xy).view(
-            1, cells, heads, points // PILLAR_POINTS, PILLAR_POINTS, 2
+            1, cells, heads, groups, PILLAR_POINTS, 2
         )
-        weights = self.attention_weights(query).view(1, cells, heads, points)
-        weights = weights.softmax(-1).unsqueeze(3)
-        weights = weights.expand(cameras, cells, heads, 1, points)
+        weights = self.attention_weights(query).view(1, cells, heads, levels * points)
+        weights = _by_level(weights.softmax(-1), levels)
+        weights = weights.expand(cameras, cells, heads, levels, points)
         locations = at[:, :, None, None] + offsets
-        locations = locations.view(cameras, cells, heads, 1, points, 2)
-        return deformable_attention(value, self.hw, locations, weights, self.sampling)
+        locations = locations.view(cameras, cells, heads, levels, points, 2)
+        return deformable_attention(value, self.hws, locations, weights, self.sampling)
+
+
+def _by_level(weights: Tensor, levels: int) -> Tensor:
+    """Cut [..., levels * points] to [..., levels, points]."""
+    return weights.unsqueeze(3) if levels == 1 else weights.unflatten(3, (levels, -1))
 
 
 ONE = torch.tensor(1.0)
@@ -107,9 +116,9 @@ ONE = torch.tensor(1.0)
 class SpatialCrossAttention(nn.Module):
     """BEV queries attend to the cameras in which their pillar is visible."""
 
-    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+    def __init__(self, hws: Levels, sampling: Sampling) -> None:
         super().__init__()
-        self.deformable_attention = CameraAttention(hw, sampling)
+        self.deformable_attention = CameraAttention(hws, sampling)
         self.output_proj = nn.Linear(EMBED, EMBED)
 
     def forward(
@@ -135,10 +144,10 @@ class SpatialCrossAttention(nn.Module):
 class EncoderLayer(nn.Module):
     """Temporal attention, camera attention, feed-forward; normalised after each."""
 
-    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+    def __init__(self, hw: tuple[int, int], hws: Levels, sampling: Sampling) -> None:
         super().__init__()
         self.attentions = nn.ModuleList(
-            [TemporalSelfAttention(sampling), SpatialCrossAttention(hw, sampling)]
+            [TemporalSelfAttention(hw, sampling), SpatialCrossAttention(hws, sampling)]
         )
         self.ffns = nn.ModuleList([FeedForward()])
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
@@ -161,20 +170,37 @@ class EncoderLayer(nn.Module):
 
 
 class BevEncoder(nn.Module):
-    """Three `EncoderLayer`s over a grid of cells."""
+    """`EncoderLayer`s over a grid of cells.
+
+    Args:
+        grid: The cells.
+        image_hw: Pixels of a camera.
+        hws: Feature levels of a camera.
+        layers: How many.
+        sampling: See `sample`.
+    """
 
     pillars: Tensor
     cells: Tensor
 
-    def __init__(self, sampling: Sampling) -> None:
+    def __init__(
+        self,
+        grid: BevGrid,
+        image_hw: tuple[int, int],
+        hws: Levels,
+        layers: int,
+        sampling: Sampling,
+    ) -> None:
         super().__init__()
-        hw = (IMAGE_HW[0] // 32, IMAGE_HW[1] // 32)
-        self.layers = nn.ModuleList(EncoderLayer(hw, sampling) for _ in range(LAYERS))
-        points = pillars(BEV_HW, PC_RANGE, PILLAR_POINTS)
+        self.image_hw = image_hw
+        self.layers = nn.ModuleList(
+            EncoderLayer(grid.hw, hws, sampling) for _ in range(layers)
+        )
+        points = pillars(grid.hw, grid.pc_range, PILLAR_POINTS)
         self.register_buffer("pillars", points, False)
         rows, columns = torch.meshgrid(
-            (torch.arange(BEV_HW[0]) + 0.5) / BEV_HW[0],
-            (torch.arange(BEV_HW[1]) + 0.5) / BEV_HW[1],
+            (torch.arange(grid.hw[0]) + 0.5) / grid.hw[0],
+            (torch.arange(grid.hw[1]) + 0.5) / grid.hw[1],
             indexing="ij",
         )
         cells = torch.stack([columns, rows], -1).view(1, -1, 2)
@@ -205,7 +231,7 @@ class BevEncoder(nn.Module):
         Returns:
             [1, cells, 256].
         """
-        pillars_at, visible = project(self.pillars, lidar2img, IMAGE_HW)
+        pillars_at, visible = project(self.pillars, lidar2img, self.image_hw)
         cells_at = self.cells + shift[:, None]
         start = query
         for layer in self.layers:
@@ -219,14 +245,15 @@ class BevEncoder(nn.Module):
 class GridPosition(nn.Module):
     """Learned embedding of a row and a column."""
 
-    def __init__(self) -> None:
+    def __init__(self, hw: tuple[int, int]) -> None:
         super().__init__()
-        self.row_embed = nn.Embedding(BEV_HW[0], EMBED // 2)
-        self.col_embed = nn.Embedding(BEV_HW[1], EMBED // 2)
+        self.hw = hw
+        self.row_embed = nn.Embedding(hw[0], EMBED // 2)
+        self.col_embed = nn.Embedding(hw[1], EMBED // 2)
 
     def forward(self) -> Tensor:
         """Return [1, cells, 256]: column half, then row half."""
-        height, width = BEV_HW
+        height, width = self.hw
         columns = self.col_embed.weight.unsqueeze(0).expand(height, -1, -1)
         rows = self.row_embed.weight.unsqueeze(1).expand(-1, width, -1)
         return torch.cat([columns, rows], -1).flatten(0, 1).unsqueeze(0)

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from me2e_compress.zoo.vad.config import BEV_HW, PC_RANGE, ROTATION_CENTRE, Sampling
-from me2e_compress.zoo.vad.sampling import sample
+from me2e_compress.zoo.bev.sampling import sample
+from me2e_compress.zoo.bev.sizes import BevGrid, Sampling
 
 MIN_DEPTH = torch.tensor(1.0e-5)
 """Metres (BEVFormer, ``point_sampling``). A tensor: the exporter would write a Python
@@ -47,7 +47,7 @@ def project(
     return torch.cat([u, v], -1).transpose(1, 2), visible
 
 
-def ego_shift(can_bus: Tensor) -> Tensor:
+def ego_shift(can_bus: Tensor, grid: BevGrid) -> Tensor:
     """Return the last frame's translation as a part of the BEV grid, [1, 2] (x, y).
 
     The original takes length t and angle of the translation (dx, dy) and then
@@ -57,41 +57,49 @@ def ego_shift(can_bus: Tensor) -> Tensor:
 
     Args:
         can_bus: [18]; 0 and 1 are dx and dy in metres (world), 16 the yaw in radians.
+        grid: Whose part it is.
     """
     dx, dy, yaw = can_bus[0:1], can_bus[1:2], can_bus[16:17]
     cos, sin = torch.cos(yaw), torch.sin(yaw)
-    right = (sin * dx - cos * dy) / (PC_RANGE[3] - PC_RANGE[0])
-    ahead = (cos * dx + sin * dy) / (PC_RANGE[4] - PC_RANGE[1])
+    low_x, low_y, _, high_x, high_y, _ = grid.pc_range
+    right = (sin * dx - cos * dy) / (high_x - low_x)
+    ahead = (cos * dx + sin * dy) / (high_y - low_y)
     return torch.stack([right, ahead], -1)
 
 
-def cell_positions() -> Tensor:
+def cell_positions(grid: BevGrid) -> Tensor:
     """Return [cells, 2], the BEV's pixel centres relative to the rotation centre."""
     rows, columns = torch.meshgrid(
-        torch.arange(BEV_HW[0]) + 0.5, torch.arange(BEV_HW[1]) + 0.5, indexing="ij"
+        torch.arange(grid.hw[0]) + 0.5, torch.arange(grid.hw[1]) + 0.5, indexing="ij"
     )
-    return torch.stack([columns, rows], -1).view(-1, 2) - torch.tensor(ROTATION_CENTRE)
+    return torch.stack([columns, rows], -1).view(-1, 2) - torch.tensor(
+        grid.rotation_centre
+    )
 
 
-def turn(bev: Tensor, can_bus: Tensor, cells: Tensor, sampling: Sampling) -> Tensor:
+def turn(
+    bev: Tensor, can_bus: Tensor, cells: Tensor, grid: BevGrid, sampling: Sampling
+) -> Tensor:
     """Rotate the previous BEV to the present heading, to the nearest cell.
 
     Args:
         bev: [cells, 1, 256].
         can_bus: [18]; the last is the change of yaw in degrees.
         cells: [cells, 2] from `cell_positions`.
+        grid: Of the cells.
         sampling: See `sample`.
 
     Returns:
         [1, cells, 256].
     """
-    height, width = BEV_HW
+    height, width = grid.hw
+    centre_column, centre_row = grid.rotation_centre
     angle = can_bus[17:18] * (math.pi / 180)
     cos, sin = torch.cos(angle), torch.sin(angle)
     x, y = cells[:, 0], cells[:, 1]
-    column = cos * x - sin * y + ROTATION_CENTRE[0]
-    row = sin * x + cos * y + ROTATION_CENTRE[1]
-    grid = torch.stack([column * (2 / width) - 1, row * (2 / height) - 1], -1)
+    column = cos * x - sin * y + centre_column
+    row = sin * x + cos * y + centre_row
+    at = torch.stack([column * (2 / width) - 1, row * (2 / height) - 1], -1)
     image = bev.permute(1, 2, 0).view(1, -1, height, width)
-    turned = sample(image, grid.view(1, height, width, 2), sampling, mode="nearest")
+    turned = sample(image, at.view(1, height, width, 2), sampling, mode="nearest")
     return turned.flatten(2).transpose(1, 2)

@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.vad.attention import (
+from me2e_compress.zoo.bev.attention import (
     DecoderAttention,
     FeedForward,
     MultiheadAttention,
 )
-from me2e_compress.zoo.vad.config import BEV_HW, EMBED, LAYERS, Sampling
+from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 
 EPSILON = torch.tensor(1.0e-5)
 """Keeps the inverse sigmoid finite (deformable DETR). A tensor: the exporter would
@@ -23,10 +23,10 @@ def inverse_sigmoid(x: Tensor) -> Tensor:
 class DecoderLayer(nn.Module):
     """Self-attention, cross-attention to the BEV, feed-forward."""
 
-    def __init__(self, sampling: Sampling) -> None:
+    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
         super().__init__()
         self.attentions = nn.ModuleList(
-            [MultiheadAttention(), DecoderAttention(BEV_HW, sampling)]
+            [MultiheadAttention(), DecoderAttention(hw, sampling)]
         )
         self.ffns = nn.ModuleList([FeedForward()])
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
@@ -40,12 +40,14 @@ class DecoderLayer(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Three `DecoderLayer`s with a regression branch after each."""
+    """`DecoderLayer`s with a regression branch after each."""
 
-    def __init__(self, sampling: Sampling, *, height: bool) -> None:
+    def __init__(
+        self, hw: tuple[int, int], layers: int, sampling: Sampling, *, height: bool
+    ) -> None:
         super().__init__()
         self.height = height
-        self.layers = nn.ModuleList(DecoderLayer(sampling) for _ in range(LAYERS))
+        self.layers = nn.ModuleList(DecoderLayer(hw, sampling) for _ in range(layers))
 
     def forward(
         self,

@@ -1,0 +1,1 @@
+"""A bird's eye view from cameras: the blocks that VAD-tiny and UniAD-tiny share."""
