@@ -13,7 +13,8 @@ folder of the recipe, one in a text to where you are.
 """
 
 import dataclasses
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -21,8 +22,9 @@ from pathlib import Path
 from me2e_compress import documents
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes import PASSES, Pass
+from me2e_compress.registry.registry import default_of, fields_of
 
-__all__ = ["load", "parse", "shipped", "to_text"]
+__all__ = ["load", "parse", "shipped", "to_text", "to_toml"]
 
 
 def shipped() -> list[str]:
@@ -80,6 +82,32 @@ def parse(text: str) -> tuple[Pass, ...]:
 def to_text(passes: Iterable[Pass]) -> str:
     """Write passes as a pipeline; options at their default are left out."""
     return PASSES.text_all(passes)
+
+
+def to_toml(passes: Iterable[Pass]) -> str:
+    """Write passes as a recipe file; options at their default are left out."""
+    return "\n".join(map(_entry, passes))
+
+
+def _entry(each: Pass) -> str:
+    lines = ["[[pass]]", f"name = {_value(each.name)}"]
+    for field in fields_of(type(each)):
+        value = getattr(each, field.name)
+        if value is not None and value != default_of(field):
+            lines.append(f"{field.name} = {_value(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: object) -> str:
+    """Write a value as TOML; a string as JSON, whose escapes TOML has too."""
+    if isinstance(value, Mapping):
+        pairs = (f"{_value(str(key))} = {_value(each)}" for key, each in value.items())
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, bool | int | float):
+        return str(value).lower()
+    return json.dumps(str(value), ensure_ascii=False)
 
 
 def _beside(current: Pass, folder: Path) -> Pass:

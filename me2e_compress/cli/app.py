@@ -126,7 +126,7 @@ _ENTRIES = (
     CommandEntry(
         COMPRESS,
         "search",
-        "Find the modules whose int8 meets a budget and costs the plan least.",
+        "Find the scheme within the budgets that costs the plan, or the road, least.",
     ),
     CommandEntry(
         MEASURE,

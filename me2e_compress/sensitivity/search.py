@@ -106,28 +106,31 @@ def search(
             return tuple(tried)
     found = [each.costs for each in ranked]
     found += [each.measured_costs for each in tried if each.measured_costs]
-    raise EvaluationError(nothing_fits(budgets, whole, found))
+    limits = [(each.limit, each.unit) for each in budgets]
+    raise EvaluationError(nothing_fits(limits, whole, found))
 
 
 def nothing_fits(
-    budgets: Sequence[Budget], whole: Sequence[float], found: Sequence[Sequence[float]]
+    limits: Sequence[tuple[float, str]],
+    whole: Sequence[float],
+    found: Sequence[Sequence[float]],
 ) -> str:
     """Say that no assignment is within the budgets, and what the least costs are.
 
     Args:
-        budgets: what was asked.
+        limits: the budgets: the most that may be spent, and its unit.
         whole: what the float model costs.
         found: what each assignment costs.
     """
 
     def said(costs: Iterable[float]) -> str:
-        pairs = zip(costs, budgets, strict=True)
-        return " and ".join(f"{cost:g} {budget.unit}" for cost, budget in pairs)
+        pairs = zip(costs, limits, strict=True)
+        return " and ".join(f"{cost:g} {unit}" for cost, (_, unit) in pairs)
 
     least = said(map(min, zip(*found, strict=True)))
-    apart = "; each alone" if len(budgets) > 1 else ""
+    apart = "; each alone" if len(limits) > 1 else ""
     return (
-        f"nothing fits {said(each.limit for each in budgets)}: the float model costs"
+        f"nothing fits {said(limit for limit, _ in limits)}: the float model costs"
         f" {said(whole)}, the least found is about {least}{apart}"
     )
 

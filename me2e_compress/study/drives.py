@@ -16,6 +16,7 @@ from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.differences import PairedDifference, difference
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.scores import Scores, score
+from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
@@ -189,7 +190,27 @@ class DriveSetup:
         job = self.job(prepared, condition)
         if job is None:
             return None
-        evaluator = HighwayEvaluator(
+        return tuple(self._evaluator(job, prepared, condition).episodes())
+
+    def some(
+        self, prepared: PreparedVariant, condition: Condition, routes: Sequence[Route]
+    ) -> tuple[Episode, ...]:
+        """Drive what is missing of some of the study's routes, and return these.
+
+        Raises:
+            EvaluationError: A folder is of another evaluation or cannot be written, or
+                a process was killed.
+            StudyError: It cannot be driven.
+        """
+        job = self.job(prepared, condition)
+        if job is None:
+            raise StudyError(self._why_not(prepared))
+        return tuple(self._evaluator(job, prepared, condition).some(routes))
+
+    def _evaluator(
+        self, job: Job, prepared: PreparedVariant, condition: Condition
+    ) -> HighwayEvaluator:
+        return HighwayEvaluator(
             job,
             self.study.routes,
             self.workspace.results(prepared.variant, condition),
@@ -198,7 +219,6 @@ class DriveSetup:
             self._teller(f"{prepared.variant.name}, {condition.name}"),
             self.listener.on_warning,
         )
-        return tuple(evaluator.episodes())
 
     def _episodes_elsewhere(
         self, prepared: PreparedVariant, condition: Condition

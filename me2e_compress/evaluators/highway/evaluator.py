@@ -66,7 +66,20 @@ class HighwayEvaluator:
             EvaluationError: The policy cannot be opened, the folder is of another
                 evaluation or cannot be written, or a process was killed.
         """
-        if not self.routes:
+        yield from self.some(self.routes)
+
+    def some(self, routes: Sequence[Route]) -> Iterator[Episode]:
+        """Drive what is missing of some of the routes, then yield these in their order.
+
+        The folder is that of all routes: the others may be driven later.
+
+        Args:
+            routes: Of the evaluator's.
+
+        Raises:
+            EvaluationError: See :meth:`episodes`.
+        """
+        if not routes:
             raise EvaluationError("there is no route to drive")
         self.job.driver.open()
         made_by = fingerprint(self.job, self.routes, self.set_size)
@@ -74,13 +87,14 @@ class HighwayEvaluator:
         done = folder.episodes()
         for path, reason in folder.corrupt.items():
             self.on_warning(f"{path}: {reason}: driven again")
-        missing = [route for route in self.routes if route.id not in done]
-        self.on_progress(progress_of(tuple(done.values()), len(self.routes)))
+        missing = [route for route in routes if route.id not in done]
+        total = len(done) + len(missing)
+        self.on_progress(progress_of(tuple(done.values()), total))
         for driven in self._engine.drive(self.job, longest_first(missing)):
             folder.save(driven)
             done[driven.episode.route] = driven.episode
-            self.on_progress(progress_of(tuple(done.values()), len(self.routes)))
-        yield from (done[route.id] for route in self.routes)
+            self.on_progress(progress_of(tuple(done.values()), total))
+        yield from (done[route.id] for route in routes)
 
     @property
     def _engine(self) -> Engine:

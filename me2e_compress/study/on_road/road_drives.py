@@ -1,0 +1,203 @@
+"""What a search on the road makes and drives: once each, kept in one folder."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from me2e_compress import documents, graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import StudyError
+from me2e_compress.evaluators.highway.engine import Engine
+from me2e_compress.metrics.differences import PairedDifference, difference
+from me2e_compress.metrics.driving_score import route_score
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.runtime.atomic import write_json
+from me2e_compress.simulator.routes import Route
+from me2e_compress.study.definition import Study
+from me2e_compress.study.drives import DriveSetup
+from me2e_compress.study.on_road.limits import Weighed
+from me2e_compress.study.prepared import PreparedVariant, prepare_all
+from me2e_compress.study.timing import time_all
+from me2e_compress.study.workspace import Workspace
+from me2e_compress.version import __version__
+from me2e_compress.workflows.budgets import Joules, joules_of
+from me2e_compress.workflows.listener import Listener
+
+ASKED = "search.json"
+"""What decides the drives of a folder; budgets and the grid do not."""
+
+
+@dataclass(frozen=True)
+class RoadDrives:
+    """Schemes that are made and weighed, and drive when they are asked to.
+
+    Attributes:
+        setup: What all drives share.
+        prepared: Models that can drive, by name of the scheme; schemes whose files are
+            the same to the byte share the first one's.
+        weighed: What each costs.
+        failures: Why there is no model of a scheme.
+        joules: What joules are here.
+    """
+
+    setup: DriveSetup
+    prepared: Mapping[str, PreparedVariant]
+    weighed: Mapping[str, Weighed]
+    failures: Mapping[str, str]
+    joules: Joules
+
+    @property
+    def study(self) -> Study:
+        """The study whose variants these are."""
+        return self.setup.study
+
+    def same_as(self, name: str) -> str:
+        """Name the scheme whose file another is, to the byte; empty for the first."""
+        first = self.prepared[name].variant.name
+        return "" if first == name else first
+
+    def episodes(self, name: str, routes: Sequence[Route]) -> tuple[Episode, ...]:
+        """Drive what is missing of some routes; return them in their order.
+
+        Raises:
+            StudyError: It cannot be driven.
+            EvaluationError: The folder is of another evaluation.
+        """
+        (condition,) = self.study.conditions
+        return self.setup.some(self.prepared[name], condition, routes)
+
+    def differ(self, name: str, routes: Sequence[Route]) -> list[float]:
+        """Return points of driving score beside the float model's, route by route."""
+        if self.prepared[name].variant.name == self.study.baseline:
+            return [0.0] * len(routes)
+        pairs = zip(
+            self.episodes(name, routes),
+            self.episodes(self.study.baseline, routes),
+            strict=True,
+        )
+        return [
+            route_score(one).composed - route_score(other).composed
+            for one, other in pairs
+        ]
+
+    def difference(self, name: str) -> PairedDifference:
+        """Return the difference to the float model over all routes."""
+        routes, baseline = self.study.routes, self.study.baseline
+        ours, others = (self.episodes(each, routes) for each in (name, baseline))
+        return difference(ours, others, self.study.seed)
+
+
+def make_drives(
+    study: Study,
+    folder: Path,
+    joules: Joules,
+    engine: Engine,
+    listener: Listener,
+) -> RoadDrives:
+    """Make and weigh the models of a study; one that fails leaves the others.
+
+    Args:
+        study: Under one condition; its frames are also what latency is measured on.
+        folder: Where everything goes.
+        joules: What joules are here.
+        engine: Where routes are driven.
+        listener: Is called with progress and warnings.
+
+    Raises:
+        StudyError: The folder is of another search.
+        Me2eError: The float model cannot drive, or frames do not fit.
+    """
+    _claim(study, folder)
+    workspace = Workspace(folder)
+    made = prepare_all(study, workspace, listener)
+    failures = {each.variant.name: each.failure for each in made if each.failure}
+    by_file = dict[str | None, PreparedVariant]()
+    for each in made:
+        if not each.failure:
+            by_file.setdefault(each.sha256, each)
+    firsts = list(by_file.values())
+    clock = time_all(study, firsts, workspace, listener)
+    spent = _joules(study, firsts, joules, listener)
+    weighed = dict[str, Weighed]()
+    for each in firsts:
+        name, ms = each.variant.name, clock.milliseconds(each.variant.name, 50)
+        if each.model is None or ms is None:
+            raise StudyError(f"variant {name}: {each.variant.policy} is not a model")
+        size = graph.size(graph.load(each.model)).weight_bytes
+        weighed[name] = Weighed(size / 1e6, ms, spent[name])
+    prepared = {
+        each.variant.name: by_file[each.sha256] for each in made if not each.failure
+    }
+    setup = DriveSetup(study, clock, workspace, engine, listener)
+    costs = {name: weighed[each.variant.name] for name, each in prepared.items()}
+    return RoadDrives(setup, prepared, costs, failures, joules)
+
+
+def _joules(
+    study: Study,
+    made: Sequence[PreparedVariant],
+    kind: Joules,
+    listener: Listener,
+) -> dict[str, float]:
+    if study.frames is None:
+        raise StudyError(f"{study.title}: there are no frames")
+    return joules_of(
+        kind,
+        {each.variant.name: each.model for each in made if each.model is not None},
+        CalibrationSet(study.frames),
+        module_map=study.reference.module_map,
+        threads=study.timing.threads,
+        provider=study.provider,
+        on_window=lambda done, total, name: listener.on_progress(
+            "energy", done, total, name
+        ),
+    )
+
+
+def _claim(study: Study, folder: Path) -> None:
+    """Write down what decides the drives, or go on with a folder of the same.
+
+    Raises:
+        StudyError: The folder is of another search, or cannot be written.
+    """
+    asked, path = _decisive(study), folder / ASKED
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            if any(not each.name.startswith(".") for each in folder.iterdir()):
+                raise StudyError(f"{folder}: not empty, and holds no {ASKED}")
+            write_json(path, asked, indent=1)
+            return
+        before = documents.from_json(documents.content(path))
+    except OSError as error:
+        raise StudyError(f"{path}: {error.strerror}") from error
+    except documents.MalformedError as error:
+        raise StudyError(f"{path}: not JSON: {error}") from error
+    before = before if isinstance(before, dict) else {}
+    for key, value in asked.items():
+        if before.get(key) != value:
+            old, new = (str(each)[:60] for each in (before.get(key), value))
+            raise StudyError(
+                f"{folder}: of another search: its {key} is {old}, this one's {new};"
+                " choose another folder"
+            )
+
+
+def _decisive(study: Study) -> dict[str, Any]:
+    if study.frames is None:
+        raise StudyError(f"{study.title}: there are no frames")
+    (condition,), reference = study.conditions, study.reference
+    found = {
+        "version": __version__,
+        "model": graph.sha256_of(Path(reference.policy)),
+        "frames": CalibrationSet(study.frames).fingerprint,
+        "routes": [asdict(each) for each in study.routes],
+        "condition": condition.to_json(),
+        "timing": asdict(study.timing),
+        "seed": study.seed,
+        "adapter": None if reference.adapter is None else reference.adapter.read_text(),
+    }
+    plain = json.loads(json.dumps(found))
+    return dict(plain)

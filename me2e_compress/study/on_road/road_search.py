@@ -1,0 +1,207 @@
+"""Which scheme to ship: within the budgets, and the best on the road."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from me2e_compress import graph, recipe
+from me2e_compress.driving.policies import driver_named
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.evaluators.highway.evaluation_options import routes_named
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study, Timing, Variant
+from me2e_compress.study.on_road.grid import GridModules, GridPoint
+from me2e_compress.study.on_road.halving import Rung, drives, halve, stratified
+from me2e_compress.study.on_road.road_drives import RoadDrives, make_drives
+from me2e_compress.study.on_road.road_options import RoadSearchOptions
+from me2e_compress.study.on_road.road_result import RoadSearchResult, Scheme
+from me2e_compress.study.workload import workload
+from me2e_compress.workflows.budgets import joules_here
+from me2e_compress.workflows.checks import check_folder, load_map, model_path
+from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.listener import SILENT, Listener
+
+BASELINE = "float"
+"""The model as it is given: what all are held against."""
+CONDITION = "road"
+
+
+def search_on_road(
+    model: str | Path,
+    frames: str | Path,
+    output: str | Path,
+    options: RoadSearchOptions,
+    engine: Engine | None = None,
+    listener: Listener = SILENT,
+    tell: Callable[[str], None] = lambda line: None,
+) -> RoadSearchResult:
+    """Find the scheme within the budgets that drives best, by successive halving.
+
+    Every module group in float or int8, times the modules that are removed: all are
+    made, weighed and timed; those within the budgets drive the same routes with the
+    same seeds, the better half more of them, the last two all. Run again with the same
+    folder of drives, it goes on.
+
+    Args:
+        model: The float ONNX file, or the name of one that ships.
+        frames: Recorded frames: int8 and the means of what is removed are of them.
+        output: The recipe of the winner.
+        options: Budgets, grid and road.
+        engine: Where routes are driven; None for one process of this machine.
+        listener: Is called with progress and warnings.
+        tell: Is called with what is ahead, and with each rung.
+
+    Raises:
+        GraphError: No such model, or the output would harm an input.
+        RecipeError: No such module, or one that cannot be removed.
+        FramesError: Frames that do not fit.
+        StudyError: The folder of drives is of another search.
+        EvaluationError: Nothing fits the budgets; says what the least was. Or the
+            model cannot drive.
+        EnergyError: A counter that answers is not usable.
+    """
+    path, recipe_file = model_path(model), Path(output)
+    inputs = (path, frames, options.module_map, options.adapter)
+    check_folder(options.drives, inputs)
+    with writing([recipe_file], inputs, folders=[options.drives], force=options.force):
+        study, grid = planned(path, Path(frames), options)
+        tell(ahead(study, grid, options, engine))
+        made = make_drives(
+            study, options.drives, joules_here(), engine or LocalEngine(), listener
+        )
+        fitting = within(made, options)
+        rungs = climbed(made, fitting, options, tell)
+        winner = rungs[-1].standings[0].name
+        text = recipe.to_toml(
+            grid[winner].passes(options.rules, options.runs_on, options.dims)
+        )
+        write_bytes(recipe_file, text.encode())
+    return RoadSearchResult(
+        recipe_file,
+        tuple(_scheme(name, point, made, options) for name, point in grid.items()),
+        made.weighed[BASELINE],
+        rungs,
+        made.difference(winner),
+        made.joules,
+        study.conditions[0],
+        made.setup.clock.scale,
+        (len(study.routes), study.set_size),
+    )
+
+
+def planned(
+    path: Path, frames: Path, options: RoadSearchOptions
+) -> tuple[Study, dict[str, GridPoint]]:
+    """Return the study of a grid, and its points by the names of their variants.
+
+    Raises:
+        RecipeError: No such module, or one that cannot be removed.
+        EvaluationError: No such routes, or latency.
+        StudyError: A module's name that no file can have, or a latency that no study
+            knows.
+    """
+    loaded = graph.load(path)
+    modules = GridModules.of(loaded, load_map(options.module_map, loaded))
+    points = modules.grid(options.modules, options.ablate, options.most_ablated)
+    grid = {each.name: each for each in points}
+    routes, set_size = routes_named(options.routes)
+    driver = driver_named(str(path), options.adapter)
+    adapter = driver.adapter if isinstance(driver, OnnxDriver) else None
+    baseline = Variant(BASELINE, str(path), (), options.module_map, adapter)
+    variants = [
+        replace(
+            baseline,
+            name=name,
+            passes=point.passes(options.rules, options.runs_on, options.dims),
+        )
+        for name, point in grid.items()
+    ]
+    study = Study(
+        title=f"search {path.name}",
+        variants=(baseline, *variants),
+        conditions=(Condition(CONDITION, options.latency),),
+        baseline=BASELINE,
+        routes=stratified(routes, options.seed),
+        set_size=set_size,
+        frames=frames,
+        held_out=frames,
+        timing=Timing(options.samples, options.threads, options.baseline_median_s),
+        seed=options.seed,
+        provider=options.provider,
+    )
+    study.check_recordings()
+    return study, grid
+
+
+def ahead(
+    study: Study,
+    grid: dict[str, GridPoint],
+    options: RoadSearchOptions,
+    engine: Engine | None,
+) -> str:
+    """Say how many schemes there are, and about how long they drive at most."""
+    workers = engine.workers if isinstance(engine, LocalEngine) else 1
+    whole = workload(study, options.drives, workers)
+    of_all = len(study.variants) * len(study.routes)
+    driven = drives(len(grid), len(study.routes), options.first_rung)
+    hours = whole.hours * driven / of_all
+    how = "by this folder's logs" if whole.measured else "an estimate"
+    return (
+        f"{len(grid)} schemes; if all are within the budgets, {driven:,} of"
+        f" {of_all:,} routes are driven: about {hours:.1f} hours on {workers} worker"
+        f"{'s' * (workers > 1)} ({how}), besides making and timing the models"
+    )
+
+
+def within(made: RoadDrives, options: RoadSearchOptions) -> tuple[str, ...]:
+    """Return the schemes within the budgets, the cheapest first, each file once.
+
+    Raises:
+        EvaluationError: There is none; says what the least was.
+    """
+    limits, weighed = options.limits, made.weighed
+    ours = [name for name in made.prepared if name != BASELINE]
+    if not ours:
+        first = next(iter(made.failures.values()), "")
+        raise EvaluationError(f"no scheme could be made: {first}")
+    fitting = [name for name in ours if limits.spent(weighed[name]) <= 1]
+    if not fitting:
+        whole = weighed[BASELINE]
+        found = [weighed[name] for name in ours]
+        raise EvaluationError(limits.refusal(whole, found, made.joules))
+    once = {made.prepared[name].sha256: name for name in reversed(fitting)}
+    return tuple(sorted(once.values(), key=lambda name: limits.spent(weighed[name])))
+
+
+def climbed(
+    made: RoadDrives,
+    fitting: Sequence[str],
+    options: RoadSearchOptions,
+    tell: Callable[[str], None] = lambda line: None,
+) -> tuple[Rung, ...]:
+    """Drive the schemes by successive halving."""
+
+    def told(rung: Rung) -> None:
+        best = rung.standings[0]
+        left = sum(each.kept for each in rung.standings)
+        tell(
+            f"{rung.routes} routes: {len(rung.standings)} schemes, best {best.name}"
+            f" ({best.difference:+.1f} DS beside float); {left} kept"
+        )
+
+    routes = made.study.routes
+    return halve(fitting, routes, options.first_rung, made.differ, told)
+
+
+def _scheme(
+    name: str, point: GridPoint, made: RoadDrives, options: RoadSearchOptions
+) -> Scheme:
+    if name in made.failures:
+        return Scheme(name, point, None, f"not made: {made.failures[name]}", "")
+    weighed, same = made.weighed[name], made.same_as(name)
+    limits = options.limits
+    over = "" if limits.spent(weighed) <= 1 else limits.words(weighed, made.joules)
+    return Scheme(name, point, weighed, over and f"over budget: {over}", same)
