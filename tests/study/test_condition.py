@@ -10,6 +10,7 @@ from me2e_compress.driving.layered_latency import AgentsLatency, LimitedLatency
 from me2e_compress.driving.realtime import LatencyModel
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.study import Condition, Study, Timing, load_study, run_study
+from tests.evaluators.highway.drivers import PARKED
 from tests.study.conftest import BLIND, IDEAL, Here, Make
 
 
@@ -66,9 +67,13 @@ def test_own_latencies_may_be_limited_and_grow_with_the_scene() -> None:
 
 
 def alone(make: Make, *conditions: Condition) -> Study:
-    """Give a study of the blind driver, whom nothing is measured of."""
+    """Give a study of the blind driver on one route; nothing is measured of it."""
     return make(
-        variants=(BLIND,), baseline="blind", conditions=conditions, timing=Timing()
+        variants=(BLIND,),
+        baseline="blind",
+        conditions=conditions,
+        timing=Timing(),
+        routes=(PARKED,),
     )
 
 
