@@ -1,5 +1,7 @@
 """The schemes that a search on the road chooses among."""
 
+from pathlib import Path
+
 import pytest
 
 from me2e_compress import graph, recipe
@@ -56,7 +58,7 @@ def test_modules_that_cannot_be_chosen(
         DRIVER.grid(groups, ablate, 1)
 
 
-def test_the_recipe_of_a_point_is_read_back() -> None:
+def test_the_recipe_of_a_point_is_read_back(tmp_path: Path) -> None:
     point = GridPoint(("backbone",), ("map", "occ"))
     passes = point.passes("safe", "onnxruntime", {"batch": 1, "0 x": 2})
 
@@ -65,4 +67,5 @@ def test_the_recipe_of_a_point_is_read_back() -> None:
         "quantize-int8",
     ]
     assert passes[3].name == "ablate-modules"
-    assert recipe.parse(recipe.to_text(passes)) == passes
+    (tmp_path / "r.toml").write_text(recipe.to_toml(passes))
+    assert recipe.load(tmp_path / "r.toml") == passes

@@ -142,6 +142,15 @@ def test_the_best_on_the_road_is_the_recipe(found: Found) -> None:
     )
 
 
+def test_the_budgets_are_met_with_figures(found: Found) -> None:
+    result, _, _ = found
+
+    assert re.match(
+        r"budgets: 0\.0\S* of 1 MB, \S+ of 1 (modelled )?J", result.lines()[1]
+    )
+    assert "a preview: 8 of 220 routes" in result.lines()
+
+
 def test_each_file_drives_each_route_once_whatever_was_killed(found: Found) -> None:
     _, engine, _ = found
 

@@ -47,6 +47,7 @@ class RoadSearchResult(Result):
         condition: What all drove under.
         device_scale: How many times slower the device is than this machine.
         coverage: Routes that were driven, and those of the whole set.
+        spent: What the winner takes of each budget, in words.
     """
 
     output: Path
@@ -58,6 +59,7 @@ class RoadSearchResult(Result):
     condition: Condition
     device_scale: float
     coverage: tuple[int, int]
+    spent: str
 
     @property
     def winner(self) -> Scheme:
@@ -90,7 +92,7 @@ class RoadSearchResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return the answer, and what it holds for."""
         chosen = len(self.rungs[-1].standings)
-        lines = [self.headline, f"{self.output}: {self.winner.name}"]
+        lines = [self.headline, f"budgets: {self.spent}"]
         if chosen > 1:
             lines.append(
                 f"chosen as the best of {chosen} on these routes: others may show"
@@ -98,7 +100,7 @@ class RoadSearchResult(Result):
             )
         if self.coverage[0] < self.coverage[1]:
             lines.append("a preview: {} of {} routes".format(*self.coverage))
-        return tuple(lines)
+        return (*lines, f"{self.output}: {self.winner.name}")
 
     def tables(self) -> tuple[Table, ...]:
         """Return the grid with its costs, and the rungs."""

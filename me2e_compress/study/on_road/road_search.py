@@ -89,6 +89,7 @@ def search_on_road(
         study.conditions[0],
         made.setup.clock.scale,
         (len(study.routes), study.set_size),
+        options.limits.words(made.weighed[winner], made.joules),
     )
 
 
