@@ -72,6 +72,7 @@ class DriveSetup:
         engine: Where routes are driven.
         listener: Is called with progress and warnings.
         means_us: What each mean of a drive came to, by its condition.
+        image_sizes: Rows and columns that each variant's policy wants.
     """
 
     study: Study
@@ -80,6 +81,7 @@ class DriveSetup:
     engine: Engine
     listener: Listener
     means_us: dict[str, int] = field(default_factory=dict)
+    image_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def under(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
@@ -113,7 +115,10 @@ class DriveSetup:
         latency = self._latency(prepared, condition)
         if latency is None:
             return None
-        size = image_size_of(prepared.driver.open())
+        name = prepared.variant.name
+        if name not in self.image_sizes:  # opening a model takes half a second
+            self.image_sizes[name] = image_size_of(prepared.driver.open())
+        size = self.image_sizes[name]
         return Job(prepared.driver, condition.drives(latency, size))
 
     def _latency(
