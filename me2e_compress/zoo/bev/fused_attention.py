@@ -10,41 +10,35 @@ from torch.nn import functional
 if TYPE_CHECKING:
     from torch.onnx._internal.torchscript_exporter.jit_utils import GraphContext
 
-    from me2e_compress.zoo.bev.attention import Levels
-
 FUSED_NODE = "me2e::MultiScaleDeformableAttention"
 """The toolkit's own form, which ``translate-plugins`` turns into every dialect."""
 
 
 def fused_deformable_attention(
-    value: Tensor, hws: "Levels", locations: Tensor, weights: Tensor
+    value: Tensor, hw: tuple[int, int], locations: Tensor, weights: Tensor
 ) -> Tensor:
     """Map as `deformable_attention` does, to [B, Q, heads, 32]; exports one node."""
     apply: Callable[..., Tensor] = _Fused.apply
-    return apply(value, hws, locations, weights)
+    return apply(value, hw, locations, weights)
 
 
 class _Fused(torch.autograd.Function):
-    """Samples of feature levels, weighted and summed; no gradient."""
+    """Samples of one feature level, weighted and summed; no gradient."""
 
     @staticmethod
     def forward(
         ctx: object,
         value: Tensor,
-        hws: "Levels",
+        hw: tuple[int, int],
         locations: Tensor,
         weights: Tensor,
     ) -> Tensor:
         """Compute it by torch's own sampler."""
         batch, _, heads, channels = value.shape
-        queries, points = locations.shape[1], len(hws) * locations.shape[4]
-        maps = value.permute(0, 2, 3, 1).split([h * w for h, w in hws], 3)
-        parts = []
-        for level, (hw, each) in enumerate(zip(hws, maps, strict=True)):
-            image = each.reshape(batch * heads, channels, *hw)
-            grid = (2 * locations - 1)[:, :, :, level].transpose(1, 2).flatten(0, 1)
-            parts.append(functional.grid_sample(image, grid, align_corners=False))
-        sampled = torch.cat(parts, -1)
+        queries, points = locations.shape[1], locations.shape[4]
+        image = value.permute(0, 2, 3, 1).reshape(batch * heads, channels, *hw)
+        grid = (2 * locations - 1)[:, :, :, 0].transpose(1, 2).flatten(0, 1)
+        sampled = functional.grid_sample(image, grid, align_corners=False)
         weights = weights.transpose(1, 2).reshape(batch * heads, 1, queries, points)
         summed = (sampled * weights).sum(-1).view(batch, heads, channels, queries)
         return summed.permute(0, 3, 1, 2)
@@ -53,14 +47,13 @@ class _Fused(torch.autograd.Function):
     def symbolic(
         g: "GraphContext",
         value: Any,  # of types of the exporter that say too little
-        hws: "Levels",
+        hw: tuple[int, int],
         locations: Any,
         weights: Any,
     ) -> Any:
         """Write the node, its sizes constants, with the shape of what it gives."""
-        sizes = torch.tensor(hws, dtype=torch.int32)
-        counts = [0, *(h * w for h, w in hws[:-1])]
-        starts = torch.tensor(counts).cumsum(0).to(torch.int32)
+        sizes = torch.tensor([hw], dtype=torch.int32)
+        starts = torch.zeros(1, dtype=torch.int32)
         tables: list[Any] = [g.op("Constant", value_t=each) for each in (sizes, starts)]
         result: Any = g.op(FUSED_NODE, value, *tables, locations, weights)
         batch, _, heads, channels = value.type().sizes()
