@@ -97,3 +97,23 @@ def test_deformable_attention_against_a_loop() -> None:
         "operator",
     )
     assert np.allclose(got.numpy(), expected, atol=1e-5)
+
+
+def test_samples_of_two_levels_add_up() -> None:
+    hws, starts = ((3, 4), (2, 2)), (0, 12, 16)
+    generator = torch.Generator().manual_seed(0)
+    value = torch.randn(1, 16, 2, 3, generator=generator)
+    locations = torch.rand(1, 5, 2, 2, 4, 2, generator=generator)
+    weights = torch.rand(1, 5, 2, 2, 4, generator=generator)
+    one_by_one = [
+        deformable_attention(
+            value[:, starts[level] : starts[level + 1]],
+            (hw,),
+            locations[:, :, :, level : level + 1],
+            weights[:, :, :, level : level + 1],
+            "operator",
+        )
+        for level, hw in enumerate(hws)
+    ]
+    got = deformable_attention(value, hws, locations, weights, "operator")
+    torch.testing.assert_close(got, one_by_one[0] + one_by_one[1])
