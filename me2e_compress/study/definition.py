@@ -228,11 +228,15 @@ class Study:
             yield from (file for step in each.passes for file in step.files())
 
     def check_recordings(self) -> None:
-        """Open the recordings that it names.
+        """Open the recordings that it names, and look for the files of its variants.
 
         Raises:
-            StudyError: One of them is not a recording.
+            StudyError: One of them is not a recording, or a file is not there.
         """
+        for each in self.variants:
+            for key, file in (("adapter", each.adapter), ("trace", each.trace)):
+                if file is not None and not file.is_file():
+                    raise StudyError(f"variant {each.name}: {key} {file}: no such file")
         for name, folder in (("frames", self.frames), ("held_out", self.held_out)):
             if folder is None:
                 continue

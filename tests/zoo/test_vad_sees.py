@@ -37,8 +37,8 @@ class Seen:
     @torch.no_grad()
     def _features(self, frame: Frame) -> Tensor:
         images = torch.from_numpy(frame["img"])[0]
-        out: Tensor = self.model.img_neck(self.model.img_backbone(images))
-        return out
+        out: list[Tensor] = self.model.img_neck([self.model.img_backbone(images)])
+        return out[0]
 
     @torch.no_grad()
     def drive(self, features: Tensor, index: int = 0) -> dict[str, Tensor]:
