@@ -8,8 +8,12 @@ without end, numbers of thousands of digits, lone surrogates, keys of thousands 
 import json
 import re
 import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from pydantic import ValidationError
 
 LARGEST_BYTES = 256_000_000
 """The largest text file that is read; a plan of 30,000 nodes has 15 MB."""
@@ -25,6 +29,33 @@ _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
 
 class MalformedError(ValueError):
     """A text is not what it should be; the message is one line, without the file."""
+
+
+@contextmanager
+def reading(
+    path: Path, error: Callable[[str], Exception], otherwise: str
+) -> Iterator[None]:
+    """Turn what is wrong with a file that is read here into one line that names it.
+
+    Args:
+        path: the file.
+        error: what is raised.
+        otherwise: what the line says of a file that is there and does not fit.
+
+    Raises:
+        Exception: ``error``: the file cannot be read, is malformed, or does not fit;
+            the first place that does not is named.
+    """
+    try:
+        yield
+    except OSError as cause:
+        raise error(f"{path}: {cause.strerror}") from cause
+    except MalformedError as cause:
+        raise error(f"{path}: {otherwise}: {cause}") from cause
+    except ValidationError as cause:
+        first = cause.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        raise error(f"{path}: {otherwise}: {where}: {first['msg']}") from cause
 
 
 def content(path: Path) -> bytes:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
@@ -160,18 +160,8 @@ class LatencyTrace(Displayed):
         Raises:
             EvaluationError: No such file, or not a trace with at least one sample.
         """
-        try:
+        with documents.reading(path, EvaluationError, "not a latency trace"):
             record = _Record.model_validate_json(documents.content(path))
-        except OSError as error:
-            raise EvaluationError(f"{path}: {error.strerror}") from error
-        except documents.MalformedError as error:
-            raise EvaluationError(f"{path}: not a latency trace: {error}") from error
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"])) or "the file"
-            raise EvaluationError(
-                f"{path}: not a latency trace: {where}: {first['msg']}"
-            ) from error
         return cls(
             record.model_sha256,
             record.machine,

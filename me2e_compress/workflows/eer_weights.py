@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
@@ -43,17 +43,8 @@ class SavedWeights:
         Raises:
             EvaluationError: no such file, or not of this form.
         """
-        try:
+        with documents.reading(path, EvaluationError, "no file of weights"):
             found = _FILE.validate_python(documents.from_json(documents.content(path)))
-        except OSError as error:
-            raise EvaluationError(f"{path}: {error.strerror}") from error
-        except documents.MalformedError as error:
-            raise EvaluationError(f"{path}: no file of weights: {error}") from error
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"])) or "the file"
-            said = f"{path}: no file of weights: {where}: {first['msg']}"
-            raise EvaluationError(said) from error
         for column in (found.weights, found.offset, found.span):
             if set(column) != set(MEASURES):
                 names = ", ".join(MEASURES)

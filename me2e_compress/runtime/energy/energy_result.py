@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
 from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
@@ -174,16 +174,6 @@ class EnergyResult(Displayed):
         Raises:
             EnergyError: No such file, or not of this form.
         """
-        try:
+        with documents.reading(path, EnergyError, "not an energy file"):
             record = documents.from_json(documents.content(path))
             return TypeAdapter(cls).validate_python(record)
-        except OSError as error:
-            raise EnergyError(f"{path}: {error.strerror}") from error
-        except documents.MalformedError as error:
-            raise EnergyError(f"{path}: not an energy file: {error}") from error
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"])) or "the file"
-            raise EnergyError(
-                f"{path}: not an energy file: {where}: {first['msg']}"
-            ) from error
