@@ -2,26 +2,30 @@
 
 A recording is a folder: one ``.npz`` a frame, keyed by input name, in the order of
 their names, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
-frame of every scene.
+frame of every scene, and which inputs are pixels (`me2e_compress.calibration.pixels`).
 """
 
 import hashlib
 import itertools
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import documents
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
+from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.recurrence import not_fed_back, recurrent_inputs, sides
+
+T = TypeVar("T", Array, Declared)
 
 __all__ = ["CalibrationSet", "Frame", "synthetic"]
 
@@ -44,7 +48,9 @@ class CalibrationSet(Displayed):
         self.files = tuple(sorted(folder.glob("*.npz")))
         if not self.files:
             raise FramesError(f"{folder}: holds no .npz frames")
-        self.scenes = _scenes(folder / "scenes.json", len(self.files))
+        index = _index(folder / "scenes.json")
+        self.scenes = _scenes(folder / "scenes.json", index, len(self.files))
+        self.pixels = _pixels(folder / "scenes.json", index).inputs
 
     @property
     def headline(self) -> str:
@@ -74,13 +80,27 @@ class CalibrationSet(Displayed):
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Frame:
-        """Read one frame.
+        """Read one frame; its pixels are normalised.
 
         Raises:
-            FramesError: the file cannot be read as arrays.
+            FramesError: the file cannot be read as arrays, or its pixels are none.
         """
-        arrays = load_arrays(self.files[index])
+        path = self.files[index]
+        arrays = self._as_fed(path, load_arrays(path), PixelInput.normalised)
         return Frame(index, index in self.scenes, arrays)
+
+    def _as_fed(
+        self, path: Path, held: Mapping[str, T], turn: Callable[[PixelInput, T], T]
+    ) -> dict[str, T]:
+        """Turn what is pixels of a frame into what is fed."""
+        ready = dict(held)
+        for name, pixels in self.pixels.items():
+            try:
+                if name in ready:
+                    ready[name] = turn(pixels, ready[name])
+            except ValueError as error:
+                raise FramesError(f"{path}: {name} {error}") from error
+        return ready
 
     @property
     def fingerprint(self) -> str:
@@ -91,6 +111,8 @@ class CalibrationSet(Displayed):
         """
         seal = hashlib.blake2b(digest_size=16)
         seal.update(repr(self.scenes).encode())
+        if self.pixels:
+            seal.update(repr(sorted(self.pixels.items())).encode())
         for path in self.files:
             try:
                 with zipfile.ZipFile(path) as archive:
@@ -116,7 +138,7 @@ class CalibrationSet(Displayed):
         """
         fixed = static_inputs(model)
         for path in self.files:
-            held = declared(path)
+            held = self._as_fed(path, declared(path), PixelInput.fed)
             asked = {name: held[name] for name in held if name not in fixed}
             _check_frame(asked, model, str(path))
             for name, array in load_arrays(path).items():
@@ -222,17 +244,32 @@ def _draw(value: ir.Value, generator: np.random.Generator) -> Array:
     return np.asarray(generator.integers(0, 2, shape)).astype(dtype)
 
 
-def _scenes(path: Path, count: int) -> tuple[int, ...]:
-    """Read where scenes begin."""
+def _index(path: Path) -> dict[str, Any]:
+    """Read what a recording says of itself."""
     if not path.is_file():
         raise FramesError(
             f'{path}: missing; {{"scenes": [0]}} if the frames are one scene'
         )
-    try:
+    with documents.reading(path, FramesError, "not JSON"):
         content = documents.from_json(documents.content(path))
-    except documents.MalformedError as error:
-        raise FramesError(f"{path}: not JSON ({error})") from error
-    starts = content.get("scenes") if isinstance(content, dict) else None
+    return content if isinstance(content, dict) else {}
+
+
+def _pixels(path: Path, index: Mapping[str, object]) -> PixelInputs:
+    """Read which inputs are pixels."""
+    found = index.get("pixels")
+    version = found.get("version") if isinstance(found, dict) else None
+    if isinstance(version, int) and version > 1:
+        raise FramesError(
+            f"{path}: pixels of version {version}: a later me2e-compress wrote them"
+        )
+    with documents.reading(path, FramesError, "pixels"):
+        return PixelInputs.of(index)
+
+
+def _scenes(path: Path, index: Mapping[str, object], count: int) -> tuple[int, ...]:
+    """Read where scenes begin."""
+    starts = index.get("scenes")
     if not isinstance(starts, list) or not all(type(at) is int for at in starts):
         raise FramesError(f'{path}: must hold {{"scenes": [0, ...]}}')
     rising = all(a < b for a, b in itertools.pairwise(starts))

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from me2e_compress import documents
+from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.frames import Array, Frame
@@ -41,7 +42,11 @@ Source: TypeAlias = Callable[[Begin], Iterable[Frame]]
 
 
 def write_recording(
-    folder: Path, source: Source, about: Mapping[str, str | int], key: str = ""
+    folder: Path,
+    source: Source,
+    about: Mapping[str, str | int],
+    key: str = "",
+    pixels: Mapping[str, PixelInput] | None = None,
 ) -> Path:
     """Write a folder that `CalibrationSet` reads, all or nothing.
 
@@ -55,6 +60,7 @@ def write_recording(
         source: Of the frames; the first starts a scene.
         about: What ``scenes.json`` also says: the model, the seed.
         key: What else decides the frames; a run goes on only from one of the same.
+        pixels: By name, the inputs that the source yields as bytes.
 
     Returns:
         The folder.
@@ -64,7 +70,8 @@ def write_recording(
     """
     _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = _Draft(folder.with_name(f".{folder.name}.partial"), about, key)
+    partial = folder.with_name(f".{folder.name}.partial")
+    draft = _Draft(partial, _with_pixels(about, pixels or {}), key)
     try:
         for frame in source(draft.resume()):
             draft.write(frame)
@@ -80,6 +87,15 @@ def write_recording(
     return folder
 
 
+def _with_pixels(
+    about: Mapping[str, str | int], pixels: Mapping[str, PixelInput]
+) -> dict[str, object]:
+    """Say in the index which inputs are bytes; nothing where none is."""
+    if not pixels:
+        return dict(about)
+    return {**about, "pixels": PixelInputs(inputs=dict(pixels)).model_dump(mode="json")}
+
+
 class _Draft:
     """A recording that is being made.
 
@@ -89,7 +105,7 @@ class _Draft:
         key: likewise.
     """
 
-    def __init__(self, folder: Path, about: Mapping[str, str | int], key: str) -> None:
+    def __init__(self, folder: Path, about: Mapping[str, object], key: str) -> None:
         self.folder, self.about = folder, dict(about)
         self.key = [key, self.about]
         self.scenes: list[int] = []
