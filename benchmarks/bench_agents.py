@@ -32,9 +32,9 @@ import onnx
 
 from benchmarks.zoo_stubs import Network, RoadOption, install
 from me2e_compress.agents import graph_agent, real_time
-from me2e_compress.agents.waypoint_pid import PidOptions, WaypointPid
 from me2e_compress.driving.adapter import Adapter, Axes
 from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
 from tests.agents.small_leaderboard import SAVE_NAME, World, gps_of
 
 LIDAR = Adapter(axes=Axes.RIGHT_FORWARD)

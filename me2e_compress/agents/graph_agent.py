@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 from pydantic import Field
 
 from me2e_compress.agents.agent_options import AgentOptions, conf_parts, route_folder
@@ -27,9 +26,11 @@ from me2e_compress.agents.carla_rig import (
 )
 from me2e_compress.agents.forwarding import ForwardingAgent
 from me2e_compress.agents.metric_info import MetricInfo
-from me2e_compress.agents.waypoint_pid import PidOptions, WaypointPid
 from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.answer import checked
+from me2e_compress.driving.contract import PedalsAndWheel
 from me2e_compress.driving.onnx_policy import OnnxPolicy
+from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.providers import PROVIDERS
 
@@ -101,7 +102,7 @@ class GraphAgentOptions(AgentOptions):
 
 
 class GraphAgent(ForwardingAgent):
-    """Drives a graph: sensors, observation, plan, control.
+    """Drives a graph: sensors, observation, plan, control; or its controls as they are.
 
     Its cheap part is ``tick``, as in Bench2DriveZoo's agents; `RealTimeAgent` puts its
     latency into the drive.
@@ -157,7 +158,7 @@ class GraphAgent(ForwardingAgent):
         """Return the control that follows from this frame.
 
         Raises:
-            EvaluationError: The plan is not finite.
+            EvaluationError: The plan is not finite, or a control out of its range.
             GraphError: A node of the model failed.
         """
         reading = self.tick(input_data)
@@ -165,11 +166,13 @@ class GraphAgent(ForwardingAgent):
             self._began_s = timestamp
         time_us = round((timestamp - self._began_s) * 1e6)
         observation = self._observer.observe(input_data, reading, time_us)
-        plan = self._policy.plan(observation)
-        if not np.isfinite(plan).all():
-            raise EvaluationError(f"step {self.step}: the plan is not finite")
-        speed_mps = reading.motion.speed_mps
-        found = self._pid.control(plan, speed_mps, reading.node)
+        try:
+            found = checked(self._policy.plan(observation))
+        except EvaluationError as error:
+            raise EvaluationError(f"step {self.step}: {error}") from error
+        if not isinstance(found, PedalsAndWheel):
+            speed_mps = reading.motion.speed_mps
+            found = self._pid.control(found, speed_mps, reading.node)
         self._metrics.note(self.step)
         return carla_control(found.throttle, found.steer, found.brake)
 

@@ -18,6 +18,9 @@ that drives keeps its speed:
 An evaluator is any object with the members of `Evaluator`: it yields one `Episode` a
 route, and `me2e_compress.metrics` scores them.
 
+A policy answers waypoints, six every 0.5 s as an array, any others as a `Trajectory`
+with their times; or `PedalsAndWheel`, and then there is no plan.
+
 Conventions: the ego frame is x forward, y left, z up, metres, its origin on the ground
 under the centre of the ego; the world is right-handed, x east, y north, headings in
 radians counter-clockwise from east. Times are integer microseconds.
@@ -29,25 +32,29 @@ what a decision costs, `me2e_compress.driving.latency`; how a policy gets a name
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.runtime.trajectory import Trajectory
 
 __all__ = [
     "CAN_BUS_SIZE",
     "PLAN_SHAPE",
     "PLAN_STEP_US",
+    "Answer",
     "Evaluator",
     "HostedPolicy",
     "Observation",
+    "PedalsAndWheel",
     "Plan",
     "Policy",
     "RouteInfo",
     "SceneView",
     "SizedEvaluator",
+    "Trajectory",
     "WorldView",
 ]
 
@@ -59,6 +66,18 @@ PLAN_SHAPE = (6, 2)
 PLAN_STEP_US = 500_000
 """Microseconds between two waypoints."""
 CAN_BUS_SIZE = 18
+
+
+class PedalsAndWheel(NamedTuple):
+    """Throttle and brake 0 to 1, steering -1 (left) to 1 (right), as in CARLA."""
+
+    throttle: float
+    steer: float
+    brake: float
+
+
+Answer: TypeAlias = Plan | Trajectory | PedalsAndWheel
+"""What a policy decides: waypoints, or controls."""
 
 
 class RouteInfo(Protocol):
@@ -143,10 +162,10 @@ class Observation:
 
 
 class Policy(Protocol):
-    """A driver: maps observations to plans, one route after the other.
+    """A driver: maps observations to plans or controls, one route after the other.
 
     One object drives many routes in one process, never two at the same time. What it
-    raises, or a plan of another shape or with a number that is not finite, ends that
+    raises, or an answer of another shape, out of its range or not finite, ends that
     route as failed (`Ending.POLICY_FAILED`); the other routes go on.
     """
 
@@ -163,7 +182,7 @@ class Policy(Protocol):
     def reset(self, route: RouteInfo) -> None:
         """Prepare for a route: recurrent state returns to its initial value.
 
-        After it, the same observations must give the same plans, whatever was driven
+        After it, the same observations must give the same answers, whatever was driven
         before.
 
         Args:
@@ -171,8 +190,8 @@ class Policy(Protocol):
         """
         ...
 
-    def plan(self, observation: Observation) -> Plan:
-        """Return the plan for one observation.
+    def plan(self, observation: Observation) -> Answer:
+        """Return the plan for one observation, or the controls.
 
         Called once a decision, in order of time. The time that it takes counts only
         where latency is measured.
@@ -181,8 +200,8 @@ class Policy(Protocol):
             observation: What the policy gets at this decision.
 
         Returns:
-            Six waypoints [6, 2], metres in the ego frame, every 0.5 s; floating point,
-            finite.
+            Six waypoints [6, 2], metres in the ego frame, every 0.5 s; others with
+            their times, a `Trajectory`; or controls. Floating point, finite.
         """
         ...
 

@@ -8,13 +8,12 @@ import numpy as np
 
 from me2e_compress.driving.adapter import Adapter, ImageNormalization
 from me2e_compress.driving.adapter.inputs import ModelInputs
-from me2e_compress.driving.adapter.outputs import plan_of
-from me2e_compress.driving.contract import PLAN_SHAPE, Observation, Plan, RouteInfo
+from me2e_compress.driving.adapter.outputs import ModelOutputs
+from me2e_compress.driving.contract import Answer, Observation, RouteInfo, Trajectory
 from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.driving.ports import fits, zeros
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 
@@ -27,13 +26,13 @@ class OnnxPolicy:
     ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route began, of
     which a model may lack any; recurrent inputs ``X`` answered by ``X_out``, zeros at
     the start of a route; output ``plan`` [1, 6, 2]. An `Adapter` maps other names and
-    layouts.
+    layouts, waypoints of any number and spacing, and controls.
 
     Attributes:
         session: The loaded graph.
         adapter: How its ports relate to the contract.
         inputs: How it is fed.
-        plan_adapter: How its plan is read.
+        outputs: How its answer is read.
         recurrent: Recurrent input to the output that answers it.
         stage: Changes the plan on the host; None leaves it as the network has it.
         host_iterations: Of that stage, for the latest plan.
@@ -43,7 +42,7 @@ class OnnxPolicy:
     session: Session
     adapter: Adapter
     inputs: ModelInputs
-    plan_adapter: PlanAdapter
+    outputs: ModelOutputs
     recurrent: dict[str, str]
     stage: HostStage | None = None
     host_iterations: int = field(default=0, init=False)
@@ -89,7 +88,7 @@ class OnnxPolicy:
             session,
             adapter,
             ModelInputs.of(session, adapter, recurrent),
-            plan_of(adapter.plan, session.metadata, list(session.outputs)),
+            ModelOutputs.of(session, adapter),
             recurrent,
             stage,
         )
@@ -115,7 +114,7 @@ class OnnxPolicy:
             name: zeros(name, self.session.inputs[name]) for name in self.recurrent
         }
 
-    def plan(self, observation: Observation) -> Plan:
+    def plan(self, observation: Observation) -> Answer:
         """Run the model once.
 
         Raises:
@@ -126,14 +125,12 @@ class OnnxPolicy:
         feeds = self.feeds(observation)
         outputs = self.session.run({**self._state, **feeds})
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
-        command = np.array([observation.command])
-        waypoints = self.plan_adapter.plan(outputs, {"command": command, **feeds})
-        plan = self.adapter.to_ego(waypoints)
+        plan = self.outputs.trajectory(outputs, feeds, observation)
         if self.stage is None:
             return plan
-        work = self.stage.work(plan, outputs)
+        work = self.stage.work(np.asarray(plan.points, np.float64), outputs)
         self.host_iterations, self.host_cells = work.iterations, work.cells
-        return work.plan
+        return Trajectory(work.plan, plan.times_s)
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
         """Lay an observation out as the graph takes it, recurrent inputs left out.
@@ -146,13 +143,7 @@ class OnnxPolicy:
     def _dry_run(self) -> None:
         """Run once on zeros: what does not fit here would fail on every route."""
         self.reset(None)
-        nothing = self.inputs.nothing(self.plan_adapter.default_mode)
-        found = self.plan(nothing).shape
-        if found != PLAN_SHAPE:
-            raise EvaluationError(
-                f"output {self.plan_adapter.output}: the plan has shape "
-                f"{list(found)}, it must be {list(PLAN_SHAPE)}"
-            )
+        self.plan(self.inputs.nothing(command=0))
         for name, answer in self.recurrent.items():
             given, wanted = self._state[name].shape, self.session.inputs[name].shape
             if not fits(given, wanted):

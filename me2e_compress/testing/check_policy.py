@@ -1,10 +1,20 @@
 """Check that a policy keeps its contract, in a world of its own."""
 
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
+from me2e_compress.driving.answer import checked
+from me2e_compress.driving.contract import (
+    Answer,
+    Observation,
+    PedalsAndWheel,
+    Policy,
+    RouteInfo,
+    Trajectory,
+)
 from me2e_compress.driving.policies import POLICIES, Driver
 from me2e_compress.errors import VerificationError
 from me2e_compress.testing.form import check_form
@@ -12,20 +22,23 @@ from me2e_compress.testing.form import check_form
 ROUTE = "HighwayExit_0"
 DECISIONS = 8
 
+Answers: TypeAlias = tuple[Trajectory | PedalsAndWheel, ...]
 
-def check_policy(driver: Driver) -> tuple[Plan, ...]:
+
+def check_policy(driver: Driver) -> Answers:
     """Check that a driver opens a policy that keeps the contract.
 
     It has the form of :func:`check_form` and one fingerprint. On the first decisions
-    of a route that ships, each plan is a finite float array [6, 2]; the world is not
-    stepped; the same policy plans the same after a reset, and so does one that is
-    opened anew.
+    of a route that ships, each answer is a finite plan, float [6, 2] or a `Trajectory`,
+    or controls in their range; the world is not stepped; the same policy answers the
+    same after a reset, and so does one that is opened anew.
 
     Args:
-        driver: what opens the policy.
+        driver: what opens the policy; a Python policy's is
+            ``driver_named("package.module:factory")``.
 
     Returns:
-        The plans.
+        The answers, plans with the times of their waypoints.
 
     Raises:
         VerificationError: it broke a promise; the message says which.
@@ -36,15 +49,28 @@ def check_policy(driver: Driver) -> tuple[Plan, ...]:
     if not driver.fingerprint() or driver.fingerprint() != driver.fingerprint():
         raise VerificationError(f"{driver.name} has no fingerprint, or more than one")
     policy = driver.open()
-    plans, again = _plans(driver, policy), _plans(driver, policy)
-    if not np.array_equal(plans, again):
+    answers, again = _answers(driver, policy), _answers(driver, policy)
+    if not _same(answers, again):
         raise VerificationError(f"{driver.name} plans otherwise after a reset")
-    if not np.array_equal(plans, _plans(driver, driver.open())):
+    if not _same(answers, _answers(driver, driver.open())):
         raise VerificationError(f"{driver.name} plans otherwise when it is opened anew")
-    return plans
+    return answers
 
 
-def _plans(driver: Driver, policy: Policy) -> tuple[Plan, ...]:
+def _same(answers: Answers, others: Answers) -> bool:
+    return all(
+        np.array_equal(_numbers(one), _numbers(other))
+        for one, other in zip(answers, others, strict=True)
+    )
+
+
+def _numbers(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
+    if isinstance(answer, PedalsAndWheel):
+        return np.array(answer)
+    return np.column_stack([answer.points, answer.times_s])
+
+
+def _answers(driver: Driver, policy: Policy) -> Answers:
     """Drive the beginning of the route."""
     # the evaluator needs an extra that the other checks do not need
     from me2e_compress.evaluators.highway.conditions import Conditions
@@ -65,27 +91,27 @@ def _plans(driver: Driver, policy: Policy) -> tuple[Plan, ...]:
     listeners = Listeners(lambda world: asked.append((world, world.time_us)), answered)
     conditions = Conditions(image_size=image_size_of(policy))
     episode = drive(route, watched, conditions, listeners)
-    if len(watched.plans) < DECISIONS or not watched.enough:
+    if len(watched.answers) < DECISIONS or not watched.enough:
         raise VerificationError(f"{driver.name}: {episode.failure}")
-    return tuple(watched.plans)
+    return tuple(checked(answer) for answer in watched.answers)
 
 
 @dataclass
 class _Watched:
-    """A policy whose first plans are kept, and that then gives up."""
+    """A policy whose first answers are kept, and that then gives up."""
 
     policy: Policy
     needs_images: bool
     privileged: bool
-    plans: list[Plan] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
     enough: bool = False
 
     def reset(self, route: RouteInfo) -> None:
         self.policy.reset(route)
 
-    def plan(self, observation: Observation) -> Plan:
-        if len(self.plans) == DECISIONS:
+    def plan(self, observation: Observation) -> Answer:
+        if len(self.answers) == DECISIONS:
             self.enough = True
             raise StopIteration
-        self.plans.append(self.policy.plan(observation))
-        return self.plans[-1]
+        self.answers.append(self.policy.plan(observation))
+        return self.answers[-1]

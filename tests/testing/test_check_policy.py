@@ -4,9 +4,17 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
-from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
+from me2e_compress.driving.contract import (
+    Answer,
+    Observation,
+    PedalsAndWheel,
+    Policy,
+    RouteInfo,
+    Trajectory,
+)
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import VerificationError
 from me2e_compress.evaluators.highway.drivers import (
@@ -36,9 +44,14 @@ def test_a_recurrent_model_holds(tmp_path: Path) -> None:
         initializers=", float[1] one = {1.0}",
     )
 
-    plans = check_policy(OnnxDriver(model))
+    first, *_, last = (points(answer) for answer in check_policy(OnnxDriver(model)))
 
-    assert plans[7].tolist() == (plans[0] * 8).tolist()
+    assert last.tolist() == (first * 8).tolist()
+
+
+def points(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
+    assert isinstance(answer, Trajectory)
+    return answer.points
 
 
 @dataclass
@@ -55,8 +68,16 @@ class Wrong:
         if self.way != "remembers":
             self.asked = 0
 
-    def plan(self, observation: Observation) -> Plan:
+    def plan(self, observation: Observation) -> Answer:
         self.asked += 1
+        if self.way == "steers too far":
+            return PedalsAndWheel(0.0, 1.3, 0.0)
+        if self.way == "steers":
+            return PedalsAndWheel(0.3, 0.0, 0.0)
+        if self.way == "no time":
+            return Trajectory(AHEAD, np.zeros(6))
+        if self.way == "dense":
+            return Trajectory(np.array([[0.8, 0.0], [1.6, 0.0]]), np.array([0.1, 0.2]))
         if self.way == "shape":
             return AHEAD[:5]
         if self.way == "not finite":
@@ -90,8 +111,15 @@ class WrongDriver(Driver):
         return str(next(OPENED)) if self.way == "fingerprint" else super().fingerprint()
 
 
+@pytest.mark.parametrize(
+    ("way", "kind"), [("dense", Trajectory), ("steers", PedalsAndWheel)]
+)
+def test_other_waypoints_and_controls_hold(way: str, kind: type) -> None:
+    assert isinstance(check_policy(WrongDriver(way))[0], kind)
+
+
 def test_what_errs_in_no_way_holds() -> None:
-    assert np.array_equal(check_policy(WrongDriver())[0], AHEAD)
+    assert np.array_equal(points(check_policy(WrongDriver())[0]), AHEAD)
 
 
 @pytest.mark.parametrize(
@@ -99,6 +127,8 @@ def test_what_errs_in_no_way_holds() -> None:
     [
         ("shape", r"wrong: the plan has shape \[5, 2\], it must be \[6, 2\]"),
         ("not finite", "wrong: the plan is not finite"),
+        ("steers too far", r"wrong: steer is 1.3, it must be from -1 to 1"),
+        ("no time", "wrong: EvaluationError: times of waypoints must increase"),
         ("raises", "wrong: KeyError: 'lost'"),
         ("steps", "wrong steps the world"),
         ("remembers", "wrong plans otherwise after a reset"),

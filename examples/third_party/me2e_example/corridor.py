@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from me2e_compress.driving.answer import six_waypoints
 from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation, RouteInfo
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.metrics.episode import (
@@ -52,7 +53,7 @@ class Corridor:
         x, frames, decisions = 0.0, list[EgoFrame](), list[InferenceRecord]()
         while x < LENGTH_M and len(frames) * FRAME_US < LIMIT_S * 1e6:
             time_us = len(frames) * FRAME_US
-            waypoints = policy.plan(_seen(time_us))
+            waypoints = six_waypoints(policy.plan(_seen(time_us)))
             speed_mps = float(waypoints[0, 0]) / 0.5
             decisions.append(InferenceRecord(time_us, 0))
             frames.append(_frame(time_us, x, speed_mps))

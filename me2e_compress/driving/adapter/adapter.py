@@ -63,5 +63,5 @@ class Adapter(BaseModel):
         return np.asarray(lidar2img @ turn, np.float32)
 
     def to_ego(self, waypoints: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Turn [6, 2] waypoints of the model's frame into the ego frame."""
+        """Turn [n, 2] waypoints of the model's frame into the ego frame."""
         return np.asarray(waypoints @ self.axes.to_ego[:2, :2].T)

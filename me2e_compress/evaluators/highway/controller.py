@@ -26,9 +26,10 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
+from me2e_compress.driving.answer import timed
+from me2e_compress.driving.contract import Plan, Trajectory
 from me2e_compress.simulator.bicycle import (
     advance,
     slip_of,
@@ -42,8 +43,8 @@ from me2e_compress.simulator.traffic.bodies import (
     STEERING_LAG_S,
 )
 
-STEP_S = 0.5
-"""Time between two waypoints."""
+AHEAD_S = (0.5, 1.0)
+"""When the plan's places decide the acceleration, whatever its waypoints' times."""
 MIN_STEP_M = 0.3
 """Waypoints nearer than this to the one before give no direction."""
 STATION_M = 0.25
@@ -60,22 +61,28 @@ class AnchoredPlan:
         time_us: When the observation was taken.
         curve: [M, 2] metres, a smooth curve through the waypoints, a point every
             0.25 m, with a straight end 20 m beyond the last one.
-        travel_m: [7] metres along the curve at 0, 0.5 .. 3 s.
+        travel_m: [n + 1] metres along the curve at the times.
+        times_s: [n + 1] seconds, 0 and those of the waypoints.
     """
 
     time_us: int
     curve: Floats
     travel_m: Floats
+    times_s: Floats
 
     @classmethod
-    def of(cls, waypoints: npt.NDArray[np.floating], ego: Ego, time_us: int) -> Self:
-        """Anchor [6, 2] waypoints (ego frame, every 0.5 s) at the ego's pose."""
-        points = np.vstack([np.zeros((1, 2)), np.asarray(waypoints, np.float64)])
+    def of(cls, plan: Plan | Trajectory, ego: Ego, time_us: int) -> Self:
+        """Anchor a plan (ego frame) at the ego's pose."""
+        trajectory = timed(plan)
+        points = np.vstack(
+            [np.zeros((1, 2)), np.asarray(trajectory.points, np.float64)]
+        )
+        times = np.concatenate([[0.0], trajectory.times_s])
         knots, travel = _advance_only(points)
         local = _smooth(knots, slip_of(ego.steering_rad))
         cos, sin = math.cos(ego.heading), math.sin(ego.heading)
         turn = np.array([[cos, sin], [-sin, cos]])
-        return cls(time_us, local @ turn + (ego.x, ego.y), travel)
+        return cls(time_us, local @ turn + (ego.x, ego.y), travel, times)
 
     def nearest(self, x: float, y: float) -> float:
         """Return the arc length (m) of the point of the curve nearest to a position."""
@@ -97,8 +104,8 @@ class AnchoredPlan:
 
         After the last waypoint the plan goes on at its last speed.
         """
-        times = np.arange(len(self.travel_m)) * STEP_S
-        last_speed = (self.travel_m[-1] - self.travel_m[-2]) / STEP_S
+        times = self.times_s
+        last_speed = (self.travel_m[-1] - self.travel_m[-2]) / (times[-1] - times[-2])
         beyond = max(seconds - times[-1], 0.0) * last_speed
         return float(np.interp(seconds, times, self.travel_m) + beyond)
 
@@ -131,13 +138,13 @@ class Controller:
         return Control(self._acceleration(plan, ego, age), self._steering(plan, ego))
 
     def _acceleration(self, plan: AnchoredPlan, ego: Ego, age_s: float) -> float:
-        """Return the acceleration that best meets the next two waypoints, with lag.
+        """Return the acceleration that best meets the planned places, with lag.
 
-        Least squares over the planned places in 0.5 s and 1 s.
+        Least squares over those in 0.5 s and 1 s.
         """
         here, speed = plan.nearest(ego.x, ego.y), ego.speed_mps
         asked = weight = 0.0
-        for ahead in (STEP_S, 2 * STEP_S):
+        for ahead in AHEAD_S:
             # distance lost to the lag, distance coasted, distance per m/s2 asked for
             late = self.thrust_lag_s * (ahead - self.thrust_lag_s)
             late += self.thrust_lag_s**2 * math.exp(-ahead / self.thrust_lag_s)

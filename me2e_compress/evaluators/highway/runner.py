@@ -8,19 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import (
-    PLAN_SHAPE,
     HostedPolicy,
     Observation,
+    PedalsAndWheel,
     Policy,
+    Trajectory,
 )
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import control_clock
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.evaluators.highway.endings import EndingRules
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder, road_users
+from me2e_compress.evaluators.highway.vehicle_map import control_of
 from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
 from me2e_compress.simulator.cameras import (
     CameraRig,
@@ -47,7 +51,8 @@ class Listeners:
         on_query: Called with the world before the policy is called.
         on_answer: Called when it has returned.
         on_moment: Called at every frame with what a picture needs, the latest plan as
-            seen from the ego now; makes the cameras render for any policy.
+            seen from the ego now, None of a policy that answers controls; makes the
+            cameras render for any policy.
     """
 
     on_query: Callable[[World], None] = lambda world: None
@@ -67,10 +72,11 @@ def drive(
     """Drive a route to its end and return the record.
 
     At each decision the policy plans, and the controller turns the plan and the ego's
-    state at that same frame into a control; equation 4 (or the other latency model)
-    says when it acts and how long it is held. Before the first one acts the ego coasts
-    straight. A policy that raises, or answers anything but six finite waypoints, ends
-    the route as failed.
+    state at that same frame into a control; throttle, steer and brake become one by
+    `vehicle_map`. Equation 4 (or the other latency model) says when it acts and how
+    long it is held. Before the first one acts the ego coasts straight. A policy that
+    raises, or answers neither finite waypoints nor controls in their range, ends the
+    route as failed.
 
     Args:
         route: What to drive.
@@ -133,14 +139,20 @@ class _Drive:
         answer = _ask(self.policy, observation)
         took_us = (time.perf_counter_ns() - begun) // 1_000
         self.listeners.on_answer()
-        plan = _checked(answer)
-        self.plan = scene.ego, plan
+        control = self.control_by(_checked(answer), scene)
         facts = DecisionFacts(took_us, road_users(scene), *_host_work(self.policy))
         latency_us = self.charge(facts)
         self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
-        anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
-        control = self.controller.control(anchored, scene.ego, scene.time_us)
         self.clock.decide(control, latency_us)
+
+    def control_by(self, answer: Trajectory | PedalsAndWheel, scene: Scene) -> Control:
+        """Return the control that follows, and keep the plan, if there is one."""
+        if isinstance(answer, PedalsAndWheel):
+            self.plan = None
+            return control_of(answer, scene.ego.length)
+        self.plan = scene.ego, np.asarray(answer.points, np.float64)
+        anchored = AnchoredPlan.of(answer, scene.ego, scene.time_us)
+        return self.controller.control(anchored, scene.ego, scene.time_us)
 
     def show(self, scene: Scene) -> None:
         """Render this frame for the listener that draws pictures."""
@@ -187,19 +199,8 @@ def _failure(error: Exception) -> PolicyFailedError:
     )
 
 
-def _checked(answer: object) -> Plan:
-    if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
-        raise PolicyFailedError(f"the plan is not a float array but {_kind(answer)}")
-    if answer.shape != PLAN_SHAPE:
-        raise PolicyFailedError(
-            f"the plan has shape {list(answer.shape)}, it must be {list(PLAN_SHAPE)}"
-        )
-    if not np.isfinite(answer).all():
-        raise PolicyFailedError("the plan is not finite")
-    return answer.astype(np.float64)
-
-
-def _kind(answer: object) -> str:
-    if isinstance(answer, np.ndarray):
-        return f"an array of {answer.dtype}"
-    return type(answer).__name__
+def _checked(answer: object) -> Trajectory | PedalsAndWheel:
+    try:
+        return checked(answer)
+    except EvaluationError as error:
+        raise PolicyFailedError(str(error)) from error

@@ -10,6 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
+from me2e_compress.driving.answer import six_waypoints
 from me2e_compress.driving.contract import (
     PLAN_SHAPE,
     Observation,
@@ -201,7 +202,8 @@ class RecordingPolicy:
         plan = decision.waypoints
         if self.student is not None:
             answer = self.student.plan(replace(observation, scene=None, world=None))
-            plan = plan if self._expert_drives(scene.time_us) else answer
+            if not self._expert_drives(scene.time_us):
+                plan = six_waypoints(answer)
         return self._noise.apply(plan, scene.time_us)
 
     def _expert_drives(self, time_us: int) -> bool:

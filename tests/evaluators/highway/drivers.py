@@ -11,7 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 
-from me2e_compress.driving.contract import Observation, Policy, RouteInfo
+from me2e_compress.driving.contract import (
+    Answer,
+    Observation,
+    PedalsAndWheel,
+    Policy,
+    RouteInfo,
+)
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.simulator.routes import Route
@@ -37,12 +43,12 @@ class Misbehaving:
         if self.way == "no-reset":
             raise RuntimeError("will not start")
 
-    def plan(self, observation: Observation) -> npt.NDArray[np.floating]:
+    def plan(self, observation: Observation) -> Answer:
         self.asked += 1
         plan = self.blind.plan(observation)
         return plan if self.asked < 20 else self.misbehave(plan)
 
-    def misbehave(self, plan: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    def misbehave(self, plan: npt.NDArray[np.floating]) -> Answer:
         if self.way == "raise":
             raise KeyError("lost\nmy way")
         if self.way == "hang":
@@ -53,6 +59,10 @@ class Misbehaving:
             os.kill(os.getpid(), signal.SIGKILL)
         if self.way == "not-finite":
             return np.where(np.arange(12).reshape(6, 2) == 5, np.nan, plan)
+        if self.way == "steers-too-far":
+            return PedalsAndWheel(0.5, 1.3, 0.0)
+        if self.way == "no-pedal":
+            return PedalsAndWheel(float("nan"), 0.0, 0.0)
         return {"shape": plan[:5], "integers": plan.astype(int), "list": [1, 2]}[
             self.way
         ]  # type: ignore[return-value]

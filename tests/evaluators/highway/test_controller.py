@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from me2e_compress.driving.contract import Trajectory
 from me2e_compress.evaluators.highway.blind import centre_plan
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, Controller
 from me2e_compress.simulator.bicycle import (
@@ -167,3 +168,26 @@ def test_an_old_plan_is_followed_from_where_it_has_got_to() -> None:
     assert control.acceleration_mps2 == pytest.approx(0.0, abs=1e-6)
     late = Controller().control(plan, ego_at(2.0), 500_000)
     assert late.acceleration_mps2 > 2.0
+
+
+@pytest.mark.parametrize(("count", "step_s"), [(30, 0.1), (10, 0.2), (4, 0.5)])
+def test_the_same_way_in_other_waypoints_is_driven_the_same(
+    count: int, step_s: float
+) -> None:
+    """A bend of 40 m at 6 m/s; how many points draw it is no matter."""
+    ego = ego_at(speed=6.0)
+
+    def planned(times: np.ndarray) -> Trajectory:
+        turned = 6.0 * times / 40.0
+        bend = 40.0 * np.stack([np.sin(turned), 1 - np.cos(turned)], axis=1)
+        return Trajectory(bend, times)
+
+    six, other = (
+        Controller().control(AnchoredPlan.of(plan, ego, 0), ego, 0)
+        for plan in (
+            planned(0.5 * np.arange(1, 7)),
+            planned(step_s * np.arange(1, count + 1)),
+        )
+    )
+    assert other.steering_rad == pytest.approx(six.steering_rad, abs=5e-3)
+    assert other.acceleration_mps2 == pytest.approx(six.acceleration_mps2, abs=0.1)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from me2e_compress.driving.adapter import (
@@ -12,7 +13,15 @@ from me2e_compress.driving.adapter import (
     Axes,
     ImageNormalization,
 )
-from me2e_compress.driving.contract import Observation, Plan, Policy, RouteInfo
+from me2e_compress.driving.answer import checked
+from me2e_compress.driving.contract import (
+    Answer,
+    Observation,
+    Plan,
+    Policy,
+    RouteInfo,
+    Trajectory,
+)
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import EvaluationError
@@ -42,6 +51,17 @@ def observation(seed: int = 0, command: int = 2) -> Observation:
     )
 
 
+def planned(policy: Policy, seen: Observation) -> npt.NDArray[np.floating]:
+    """Ask a policy that answers waypoints."""
+    return checked_plan(policy.plan(seen)).points
+
+
+def checked_plan(answer: Answer) -> Trajectory:
+    found = checked(answer)
+    assert isinstance(found, Trajectory)
+    return found
+
+
 def test_a_model_drives(tmp_path: Path) -> None:
     policy = OnnxPolicy.open(straight_on(tmp_path / "m.onnx"))
 
@@ -69,7 +89,7 @@ def test_images_arrive_normalised_in_the_models_order(tmp_path: Path) -> None:
     policy, seen = OnnxPolicy.open(model), observation()
     policy.reset(EXIT)
 
-    plan = policy.plan(seen)
+    plan = planned(policy, seen)
 
     assert image_size_of(policy) == (16, 24)
     assert seen.images is not None
@@ -93,7 +113,7 @@ def test_recurrent_state_is_fed_forward_and_reset(tmp_path: Path) -> None:
     counted = []
     for _ in range(2):
         policy.reset(EXIT)
-        counted += [policy.plan(observation())[0, 0] for _ in range(3)]
+        counted += [planned(policy, observation())[0, 0] for _ in range(3)]
 
     assert counted == [1.0, 2.0, 3.0, 1.0, 2.0, 3.0]
 
@@ -122,7 +142,7 @@ class Listening:
         self.model.reset(route)
 
     def plan(self, observation: Observation) -> Plan:
-        self.heard.append(float(self.model.plan(observation)[0, 0]))
+        self.heard.append(float(planned(self.model, observation)[0, 0]))
         return np.zeros((6, 2))
 
 
@@ -138,7 +158,7 @@ def test_a_recurrent_model_knows_how_far_apart_its_frames_are(
         policy.reset(EXIT)
         for time_us in (0, 350_000, 400_000):
             seen = dataclasses.replace(observation(), time_us=time_us)
-            elapsed.append(policy.plan(seen)[0, 0])
+            elapsed.append(planned(policy, seen)[0, 0])
 
     assert elapsed == pytest.approx([0.0, 0.35, 0.05] * 2)
 
@@ -167,7 +187,7 @@ def test_an_adapter_names_the_recurrent_pair(tmp_path: Path) -> None:
     policy = OnnxPolicy.open(path, Adapter(recurrent={"steps": "state"}))
     policy.reset(EXIT)
 
-    assert [policy.plan(observation())[5, 1] for _ in range(2)] == [1.0, 2.0]
+    assert [planned(policy, observation())[5, 1] for _ in range(2)] == [1.0, 2.0]
 
 
 VAD = """
@@ -199,10 +219,10 @@ def test_an_adapter_sums_steps_picks_the_mode_and_turns_the_axes(
     policy = OnnxDriver(model, toml).open()
     policy.reset(EXIT)
 
-    plan = policy.plan(observation(command=2))
+    plan = planned(policy, observation(command=2))
 
     assert plan == pytest.approx(np.outer(range(1, 7), [2.0, 0.25]))
-    assert policy.plan(observation(command=0))[5] == pytest.approx([0.0, -3.0])
+    assert planned(policy, observation(command=0))[5] == pytest.approx([0.0, -3.0])
 
 
 def test_the_projection_is_turned_with_the_axes() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from me2e_compress.driving.contract import Observation, RouteInfo
+from me2e_compress.driving.contract import Observation, PedalsAndWheel, RouteInfo
 from me2e_compress.driving.latency import FixedLatency, parse_latency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
@@ -138,6 +138,8 @@ def test_a_late_control_acts_late() -> None:
         ("shape", r"the plan has shape \[5, 2\], it must be \[6, 2\]"),
         ("integers", "the plan is not a float array but an array of int64"),
         ("list", "the plan is not a float array but list"),
+        ("steers-too-far", "steer is 1.3, it must be from -1 to 1"),
+        ("no-pedal", "throttle is nan, it must be from 0 to 1"),
     ],
 )
 def test_a_policy_that_breaks_its_contract_has_failed(way: str, reason: str) -> None:
@@ -211,6 +213,38 @@ def test_a_junction_begins_after_its_announcement() -> None:
 def test_a_step_must_divide_50_ms() -> None:
     with pytest.raises(EvaluationError, match="a step of 30 ms"):
         Conditions(dt_us=30_000)
+
+
+@dataclass
+class Pressing:
+    """Answers one control, and no plan."""
+
+    control: PedalsAndWheel
+    needs_images: bool = False
+    privileged: bool = False
+
+    def reset(self, route: RouteInfo) -> None:
+        pass
+
+    def plan(self, observation: Observation) -> PedalsAndWheel:
+        return self.control
+
+
+def test_a_policy_of_controls_drives_and_shows_no_plan() -> None:
+    """Full throttle is 4 m/s2; the latency holds for it as for a plan."""
+    moments = list[Moment]()
+    late = Conditions(FixedLatency(150_000), image_size=(16, 16))
+    policy = Pressing(PedalsAndWheel(1.0, 0.0, 0.0))
+
+    episode = drive(PARKED, policy, late, Listeners(on_moment=moments.append))
+
+    assert episode.failure is None
+    pushed = [frame.acceleration_mps2 for frame in episode.frames]
+    assert pushed[3] == 0.0
+    assert pushed[4] > 0.5
+    assert max(pushed) == pytest.approx(4.0, rel=0.05)
+    assert episode.conflicts is not None
+    assert all(moment.plan is None for moment in moments)
 
 
 def test_watching_changes_nothing() -> None:

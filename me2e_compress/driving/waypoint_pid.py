@@ -9,15 +9,15 @@ option.
 
 import math
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from me2e_compress.driving.contract import PLAN_STEP_US
-
-STEPS_PER_S = 1e6 / PLAN_STEP_US
+from me2e_compress.driving.answer import timed
+from me2e_compress.driving.contract import PedalsAndWheel, Plan
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.trajectory import Trajectory
 
 Place = tuple[float, float]
 """Metres to the right and forward."""
@@ -69,14 +69,6 @@ class PidOptions(BaseModel):
     coast_above_mps: float = Field(default=math.inf, gt=0.0, allow_inf_nan=True)
 
 
-class PedalsAndWheel(NamedTuple):
-    """Throttle and brake 0 to 1, steering -1 (left) to 1 (right)."""
-
-    throttle: float
-    steer: float
-    brake: float
-
-
 class WaypointPid:
     """Follows one plan after the other; its windows count decisions, not seconds.
 
@@ -90,19 +82,25 @@ class WaypointPid:
         self._misses = deque([0.0] * options.speed_window, options.speed_window)
 
     def control(
-        self, plan: npt.NDArray[np.floating], speed_mps: float, node: Place
+        self, plan: Plan | Trajectory, speed_mps: float, node: Place
     ) -> PedalsAndWheel:
         """Return what follows from one plan.
 
         Args:
-            plan: [6, 2] waypoints every 0.5 s, metres, x forward, y left.
+            plan: Two waypoints or more, metres, x forward, y left.
             speed_mps: Of the ego.
             node: The next node of the route, metres to the right and forward.
+
+        Raises:
+            EvaluationError: The plan has one waypoint, which has no speed.
         """
-        asked = self.options
-        waypoints = np.stack([-plan[:, 1], plan[:, 0]], axis=1).astype(np.float64)
+        asked, trajectory = self.options, timed(plan)
+        forward, left = trajectory.points.T
+        waypoints = np.stack([-left, forward], axis=1).astype(np.float64)
+        if len(waypoints) < 2:
+            raise EvaluationError("a plan of one waypoint cannot be followed by PID")
         steps = np.hypot(*np.diff(waypoints, axis=0).T)
-        wanted_mps = float(np.mean(steps)) * STEPS_PER_S
+        wanted_mps = float(np.mean(steps) / np.mean(np.diff(trajectory.times_s)))
         steer = self._steering(waypoints, node)
         missing = min(max(wanted_mps - speed_mps, 0.0), asked.clip_delta_mps)
         self._misses.append(missing)

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from me2e_compress.agents.waypoint_pid import PedalsAndWheel, PidOptions, WaypointPid
+from me2e_compress.driving.contract import PedalsAndWheel
+from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
 
 AHEAD = (0.0, 30.0)
 

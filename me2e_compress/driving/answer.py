@@ -1,0 +1,79 @@
+"""What a policy may answer, checked and in one form."""
+
+import numpy as np
+
+from me2e_compress.driving.contract import (
+    PLAN_SHAPE,
+    PLAN_STEP_US,
+    PedalsAndWheel,
+    Plan,
+)
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.trajectory import Trajectory
+
+PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
+"""When the waypoints of a `Plan` are to be reached."""
+
+RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
+"""Of `PedalsAndWheel`."""
+
+
+def checked(answer: object) -> Trajectory | PedalsAndWheel:
+    """Return a policy's answer, a plan with the times of its waypoints.
+
+    Raises:
+        EvaluationError: It is neither waypoints nor controls, of another shape, not
+            finite, or a control out of its range.
+    """
+    if isinstance(answer, PedalsAndWheel):
+        return _in_range(answer)
+    if isinstance(answer, Trajectory):
+        return Trajectory(_finite(answer.points), np.asarray(answer.times_s))
+    if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
+        raise EvaluationError(f"the plan is not a float array but {_kind(answer)}")
+    if answer.shape != PLAN_SHAPE:
+        raise EvaluationError(
+            f"the plan has shape {list(answer.shape)}, it must be {list(PLAN_SHAPE)}"
+        )
+    return Trajectory(_finite(answer), PLAN_TIMES_S)
+
+
+def timed(plan: Plan | Trajectory) -> Trajectory:
+    """Return a plan with the times of its waypoints."""
+    return plan if isinstance(plan, Trajectory) else Trajectory(plan, PLAN_TIMES_S)
+
+
+def six_waypoints(answer: object) -> Plan:
+    """Return a plan as six waypoints every 0.5 s, others read off between its own.
+
+    Raises:
+        EvaluationError: See :func:`checked`; or the policy answers controls.
+    """
+    found = checked(answer)
+    if isinstance(found, PedalsAndWheel):
+        raise EvaluationError("the policy answers controls: there is no plan")
+    if np.array_equal(found.times_s, PLAN_TIMES_S):
+        return found.points
+    return found.at(PLAN_TIMES_S)
+
+
+def _finite(points: Plan) -> Plan:
+    if not np.isfinite(points).all():
+        raise EvaluationError("the plan is not finite")
+    return points.astype(np.float64)
+
+
+def _in_range(control: PedalsAndWheel) -> PedalsAndWheel:
+    for name, (low, high) in RANGES.items():
+        value = getattr(control, name)
+        if not low <= value <= high:  # which NaN is not either
+            raise EvaluationError(
+                f"{name} is {value:g}, it must be from {low:g} to {high:g}"
+            )
+    return control
+
+
+def _kind(answer: object) -> str:
+    if isinstance(answer, np.ndarray):
+        return f"an array of {answer.dtype}"
+    return type(answer).__name__
