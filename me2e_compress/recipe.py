@@ -23,6 +23,7 @@ from me2e_compress import documents
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes import PASSES, Pass
 from me2e_compress.registry.registry import default_of, fields_of
+from me2e_compress.registry.text import chosen_fields
 
 __all__ = ["load", "parse", "shipped", "to_text", "to_toml"]
 
@@ -100,6 +101,8 @@ def _entry(each: Pass) -> str:
 
 def _value(value: object) -> str:
     """Write a value as TOML; a string as JSON, whose escapes TOML has too."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _value(chosen_fields(value))
     if isinstance(value, Mapping):
         pairs = (f"{_value(str(key))} = {_value(each)}" for key, each in value.items())
         return f"{{{', '.join(pairs)}}}"

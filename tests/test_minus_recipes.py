@@ -25,6 +25,13 @@ DROPPED = {
     "motion": ("motions",),
     "occ": ("occupancy",),
 }
+SCHEMES = {
+    "-".join(names): sum((DROPPED[name] for name in names), ())
+    for names in (
+        *(("map", "motion"), ("occ", "motion"), ("occ", "map")),
+        ("occ", "map", "motion"),
+    )
+}
 OUTPUTS = (
     *("plan", "agents", "lanes", "motions", "occupancy"),
     *("prev_bev_out", "prev_memory_out"),
@@ -77,6 +84,14 @@ def test_the_module_is_gone_with_its_outputs(
     assert tuple(value.name for value in made.graph.outputs) == left
     inputs, _ = graph.interface(made)
     assert inputs == graph.interface(graph.load(model))[0]
+
+
+@pytest.mark.parametrize("modules", SCHEMES)
+def test_several_modules_go_together(model: Path, tmp_path: Path, modules: str) -> None:
+    made = without(modules, model, recording(tmp_path / "f", 1))
+
+    left = tuple(name for name in OUTPUTS if name not in SCHEMES[modules])
+    assert tuple(value.name for value in made.graph.outputs) == left
 
 
 @pytest.mark.parametrize("module", DROPPED)

@@ -25,12 +25,15 @@ class Substitute:
     """What substitutes the result of a scope while a module is ablated.
 
     Attributes:
-        scope: pattern of the scope whose result must no longer depend on the module.
-        by: pattern of the scope whose result is read in its place; None for zeros.
+        scope: pattern of the scope, or a module, whose result must no longer depend on
+            the module.
+        by: the scope or module whose result is read in its place; None for zeros.
+        reader: the scope or module that reads it so; None: whoever read it.
     """
 
     scope: str
     by: str | None = None
+    reader: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +93,7 @@ class ModuleMap(Displayed):
         [[modules.map.substitutes]]           # read on ablation only
         scope = "*.ego_map_decoder"
         by = "*.ego_agent_decoder"            # left out: zeros
+        reader = "planner"                    # left out: whoever read it
         ```
 
         Raises:
@@ -230,6 +234,16 @@ class _Strict(pydantic.BaseModel):
 class _SubstituteTable(_Strict):
     scope: str
     by: str | None = None
+    reader: str | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _reads_something(self) -> Self:
+        if self.reader is not None and self.by is None:
+            raise ValueError("a substitute with a reader needs by=")
+        return self
+
+    def substitute(self) -> Substitute:
+        return Substitute(self.scope, self.by, self.reader)
 
 
 class _ModuleTable(_Strict):
@@ -252,7 +266,7 @@ class _ModuleTable(_Strict):
             self.role,
             self.patterns,
             self.optional,
-            tuple(Substitute(item.scope, item.by) for item in self.substitutes),
+            tuple(item.substitute() for item in self.substitutes),
         )
 
 

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import functools
+from collections.abc import Callable
 from fnmatch import fnmatchcase
 
 import onnx_ir as ir
@@ -109,14 +110,48 @@ def exits(model: ir.Model, pattern: str) -> tuple[ir.Value, ...]:
         one is what the torch module returned, where it returns one tensor.
     """
     glob = PathGlob(pattern)
-    inside = [node for node in model.graph if _within(glob, scope_of(node))]
-    members = set(inside)
+    return leaving(model, lambda node: _within(glob, scope_of(node)))
+
+
+def leaving(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
+    """List the values that some nodes give to the others or to the outputs.
+
+    Args:
+        model: the graph.
+        holds: whether a node is one of them.
+
+    Returns:
+        In graph order.
+    """
+    members = {node: None for node in model.graph if holds(node)}
     return tuple(
         value
-        for node in inside
+        for node in members
         for value in node.outputs
         if value.is_graph_output()
         or any(reader not in members for reader in value.consumers())
+    )
+
+
+def entering(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
+    """List the values that some nodes read of others or of the inputs, not weights.
+
+    Args:
+        model: the graph.
+        holds: whether a node is one of them.
+
+    Returns:
+        In the order in which they are first read.
+    """
+    members = {node: None for node in model.graph if holds(node)}
+    read = dict.fromkeys(value for node in members for value in node.inputs)
+    return tuple(
+        value
+        for value in read
+        if value is not None
+        and value.producer() not in members
+        and (value.producer() is not None or value.is_graph_input())
+        and value.const_value is None
     )
 
 

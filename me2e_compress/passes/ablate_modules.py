@@ -1,30 +1,30 @@
 """Remove whole modules from a graph."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
-from me2e_compress.calibration.means import load_means, token_means
-from me2e_compress.errors import FramesError, PreconditionError, RecipeError
+from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
-from me2e_compress.modules import Substitute
+from me2e_compress.modules import ModuleMap, Substitute
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.edges import Edge, add_edge
+from me2e_compress.passes.parts import Part, within
+from me2e_compress.passes.planner_sight import PLANNER, check_sight, seeing
 from me2e_compress.passes.substitutes import (
     constant_like,
     depends,
-    layout_of,
+    means_of,
     module_of,
     replace_readers,
     result_of,
     shaped_like,
-    within,
     zeros_like,
 )
-from me2e_compress.runtime.frames import Array
 
 _LAYOUT = frozenset(
     {"Cast", "Flatten", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
@@ -41,11 +41,19 @@ class AblateModules(Pass):
 
     With ``fill="substitute"`` the substitutes of the module map go first: the result of
     one scope takes the place of another's (without the map, the ego query keeps what it
-    knew of the agents). Whatever else leaves a dropped module is then zeros of its
-    shape; with ``fill="means"``, what it is on average over the context's frames, so
-    that the others read nothing that they never saw. What only lays out anew a value of
-    a module that stays (a cast that two modules share) is handed to its readers.
-    Everything that became dead is swept, in other modules too.
+    knew of the agents), repeated where there are more to read it (without motion, one
+    track query for each of six modes). Whatever else leaves a dropped module is then
+    zeros of its shape; with ``fill="means"``, what it is on average over the context's
+    frames, so that the others read nothing that they never saw. What only lays out anew
+    a value of a module that stays (a cast that two modules share) is handed to its
+    readers. Everything that became dead is swept, in other modules too.
+
+    With ``edges`` parts of the graph read others directly::
+
+        Given:   map -> motion -> planner
+        Result:  map -> motion -> planner, map -> planner
+
+    They need no weights, and no training made them: the plan is another one.
 
     Attributes:
         drop: the modules to remove.
@@ -56,6 +64,7 @@ class AblateModules(Pass):
         drop_outputs: True removes the graph outputs that only a dropped module makes;
             False refuses to drop such a module.
         means: an ``.npz`` of means by value name, for ``fill="means"`` without frames.
+        edges: what reads what besides, or instead; ``drop=[]`` adds them alone.
     """
 
     name: ClassVar[str] = "ablate-modules"
@@ -65,6 +74,7 @@ class AblateModules(Pass):
     keep: tuple[str, ...] = ()
     drop_outputs: bool = False
     means: Path | None = None
+    edges: tuple[Edge, ...] = ()
 
     @property
     def needs_frames(self) -> bool:
@@ -77,32 +87,46 @@ class AblateModules(Pass):
         Raises:
             ModuleMapError: the map has no such module.
             PreconditionError: no node belongs to it, it makes a graph output (and
-                ``drop_outputs`` is False), it makes all of them, a value that leaves it
-                has no static shape, or a substitute or a mean does not fit.
-            RecipeError: ``means`` without ``fill="means"``.
+                ``drop_outputs`` is False), it makes all of them, the plan would go or
+                no longer depend on what the cameras see, a value that leaves it has no
+                static shape, or a substitute, a mean or an edge does not fit.
+            RecipeError: ``means`` without ``fill="means"``, or nothing to do.
             FramesError: means are asked for, and there are neither frames nor a file;
                 or they are of another graph.
         """
-        if self.means is not None and self.fill != "means":
-            raise RecipeError(f"{self.name}: means goes with fill=means only")
+        self._check_options()
         known = [context.modules.module(name) for name in self.drop]
         _require_nodes(model, self.drop)
         for pattern in self.keep:
-            result_of(model, pattern)
-        before = graph.node_count(model)
+            result_of(model, Part(pattern))
+        before, sighted = graph.node_count(model), seeing(model, context.modules)
         _hand_over(model, self._goes)
         gone = self._cut_outputs(model)
         notes = [f"output removed: {name}" for name in gone]
         if self.fill == "substitute":
             for module in known:
-                notes += [self._substitute(model, each) for each in module.substitutes]
+                notes += [
+                    self._substitute(model, each, context.modules)
+                    for each in module.substitutes
+                ]
+        notes += [
+            add_edge(model, edge, context.modules, self._goes, self.name)
+            for edge in self.edges
+        ]
         rewrite.sweep(model)
         notes += self._fill(model, context)
         rewrite.sweep(model)
         model.graph.sort()
+        check_sight(model, context.modules, sighted, self.drop)
         removed = before - graph.node_count(model)
-        notes.append(f"{removed} nodes removed")
+        notes.append(f"{abs(removed)} nodes {'removed' if removed >= 0 else 'added'}")
         return PassResult(model, max(1, removed), tuple(notes), tuple(gone))
+
+    def _check_options(self) -> None:
+        if self.means is not None and self.fill != "means":
+            raise RecipeError(f"{self.name}: means goes with fill=means only")
+        if not self.drop and not self.edges:
+            raise RecipeError(f"{self.name}: drop is empty, and there are no edges")
 
     def _goes(self, node: ir.Node | None) -> bool:
         if node is None or provenance.module_of(node) not in self.drop:
@@ -120,7 +144,7 @@ class AblateModules(Pass):
         """Put constants in the place of all that leaves the dropped modules."""
         where, exits = model.graph, self._exits(model)
         if self.fill == "means":
-            means, how = _means_of(model, exits, context, self.means)
+            means, how = means_of(model, exits, context, self.means)
             for value in exits:
                 mean = means[str(value.name)]
                 replace_readers(value, constant_like(where, value, mean))
@@ -145,36 +169,55 @@ class AblateModules(Pass):
         owned = [value for value in model.graph.outputs if self._dropped(value)]
         names = [str(value.name) for value in owned]
         who, what = ", ".join(self.drop), ", ".join(names)
+        if owned and len(owned) == len(model.graph.outputs) and self.drop_outputs:
+            raise PreconditionError(f"{who} makes every output: {what}")
+        for value in owned:
+            if module_of(value) == PLANNER:
+                raise PreconditionError(
+                    f"{PLANNER} cannot be dropped: it makes {value.name}"
+                )
         if owned and not self.drop_outputs:
             raise PreconditionError(
                 f"{who} makes the outputs {what}: drop_outputs=true removes them too"
             )
-        if len(owned) == len(model.graph.outputs):
-            raise PreconditionError(f"{who} makes every output: {what}")
         for value in owned:
             model.graph.outputs.remove(value)
         return names
 
-    def _substitute(self, model: ir.Model, wanted: Substitute) -> str:
-        old = result_of(model, wanted.scope)
+    def _substitute(
+        self, model: ir.Model, wanted: Substitute, modules: ModuleMap
+    ) -> str:
+        if wanted.reader is not None and wanted.by is not None:
+            return self._read_instead(model, wanted, modules)
+        old = result_of(model, Part.of(wanted.scope, modules))
         if self._dropped(old):
             return f"{wanted.scope} is dropped itself: nothing is substituted"
         if wanted.by is None:
             replace_readers(old, self._zeros(model.graph, old))
             return f"{wanted.scope} reads as zeros"
-        new = result_of(model, wanted.by, like=old)
+        new = result_of(model, Part.of(wanted.by, modules), like=old)
         if self._dropped(new):
             raise PreconditionError(
                 f"{wanted.by} cannot substitute for {wanted.scope}: it is of module"
                 f" {module_of(new)}, which is dropped too"
             )
-        if depends(new, old):
+        if depends(new, {old}):
             raise PreconditionError(
                 f"{wanted.by} cannot substitute for {wanted.scope}: it reads its result"
             )
         readers = self._readers(old)
         replace_readers(old, shaped_like(model.graph, new, old, readers, self.name))
         return f"{wanted.scope} replaced by {wanted.by}"
+
+    def _read_instead(
+        self, model: ir.Model, wanted: Substitute, modules: ModuleMap
+    ) -> str:
+        """Let one part of the graph read a substitute; others read what they did."""
+        reader = Part.of(str(wanted.reader), modules)
+        if not any(reader.holds(node) and not self._goes(node) for node in model.graph):
+            return f"{wanted.reader} is not there: nothing is substituted for it"
+        edge = Edge(str(wanted.by), reader.name, "replace", of=wanted.scope)
+        return add_edge(model, edge, modules, self._goes, self.name)
 
 
 def _require_nodes(model: ir.Model, drop: tuple[str, ...]) -> None:
@@ -217,40 +260,3 @@ def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> int:
             provenance.stamp(node, dataclasses.replace(past, module=module))
             count += 1
     return count
-
-
-def _means_of(
-    model: ir.Model,
-    values: Sequence[ir.Value],
-    context: Context,
-    file: Path | None,
-) -> tuple[dict[str, Array], str]:
-    """Read means from a file, or measure them on frames.
-
-    Args:
-        model: the graph that makes the values.
-        values: of its main graph.
-        context: has the recording, or none.
-        file: an ``.npz`` by value name, which goes before frames; None for frames.
-
-    Returns:
-        The means by value name, and where they are from in words.
-
-    Raises:
-        FramesError: neither frames nor a file, or they are of another graph.
-        PreconditionError: a value has no static shape, or is itself a shape.
-    """
-    for value in values:
-        layout_of(value)
-    names = [str(value.name) for value in values]
-    if file is not None:
-        return load_means(file, names), f"its mean in {file}"
-    frames = context.frames
-    if frames is None:
-        raise FramesError(
-            "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"
-            " a mean is never made up"
-        )
-    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
-    means = token_means(model, frames, names, provider=context.provider)
-    return means, f"its mean over {count}"

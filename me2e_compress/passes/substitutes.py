@@ -1,15 +1,17 @@
 """What can be read in the place of a value whose makers are removed."""
 
-import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
-from me2e_compress.errors import PreconditionError
+from me2e_compress.calibration.means import load_means, token_means
+from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
-from me2e_compress.modules import PathGlob, exits, scope_of
+from me2e_compress.passes.base import Context
+from me2e_compress.passes.parts import Part, fit, listed, stretched
 from me2e_compress.runtime.frames import Array
 
 _INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
@@ -21,52 +23,42 @@ def module_of(value: ir.Value) -> str:
     return "" if producer is None else provenance.module_of(producer)
 
 
-def within(node: ir.Node, scope: str) -> bool:
-    """Return whether a node was made in a scope, e.g. ``*.lane_encoder``."""
-    path = tuple(part for part in scope_of(node).split(".") if part)
-    return PathGlob(scope).reach(path) is not None
-
-
-def result_of(model: ir.Model, scope: str, like: ir.Value | None = None) -> ir.Value:
-    """Return what a scope returns: the last value that leaves it.
+def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.Value:
+    """Return what a part of a graph returns: the last value that leaves it.
 
     A decoder returns its queries and, last, the reference points it refined; so the
     last value *that fits* is taken where it is known what it must fit.
 
     Args:
         model: the graph, its nodes still scoped.
-        scope: pattern as in a module map, e.g. ``*.motion_decoder``.
+        part: a module, or scopes, e.g. those of ``*.motion_decoder``.
         like: what it is to substitute for: same type, same shape up to dimensions of
-            size 1.
+            size 1, or else one that a broadcast makes the same.
 
     Raises:
-        PreconditionError: nothing leaves such a scope, or nothing that fits.
+        PreconditionError: nothing leaves such a part, or nothing that fits.
     """
-    leaving = exits(model, scope)
-    fitting = [value for value in leaving if like is None or _fits(value, like)]
-    if fitting:
-        return fitting[-1]
-    if like is None or not leaving:
-        raise PreconditionError(f"no value leaves a scope {scope} in this graph")
-    found = ", ".join(f"{value.name} {value.shape}" for value in leaving)
-    raise PreconditionError(
-        f"nothing that leaves {scope} fits {like.name} {like.shape}: {found}"
-    )
+    found = part.exits(model)
+    if like is None and found:
+        return found[-1]
+    if like is None or not found:
+        raise PreconditionError(f"no value leaves a scope {part.name} in this graph")
+    ranked = [(fit(value, like), index) for index, value in enumerate(found)]
+    best, index = max(ranked)
+    if not best:
+        raise PreconditionError(
+            f"nothing that leaves {part.name} fits {like.name} {like.shape}:"
+            f" {listed(found)}"
+        )
+    return found[index]
 
 
-def _fits(value: ir.Value, like: ir.Value) -> bool:
-    have, want = graph.static_shape(value), graph.static_shape(like)
-    if have is None or want is None or value.dtype != like.dtype:
-        return False
-    return have == want or _bare(have) == _bare(want)
-
-
-def depends(value: ir.Value, on: ir.Value) -> bool:
-    """Return whether a value is computed from another (or is it)."""
+def depends(value: ir.Value, on: Collection[ir.Value]) -> bool:
+    """Return whether a value is computed from one of others (or is it)."""
     queue, seen = [value], {value}
     while queue:
         current = queue.pop()
-        if current is on:
+        if current in on:
             return True
         producer = current.producer()
         for each in () if producer is None else producer.inputs:
@@ -161,7 +153,7 @@ def zeros_like(
     zero = ir.tensor(np.zeros(1, dtype), name="zero")
     node = ir.node("ConstantOfShape", [size], {"value": zero})
     provenance.inherit(node, readers, by=by)
-    return _finished(where, node, value, f"{value.name}_zeros")
+    return finished(where, node, shape, value, f"{value.name}_zeros")
 
 
 def shaped_like(
@@ -171,26 +163,100 @@ def shaped_like(
     readers: Sequence[ir.Node],
     by: str,
 ) -> ir.Value:
-    """Reshape a value to another's shape; they differ in dimensions of size 1 only."""
-    want = graph.static_shape(old)
-    if graph.static_shape(new) == want:
+    """Give a value another's shape: add ones, then repeat along axes of size 1.
+
+    Args:
+        where: the graph that gets the nodes.
+        new: what is to be read; it fits, see :func:`~me2e_compress.passes.parts.fit`.
+        old: what is read so far.
+        readers: whose heirs the new nodes are.
+        by: name of the pass.
+    """
+    have, want = graph.static_shape(new), graph.static_shape(old)
+    padded = have and want and stretched(have, want)
+    if have == want or not padded or not want:
         return new
+    shaped = reshaped(where, new, padded, readers, by)
+    if padded == want:
+        return shaped
     size = rewrite.add_constant(where, np.array(want, np.int64), f"{old.name}_shape")
-    node = ir.node("Reshape", [new, size])
+    node = ir.node("Expand", [shaped, size])
     provenance.inherit(node, readers, by=by)
-    return _finished(where, node, old, f"{old.name}_substitute")
+    return finished(where, node, want, new, f"{new.name}_repeated")
 
 
-def _bare(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Drop the ones: a reorder that moves only those moves no element."""
-    if math.prod(shape) == 0:
-        return shape
-    return tuple(size for size in shape if size != 1)
+def reshaped(
+    where: ir.Graph,
+    value: ir.Value,
+    shape: tuple[int, ...],
+    readers: Sequence[ir.Node],
+    by: str,
+) -> ir.Value:
+    """Reshape a value for some readers, unless it has that shape."""
+    if graph.static_shape(value) == shape:
+        return value
+    size = rewrite.add_constant(where, np.array(shape, np.int64), f"{value.name}_shape")
+    node = ir.node("Reshape", [value, size])
+    provenance.inherit(node, readers, by=by)
+    return finished(where, node, shape, value, f"{value.name}_reshaped")
 
 
-def _finished(where: ir.Graph, node: ir.Node, like: ir.Value, name: str) -> ir.Value:
-    node.name = name
+def finished(
+    where: ir.Graph,
+    node: ir.Node,
+    shape: tuple[int, ...],
+    like: ir.Value,
+    name: str,
+) -> ir.Value:
+    """Name a new node and what it gives, append it, and return what it gives.
+
+    Args:
+        where: the graph that gets it.
+        node: it has one output.
+        shape: of this.
+        like: a value of the same type.
+        name: if that is free.
+    """
+    unique = rewrite.fresh_name(name, rewrite.value_names(where))
+    node.name = unique
     output = node.outputs[0]
-    output.name, output.shape, output.type = name, like.shape, like.type
+    output.name, output.shape, output.type = unique, ir.Shape(shape), like.type
     where.append(node)
     return output
+
+
+def means_of(
+    model: ir.Model,
+    values: Sequence[ir.Value],
+    context: Context,
+    file: Path | None,
+) -> tuple[dict[str, Array], str]:
+    """Read means from a file, or measure them on frames.
+
+    Args:
+        model: the graph that makes the values.
+        values: of its main graph.
+        context: has the recording, or none.
+        file: an ``.npz`` by value name, which goes before frames; None for frames.
+
+    Returns:
+        The means by value name, and where they are from in words.
+
+    Raises:
+        FramesError: neither frames nor a file, or they are of another graph.
+        PreconditionError: a value has no static shape, or is itself a shape.
+    """
+    for value in values:
+        layout_of(value)
+    names = [str(value.name) for value in values]
+    if file is not None:
+        return load_means(file, names), f"its mean in {file}"
+    frames = context.frames
+    if frames is None:
+        raise FramesError(
+            "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"
+            " a mean is never made up"
+        )
+    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+    means = token_means(model, frames, names, provider=context.provider)
+    return means, f"its mean over {count}"

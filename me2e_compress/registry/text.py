@@ -10,7 +10,10 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 _NAME = re.compile(r"[A-Za-z][\w.-]*", re.ASCII)
 _BEGINNING = re.compile(rf"\s*({_NAME.pattern})\s*(?=[:{{]|$)", re.ASCII)
@@ -111,7 +114,12 @@ def write_item(name: str, options: Mapping[str, object], *, short: bool = False)
 
 
 def write_value(value: object) -> str:
-    """Write the value of an option: a number, a list, or else a string."""
+    """Write the value of an option: a number, a list, or else a string.
+
+    A dataclass is a mapping of its fields; those at their default are left out.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return write_value(chosen_fields(value))
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
     if isinstance(value, Mapping):
@@ -120,6 +128,16 @@ def write_value(value: object) -> str:
     if value is None or isinstance(value, bool | int | float | str):
         return json.dumps(value)
     return json.dumps(str(value))
+
+
+def chosen_fields(value: "DataclassInstance") -> dict[str, object]:
+    """Return the fields of a dataclass by name, without those at their default."""
+    held = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+    return {
+        each.name: held[each.name]
+        for each in dataclasses.fields(value)
+        if held[each.name] != each.default
+    }
 
 
 def _key(name: object) -> str:

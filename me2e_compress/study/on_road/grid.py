@@ -13,11 +13,10 @@ from me2e_compress.modules import ModuleMap, assign
 from me2e_compress.passes import Pass
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.fix_shapes import with_sizes
+from me2e_compress.passes.planner_sight import PLANNER
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 
-PLANNER = "planner"
-"""The module that no driver can lose, in every preset."""
 BEFORE_ABLATION = "fold-constants"
 """Ablation comes next: before anything merges nodes of different modules."""
 

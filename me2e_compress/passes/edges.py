@@ -1,0 +1,211 @@
+"""New edges of a graph: a part reads another's result, at no weight of its own."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.graph import provenance
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes.grown_axis import carry
+from me2e_compress.passes.parts import Part, fit, listed, stretched
+from me2e_compress.passes.substitutes import (
+    depends,
+    finished,
+    reshaped,
+    shaped_like,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Edge:
+    """A part of a graph reads another's result, directly.
+
+    Given:   map -> motion -> planner
+    Result:  map -> motion -> planner, map -> planner
+
+    A part is a module of the map by its name (``track``), or a pattern of scopes
+    (``*.ego_map_decoder``).
+
+    Attributes:
+        source: the part whose result is to be read: of what leaves it, what fits and
+            leaves last; what the reader reads already goes first.
+        reader: the part that is to read it, in one of the values that enter it: of
+            those that it fits, the one that is first read last.
+        how: ``append`` gives the reader more queries, those of the source behind its
+            own; ``add`` gives it the sum; ``replace`` gives it the source's in the
+            place of its own. A result of fewer queries is repeated for the last two:
+            one agent's for its six modes.
+        of: the part that makes what the reader reads so far; None: any.
+        axis: of the queries, for ``append``.
+
+    Raises:
+        RecipeError: an edge that replaces does not say what.
+    """
+
+    source: str
+    reader: str
+    how: Literal["append", "add", "replace"] = "append"
+    of: str | None = None
+    axis: int = 1
+
+    def __post_init__(self) -> None:
+        """Check that it says what it replaces."""
+        if self.how == "replace" and self.of is None:
+            raise RecipeError(f"edge {self.label}: how=replace needs of=PART too")
+
+    @property
+    def label(self) -> str:
+        """Source and reader, for messages."""
+        return f"{self.source} -> {self.reader}"
+
+
+def add_edge(
+    model: ir.Model,
+    edge: Edge,
+    modules: ModuleMap,
+    goes: Callable[[ir.Node | None], bool],
+    by: str,
+) -> str:
+    """Add an edge to a graph; what does not depend on its reader stays as it is.
+
+    Args:
+        model: the graph, in order, its nodes still scoped, shapes known; changes.
+        edge: what reads what.
+        modules: the map of the graph.
+        goes: whether a node is of a module that is to be removed.
+        by: name of the pass.
+
+    Returns:
+        What is read now, in words.
+
+    Raises:
+        PreconditionError: there is no such part, the source is removed or depends on
+            the reader, or nothing fits.
+    """
+    source, reader = Part.of(edge.source, modules), Part.of(edge.reader, modules)
+    new, old = _ends(model, edge, source, reader, modules, goes)
+    heirs = [node for node in old.consumers() if reader.holds(node)]
+    if depends(new, {value for node in heirs for value in node.outputs}):
+        raise PreconditionError(
+            f"edge {edge.label}: {new.name} depends on what {edge.reader} makes of"
+            f" {old.name}"
+        )
+    uses = [(node, index) for node, index in old.uses() if node in heirs]
+    joined = _join(model.graph, edge, new, old, heirs, by)
+    for node, index in uses:
+        node.replace_input_with(index, joined)
+    model.graph.sort()
+    if edge.how == "append":
+        carry(model, joined, old, f"edge {edge.label}: {listed([new])}")
+    return _told(edge, new, old)
+
+
+def _ends(
+    model: ir.Model,
+    edge: Edge,
+    source: Part,
+    reader: Part,
+    modules: ModuleMap,
+    goes: Callable[[ir.Node | None], bool],
+) -> tuple[ir.Value, ir.Value]:
+    """Find the value that is to be read, and the one it joins or replaces."""
+    if all(goes(node) for node in model.graph if source.holds(node)):
+        raise PreconditionError(f"edge {edge.label}: {_lacks(model, source)}")
+    read = reader.entries(model)
+    left = [v for v in source.exits(model) if not goes(v.producer())]
+    if not read or not left:
+        what = (
+            f"{edge.reader} reads nothing" if left else f"{edge.source} gives nothing"
+        )
+        raise PreconditionError(f"edge {edge.label}: {what} nothing")
+    made = [value for value in read if not source.holds(value.producer())]
+    if edge.of is not None:
+        of = Part.of(edge.of, modules)
+        made = [value for value in made if of.holds(value.producer())]
+    if not made:
+        raise PreconditionError(
+            f"edge {edge.label}: {edge.reader} reads nothing of {edge.of or 'others'},"
+            f" only {listed(read)}"
+        )
+    ranked = [
+        (_fit(edge, new, old), new in read, old_at, new_at)
+        for (old_at, old), (new_at, new) in itertools.product(
+            enumerate(made), enumerate(left)
+        )
+    ]
+    best, _, old_at, new_at = max(ranked)
+    if not best:
+        raise PreconditionError(
+            f"edge {edge.label}: nothing that leaves {edge.source} ({listed(left)})"
+            f" fits what {edge.reader} reads ({listed(made)})"
+        )
+    return left[new_at], made[old_at]
+
+
+def _lacks(model: ir.Model, source: Part) -> str:
+    if any(source.holds(node) for node in model.graph):
+        return f"{source.name} is dropped too"
+    return f"the graph has no {source.name}"
+
+
+def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
+    """Return how well two values can be joined; 0 not at all."""
+    if edge.how != "append":
+        return fit(new, old)
+    have, want = _as_queries(new, old), graph.static_shape(old)
+    if have is None or want is None or new.dtype != old.dtype:
+        return 0
+    axis = edge.axis
+    if not -len(want) <= axis < len(want) or want[axis] < 2:
+        return 0
+    others = [at for at in range(len(want)) if at != axis % len(want)]
+    return int(all(have[at] == want[at] for at in others))
+
+
+def _as_queries(new: ir.Value, old: ir.Value) -> tuple[int, ...] | None:
+    """Return a shape with ones in front, as many dimensions as another's."""
+    have, want = graph.static_shape(new), graph.static_shape(old)
+    if have is None or want is None or len(have) > len(want):
+        return None
+    return (1,) * (len(want) - len(have)) + have
+
+
+def _join(
+    where: ir.Graph,
+    edge: Edge,
+    new: ir.Value,
+    old: ir.Value,
+    heirs: Sequence[ir.Node],
+    by: str,
+) -> ir.Value:
+    """Make what is read from now on; the heirs give the new nodes their module."""
+    want = graph.static_shape(old) or ()
+    if edge.how == "replace":
+        return shaped_like(where, new, old, heirs, by)
+    if edge.how == "add":
+        padded = stretched(graph.static_shape(new) or (), want) or want
+        shaped = reshaped(where, new, padded, heirs, by)
+        node = ir.node("Add", [old, shaped])
+    else:
+        padded = _as_queries(new, old) or ()
+        shaped = reshaped(where, new, padded, heirs, by)
+        node = ir.node("Concat", [old, shaped], {"axis": edge.axis})
+        size = list(want)
+        size[edge.axis] += padded[edge.axis]
+        want = tuple(size)
+    provenance.inherit(node, heirs, by=by)
+    return finished(where, node, want, old, f"{old.name}_joined")
+
+
+def _told(edge: Edge, new: ir.Value, old: ir.Value) -> str:
+    before, after = listed([old]), listed([new])
+    if edge.how == "append":
+        return f"{edge.reader} reads {after} behind {before}"
+    if edge.how == "add":
+        return f"{edge.reader} reads {after} added to {before}"
+    return f"{edge.reader} reads {after} in the place of {before}"

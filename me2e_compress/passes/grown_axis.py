@@ -1,0 +1,122 @@
+"""A value of a graph got longer: what is computed of it has to know."""
+
+import math
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+
+from me2e_compress import graph, rewrite
+from me2e_compress.errors import PreconditionError
+from me2e_compress.passes.parts import listed
+
+_SHOWN_BYTES = 1024
+"""Constants up to this size are shown to the inference: shapes and axes are."""
+
+
+def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
+    """Infer the shapes behind a value that got longer along one axis, in place.
+
+    A Reshape to a constant shape gets a new constant.
+
+    Args:
+        model: the graph, in order.
+        grown: the value; its shape is known.
+        old: what its readers read before.
+        what: the change and the tensor that made it, for messages.
+
+    Raises:
+        PreconditionError: an operator does not work with the new size, an output of the
+            graph would change its shape, or nobody knows what a plugin would make.
+    """
+    was = {grown: graph.static_shape(old) or ()}
+    for node in model.graph:
+        if not any(value in was for value in node.inputs if value is not None):
+            continue
+        if node.op_type == "Reshape":
+            _reshape(model.graph, node, was, what)
+        shapes = _inferred(model, node, what)
+        for value in node.outputs:
+            before, after = graph.static_shape(value), shapes.get(str(value.name))
+            if before == after or not value.name:
+                continue
+            if after is None or before is None or value.is_graph_output():
+                raise PreconditionError(f"{what} would change {listed([value])}")
+            was[value], value.shape = before, ir.Shape(after)
+
+
+def _reshape(
+    where: ir.Graph,
+    node: ir.Node,
+    was: dict[ir.Value, tuple[int, ...]],
+    what: str,
+) -> None:
+    """Give a Reshape the new size where the old one stands in its shape.
+
+    The axis that grew must be an axis of the result too, neither split nor merged.
+    """
+    source, size = node.inputs[0], node.inputs[1]
+    made = graph.static_shape(node.outputs[0])
+    target = None if size is None else graph.array_of(size)
+    after = graph.static_shape(source)
+    if source is None or made is None or target is None or after is None:
+        raise PreconditionError(
+            f"{what}: the shape that {node.name} makes is not known"
+        )
+    before = was[source]
+    axis = next(at for at, size in enumerate(before) if size != after[at])
+    places = [
+        at
+        for at, length in enumerate(made)
+        if length == before[axis] and math.prod(made[:at]) == math.prod(before[:axis])
+    ]
+    if not places:
+        raise PreconditionError(
+            f"{what} does not fit {node.name}, which makes {list(made)} of"
+            f" {list(before)}: the queries are no axis of that"
+        )
+    shape = np.array(made, np.int64)
+    shape[places[0]] = after[axis]
+    name = f"{node.outputs[0].name}_shape"
+    node.replace_input_with(1, rewrite.add_constant(where, shape, name))
+
+
+def _inferred(model: ir.Model, node: ir.Node, what: str) -> dict[str, tuple[int, ...]]:
+    """Return the shapes that a node gives by ONNX's inference."""
+    opset = model.opset_imports.get(node.domain, 0)
+    read = [value for value in node.inputs if value is not None]
+    try:
+        schema = onnx.defs.get_schema(node.op_type, opset, node.domain)
+        found = onnx.shape_inference.infer_node_outputs(
+            schema,
+            ir.to_proto(node),
+            {str(value.name): _type(value) for value in read},
+            {str(v.name): held for v in read if (held := _held(v)) is not None},
+            opset_imports=[onnx.helper.make_opsetid(node.domain, opset)],
+        )
+    except (
+        onnx.defs.SchemaError,
+        onnx.shape_inference.InferenceError,
+        ValueError,
+    ) as error:
+        raise PreconditionError(
+            f"{what} does not fit {node.name} ({node.op_type}), which reads"
+            f" {listed(read)}"
+        ) from error
+    return {
+        name: tuple(dim.dim_value for dim in kind.tensor_type.shape.dim)
+        for name, kind in found.items()
+        if all(dim.HasField("dim_value") for dim in kind.tensor_type.shape.dim)
+    }
+
+
+def _type(value: ir.Value) -> onnx.TypeProto:
+    kind = value.dtype.value if value.dtype is not None else 0
+    return onnx.helper.make_tensor_type_proto(kind, graph.static_shape(value))
+
+
+def _held(value: ir.Value) -> onnx.TensorProto | None:
+    array = graph.array_of(value)
+    if array is None or array.nbytes > _SHOWN_BYTES:
+        return None
+    return onnx.numpy_helper.from_array(array)

@@ -1,0 +1,69 @@
+"""Whether what drives still sees: what an ablation must not cut."""
+
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import provenance
+from me2e_compress.modules import ModuleMap
+
+PLANNER = "planner"
+"""The module that makes the plan, in every preset."""
+
+
+def seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
+    """Name the planner's outputs that depend on the modules of feature extraction.
+
+    Args:
+        model: the graph.
+        modules: its map; one without a planner has no such outputs.
+    """
+    features = set(modules.names("feature"))
+    return tuple(
+        str(value.name)
+        for value in model.graph.outputs
+        if _module(value) == PLANNER and _depends(value, features)
+    )
+
+
+def check_sight(
+    model: ir.Model, modules: ModuleMap, before: tuple[str, ...], drop: tuple[str, ...]
+) -> None:
+    """Check that the plan still depends on what the cameras see.
+
+    Args:
+        model: the graph without what was dropped.
+        modules: its map.
+        before: what :func:`seeing` said of the whole graph.
+        drop: the modules that went.
+
+    Raises:
+        PreconditionError: it does not.
+    """
+    blind = [name for name in before if name not in seeing(model, modules)]
+    if blind:
+        features = ", ".join(modules.names("feature"))
+        how = f"without {', '.join(drop)}" if drop else "by these edges"
+        raise PreconditionError(
+            f"{how} the plan is cut: {blind[0]} depends on nothing of {features} any"
+            f" more; keep a module, or add an edge to the {PLANNER}"
+        )
+
+
+def _module(value: ir.Value) -> str:
+    producer = value.producer()
+    return "" if producer is None else provenance.module_of(producer)
+
+
+def _depends(value: ir.Value, features: set[str]) -> bool:
+    queue, seen = [value.producer()], {value.producer()}
+    while queue:
+        node = queue.pop()
+        if node is None:
+            continue
+        if provenance.module_of(node) in features:
+            return True
+        for each in node.predecessors():
+            if each not in seen:
+                seen.add(each)
+                queue.append(each)
+    return False
