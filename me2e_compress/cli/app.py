@@ -79,7 +79,7 @@ _ENTRIES = (
     CommandEntry(
         GRAPHS,
         "export",
-        "Write a reference stack as ONNX: drawn from a seed, or our driver.",
+        "Write a reference stack as ONNX: drawn, of a checkpoint, or our driver.",
     ),
     CommandEntry(
         GRAPHS,

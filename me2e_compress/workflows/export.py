@@ -2,7 +2,6 @@
 
 import dataclasses
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +25,11 @@ from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.result import Result, Table, megabytes
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
+from me2e_compress.zoo.published_weights import (
+    PublishedWeights,
+    WeightsRecord,
+    published_weights,
+)
 
 OPSET = 17
 """Of the shipped models, and of the others unless asked otherwise."""
@@ -43,10 +47,12 @@ class ExportOptions:
         force: replace outputs that are not as we left them, too.
         operators: ``plugin`` writes deformable attention as one node.
         dialect: of which library that node is; None is the toolkit's own form.
+        weights: checkpoint of the stack's original; None draws weights from the seed.
+        ema: take the checkpoint's moving averages (``ema_...``), not its parameters.
 
     Raises:
-        RecipeError: a seed below 0, a dialect that has no deformable attention, or one
-            where operators are standard.
+        RecipeError: a seed below 0 or beside weights, averages of no weights, a dialect
+            that has no deformable attention, or one where operators are standard.
     """
 
     opset: int = OPSET
@@ -55,10 +61,16 @@ class ExportOptions:
     force: bool = False
     operators: Literal["standard", "plugin"] = "standard"
     dialect: str | None = None
+    weights: Path | None = None
+    ema: bool = False
 
     def __post_init__(self) -> None:
-        """Check seed and dialect."""
+        """Check seed, weights and dialect."""
         check_count("--seed", self.seed or 0)
+        if self.weights is not None and self.seed is not None:
+            raise RecipeError("--seed draws weights, --weights brings them: give one")
+        if self.ema and self.weights is None:
+            raise RecipeError("--ema needs --weights")
         names = [each.name for each in DeformableAttention().all_dialects()]
         if self.dialect is not None and self.operators != "plugin":
             raise RecipeError(f"--dialect {self.dialect} needs --operators plugin")
@@ -77,11 +89,13 @@ class ExportResult(Result):
         stack: its name.
         output: the file.
         opset: of the file.
+        weights: where they are from; None: drawn from a seed, or our driver's.
     """
 
     stack: str
     output: Path
     opset: int
+    weights: WeightsRecord | None = None
 
     @property
     def headline(self) -> str:
@@ -89,8 +103,13 @@ class ExportResult(Result):
         size = megabytes(file_bytes(self.output))
         return f"{self.output}: {self.stack}, opset {self.opset}, {size} MB"
 
+    def lines(self) -> tuple[str, ...]:
+        """Return the headline, the checkpoint, and what became of the rest of it."""
+        said = () if self.weights is None else self.weights.lines()
+        return (self.headline, *said)
+
     def tables(self) -> tuple[Table, ...]:
-        """Return none: the line says it."""
+        """Return none: the lines say it."""
         return ()
 
     def records(self) -> list[dict[str, object]]:
@@ -105,14 +124,15 @@ class ExportResult(Result):
         ]
 
     def to_json(self) -> object:
-        """Return the file: stack, path, opset, bytes."""
-        return self.records()[0]
+        """Return the file: stack, path, opset, bytes, weights."""
+        said = None if self.weights is None else dataclasses.asdict(self.weights)
+        return {**self.records()[0], "weights": said}
 
 
 def export_stack(
     stack: str, output: str | Path, options: ExportOptions | None = None
-) -> Path:
-    """Write a reference stack as ONNX, drawn from a seed, or our driver.
+) -> ExportResult:
+    """Write a reference stack as ONNX: drawn, of a checkpoint, or our driver.
 
     Args:
         stack: ``vad-tiny``, ``tcp`` or ``highway``.
@@ -120,36 +140,50 @@ def export_stack(
         options: None takes the defaults.
 
     Returns:
-        The file.
+        The file, and what of the checkpoint went into it.
 
     Raises:
-        GraphError: no such stack, heads or opset, options for a trained model, or an
-            output that cannot be written.
+        GraphError: no such stack, heads or opset, options for a trained model, a
+            checkpoint that cannot be read or of another model, or an output that cannot
+            be written.
         MissingExtraError: exporting needs the extra ``zoo``.
     """
     options, output = options or ExportOptions(), Path(output)
     files = [output] if output.parent.is_dir() else []  # else it is made
-    with writing(files, force=options.force):
+    given = [] if options.weights is None else [options.weights]
+    with writing(files, given, force=options.force):
+        if stack in shipped.SHIPPED:
+            _refuse(stack, options)
+            shipped.copy(stack, output)
+            return ExportResult(stack, output, options.opset)
         return _exported(stack, output, options)
 
 
-def _exported(stack: str, output: Path, options: ExportOptions) -> Path:
-    fused = options.operators == "plugin"
-    if stack in shipped.SHIPPED:
-        given = {"--seed": options.seed, "--heads": options.heads}
-        _refuse(stack, {**given, "--operators": fused or None}, options.opset)
-        return shipped.copy(stack, output)
-    if not fused:
-        return _drawn(stack, output, options)
-    with tempfile.TemporaryDirectory(prefix="me2e-export-") as folder:
-        own = _drawn(stack, Path(folder, "own.onnx"), options)
-        model = in_dialect(graph.load(own), options.dialect or OWN_DOMAIN)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        graph.save(model, output)
-    return output
+def _exported(stack: str, output: Path, options: ExportOptions) -> ExportResult:
+    weights = _read(stack, options)
+    if options.operators == "plugin":
+        with tempfile.TemporaryDirectory(prefix="me2e-export-") as folder:
+            own = _written(stack, Path(folder, "own.onnx"), options, weights)
+            model = in_dialect(graph.load(own), options.dialect or OWN_DOMAIN)
+            output.parent.mkdir(parents=True, exist_ok=True)
+            graph.save(model, output)
+    else:
+        _written(stack, output, options, weights)
+    record = None if weights is None else weights.record
+    return ExportResult(stack, output, options.opset, record)
 
 
-def _drawn(stack: str, output: Path, options: ExportOptions) -> Path:
+def _read(stack: str, options: ExportOptions) -> PublishedWeights | None:
+    if options.weights is None:
+        return None
+    return published_weights(
+        stack, options.weights, heads=options.heads, ema=options.ema
+    )
+
+
+def _written(
+    stack: str, output: Path, options: ExportOptions, weights: PublishedWeights | None
+) -> Path:
     return exporter.export(
         stack,
         output,
@@ -157,6 +191,7 @@ def _drawn(stack: str, output: Path, options: ExportOptions) -> Path:
         seed=options.seed or 0,
         heads=options.heads,
         fused=options.operators == "plugin",
+        weights=weights,
     )
 
 
@@ -206,11 +241,16 @@ def _unshaped(model: ir.Model) -> int:
     return sum(graph.static_shape(value) is None for value in values)
 
 
-def _refuse(stack: str, options: Mapping[str, object], opset: int) -> None:
+def _refuse(stack: str, options: ExportOptions) -> None:
     """Refuse options: a trained model is one file."""
-    given = [option for option, value in options.items() if value is not None]
-    if opset != OPSET:
-        given.append(f"--opset {opset}")
+    chosen = {
+        "--seed": options.seed is not None,
+        "--heads": options.heads is not None,
+        "--weights": options.weights is not None,
+        "--operators": options.operators == "plugin",
+        f"--opset {options.opset}": options.opset != OPSET,
+    }
+    given = [option for option, is_given in chosen.items() if is_given]
     if given:
         raise GraphError(
             f"{stack} is a trained model of opset {OPSET}: {given[0]} cannot be chosen"

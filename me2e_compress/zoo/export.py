@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, cast
 import onnx
 
 from me2e_compress.errors import GraphError, MissingExtraError
+from me2e_compress.zoo.construct import construct
 from me2e_compress.zoo.model_files import write
 from me2e_compress.zoo.stacks import TCP, Stack, find
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from me2e_compress.zoo.bev.sizes import Sampling
+    from me2e_compress.zoo.published_weights import PublishedWeights
     from me2e_compress.zoo.tcp.config import ActionHeads
     from me2e_compress.zoo.vad.config import HeadsName
 
@@ -44,8 +46,9 @@ def export(
     seed: int = 0,
     heads: str | None = None,
     fused: bool = False,
+    weights: "PublishedWeights | None" = None,
 ) -> Path:
-    """Build a stack from a seed and write it as one ONNX file.
+    """Build a stack from a seed or a checkpoint and write it as one ONNX file.
 
     Parameters keep their state-dict names and nodes the scopes of their modules, which
     is what a module map reads; constants are not folded. The metadata says what the
@@ -56,9 +59,10 @@ def export(
         path: The ``.onnx`` to write; replaced in one step.
         opset: 13 to 18; below 16 grid sampling is decomposed into gathers, and 18 is
             what the dynamo exporter writes.
-        seed: Of all weights.
+        seed: Of all weights, unless they are given.
         heads: Which last layers; None is the default of the stack.
         fused: Whether deformable attention is one node, of the domain ``me2e``.
+        weights: Of the stack with these heads; the metadata names their file.
 
     Returns:
         The path.
@@ -78,8 +82,11 @@ def export(
             f"cannot export {stack} at opset {opset} with plugins, which take up to"
             f" {DYNAMO_OPSET - 1}"
         )
-    model = build(stack, opset=opset, seed=seed, heads=heads, fused=fused)
-    return save(trace(spec, model, opset), spec.metadata(), path)
+    made = build(
+        stack, opset=opset, seed=seed, heads=heads, fused=fused, weights=weights
+    )
+    said = {} if weights is None else weights.record.metadata()
+    return save(trace(spec, made, opset), {**spec.metadata(), **said}, path)
 
 
 def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Path:
@@ -105,8 +112,9 @@ def build(
     seed: int = 0,
     heads: str | None = None,
     fused: bool = False,
+    weights: "PublishedWeights | None" = None,
 ) -> "nn.Module":
-    """Return the torch module of a stack, initialised from a seed, ready to run.
+    """Return the torch module of a stack, its weights given or of a seed, ready to run.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -124,6 +132,8 @@ def build(
     if spec.name == TCP.name:
         if fused:
             raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
+        if weights is not None:
+            return _filled(spec, weights)
         from me2e_compress.zoo.tcp.initialise import build_tcp
 
         return build_tcp(seed=seed, heads=cast("ActionHeads", chosen))
@@ -131,7 +141,17 @@ def build(
 
     native: Sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
     sampling = "fused" if fused else native
+    if weights is not None:
+        return _filled(spec, weights, sampling)
     return build_vad(seed=seed, heads=cast("HeadsName", chosen), sampling=sampling)
+
+
+def _filled(
+    spec: Stack, weights: "PublishedWeights", sampling: "Sampling" = "operator"
+) -> "nn.Module":
+    model = construct(spec, sampling)
+    weights.fill(model)
+    return model
 
 
 def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:

@@ -176,6 +176,14 @@ def test_an_opset_nobody_writes(refused: Callable[..., str], files: Path) -> Non
     assert "opset 99" in line
 
 
+def test_weights_that_are_no_checkpoint(
+    refused: Callable[..., str], files: Path
+) -> None:
+    weights = files / "in.onnx"
+    line = refused("export", "tcp", "--weights", weights, "-o", files / "m.onnx")
+    assert f"{weights}: not read as weights: neither a file of torch.save" in line
+
+
 def test_a_comparison_without_a_common_output(
     refused: Callable[..., str], files: Path
 ) -> None:

@@ -151,7 +151,12 @@ def test_export_copies_it(command: Command, weights: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("--opset", "16"), ("--seed", "0"), ("--heads", "nuscenes")],
+    [
+        ("--opset", "16"),
+        ("--seed", "0"),
+        ("--heads", "nuscenes"),
+        ("--weights", "a.pth"),
+    ],
 )
 def test_a_trained_model_leaves_nothing_to_choose(
     command: Command,

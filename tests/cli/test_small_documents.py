@@ -7,8 +7,10 @@ import pytest
 from me2e_compress.cli.console import show
 from me2e_compress.metrics.scores import score
 from me2e_compress.training.course import RoundResult
+from me2e_compress.workflows.export import ExportResult
 from me2e_compress.workflows.frames import FramesOptions, FramesResult
 from me2e_compress.workflows.train import TrainResult
+from me2e_compress.zoo.published_weights import WeightsRecord
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
 from tests.metrics.drives import drive
@@ -24,6 +26,20 @@ def test_an_exported_stack(
     found = strict(capsys.readouterr().out)
     assert faults("export", found) == []
     assert found["bytes"] == output.stat().st_size
+
+
+def test_a_stack_of_a_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "m.onnx"
+    output.write_bytes(b"1234")
+    record = WeightsRecord("a.pth", "0" * 64, epoch=3, converted={"float16": 9})
+
+    show(ExportResult("tcp", output, 17, record), as_json=True)
+
+    found = strict(capsys.readouterr().out)
+    assert faults("export", found) == []
+    assert found["weights"]["epoch"] == 3
 
 
 def test_recorded_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,6 +19,7 @@ GOOD = {
     "output": "m.onnx",
     "opset": 17,
     "bytes": 1,
+    "weights": None,
 }
 
 

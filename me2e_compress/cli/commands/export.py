@@ -32,6 +32,15 @@ DialectName = Annotated[
     str | None,
     typer.Option(help="of that node's plugin library; default me2e, our own form"),
 ]
+Weights = Annotated[
+    Path | None,
+    typer.Option(
+        help="file of weights: a checkpoint of the original (.pth, .ckpt, .safetensors)"
+    ),
+]
+Ema = Annotated[
+    bool, typer.Option("--ema", help="the moving averages (ema_...) of --weights")
+]
 
 
 def export(
@@ -42,12 +51,16 @@ def export(
     seed: Seed = None,
     operators: Operators = "standard",
     dialect: DialectName = None,
+    weights: Weights = None,
+    ema: Ema = False,
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
-    """Write a reference stack as ONNX: drawn from a seed, or our driver."""
-    options = workflow.ExportOptions(opset, heads, seed, force, operators, dialect)
+    """Write a reference stack as ONNX: drawn, of a checkpoint, or our driver."""
+    options = workflow.ExportOptions(
+        opset, heads, seed, force, operators, dialect, weights, ema
+    )
     with listening() as listener:
         listener.on_progress(f"exporting {stack}", 0, 1, "")
-        workflow.export_stack(stack, output, options)
-    show(workflow.ExportResult(stack, output, opset), as_json)
+        found = workflow.export_stack(stack, output, options)
+    show(found, as_json)

@@ -35,7 +35,8 @@ Modelled = Annotated[
     typer.Option(help="NAME=JOULES or FILE, by MACs and bytes; an EER_AV of its own"),
 ]
 Weights = Annotated[
-    Path | None, typer.Option(help="of EER_AV, as --save-weights wrote them")
+    Path | None,
+    typer.Option(help="file of weights: of EER_AV, as --save-weights wrote them"),
 ]
 SaveWeights = Annotated[Path | None, typer.Option(help="JSON of the weights of EER_AV")]
 

@@ -14,7 +14,8 @@ class VadTiny(nn.Module):
     """Cameras, ego motion and the previous BEV to a plan (Jiang et al. 2023).
 
     Written from the published description, at the published dimensions and with the
-    parameter names of the original, so that a module map fits both. What differs is
+    parameter names of the original but for the layers of `LaneNet`, so that a module
+    map fits both (`published_names` has the difference). What else differs is
     what an export at fixed shapes asks for: camera attention reads every camera for
     every cell and masks, and the map for the motion is masked instead of gathered.
     """

@@ -1,0 +1,200 @@
+"""State dicts in files that other programs wrote: tensors by name, and no code run."""
+
+import hashlib
+import importlib
+import importlib.util
+import pickle
+import re
+import struct
+import warnings
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from me2e_compress.documents import MalformedError, reading
+from me2e_compress.errors import GraphError, MissingExtraError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+WRAPPERS = ("state_dict", "model_state_dict", "model")
+"""Keys under which a checkpoint holds its tensors: the first of mmcv and PyTorch
+Lightning."""
+
+PREFIXES = ("module.", "model.", "_orig_mod.")
+"""Put before names by DataParallel, by a Lightning module and by ``torch.compile``."""
+
+EPOCHS = ("epoch",)
+ITERATIONS = ("iter", "iteration", "global_step")
+"""How mmcv and Lightning count, in ``meta`` or beside the tensors."""
+
+SAFETENSORS = ".safetensors"
+
+_BROKEN = (
+    AssertionError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    OverflowError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zipfile.BadZipFile,
+)
+"""What torch's reader raises, apart from its own refusal, of bytes that are no file of
+it."""
+
+_NAMED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class StateDict:
+    """Tensors of a checkpoint.
+
+    Attributes:
+        path: The file.
+        sha256: Of the file, lower-case hex.
+        tensors: By name, without the prefixes that wrappers put before it.
+        epoch: That the file states.
+        iteration: That the file states.
+    """
+
+    path: Path
+    sha256: str
+    tensors: Mapping[str, "Tensor"]
+    epoch: int | None = None
+    iteration: int | None = None
+
+
+def read_state_dict(path: Path) -> StateDict:
+    """Read the tensors of a checkpoint; whatever else is in it is not looked at.
+
+    Args:
+        path: Of ``torch.save``, zipped or not, or ``.safetensors``. In it lie tensors
+            by name, or a dictionary that holds them under one of `WRAPPERS`.
+
+    Raises:
+        MissingExtraError: torch is not installed, or safetensors for such a file.
+        GraphError: The file cannot be read, is cut or broken, asks for code to be run,
+            or holds no tensors by name.
+    """
+    if importlib.util.find_spec("torch") is None:
+        raise MissingExtraError("torch", "zoo")
+    with reading(path, GraphError, "not read as weights"):
+        if path.is_dir():
+            raise MalformedError("it is a folder")
+        with path.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        named = path.suffix == SAFETENSORS
+        whole = _from_safetensors(path) if named else _from_torch(path)
+        tensors = _without_prefixes(_tensors(whole))
+        epoch, iteration = (_count(whole, keys) for keys in (EPOCHS, ITERATIONS))
+        return StateDict(path, sha256, tensors, epoch, iteration)
+
+
+def _from_torch(path: Path) -> object:
+    import torch
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # how old the file's form is
+            found: object = torch.load(
+                path,
+                map_location="cpu",
+                weights_only=True,
+                mmap=zipfile.is_zipfile(path),
+            )
+    except pickle.UnpicklingError as error:
+        raise MalformedError(_refusal(str(error))) from error
+    except _BROKEN as error:
+        first = (str(error).splitlines() or ["it ends too early"])[0]
+        raise MalformedError(f"cut or broken ({first[:120]})") from error
+    return found
+
+
+def _refusal(said: str) -> str:
+    """Say which function or class a file asks for, as torch's reader names it."""
+    asked = re.search(r"GLOBAL ([\w.]+)", said)
+    if asked is None:
+        return "neither a file of torch.save nor .safetensors"
+    return (
+        f"it asks for {asked[1]}, which may run code: only tensors and plain values are"
+        " read"
+    )
+
+
+def _from_safetensors(path: Path) -> object:
+    if importlib.util.find_spec("safetensors") is None:
+        raise MissingExtraError("safetensors", "zoo")
+    library = importlib.import_module("safetensors")
+    try:
+        with library.safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            said = file.metadata() or {}
+    except library.SafetensorError as error:
+        raise MalformedError(f"cut or broken ({error})") from error
+    meta = {key: int(text) for key, text in said.items() if text.isdecimal()}
+    return {"state_dict": tensors, "meta": meta}
+
+
+def _tensors(whole: object) -> Mapping[Any, Any]:
+    """Return what lies under the wrapper's key, or all there is.
+
+    Raises:
+        MalformedError: It holds no tensors by name, or under several keys.
+    """
+    if not isinstance(whole, Mapping):
+        raise MalformedError(f"it holds a {type(whole).__name__}, not tensors by name")
+    held = [key for key in WRAPPERS if isinstance(whole.get(key), Mapping)]
+    if len(held) > 1:
+        raise MalformedError(f"it holds {' and '.join(held)}: keep one")
+    found: Mapping[Any, Any] = whole[held[0]] if held else whole
+    wrong = next((k for k in found if not _is_tensor(k, found[k])), None)
+    if wrong is not None and not held:
+        keys = [str(key) for key in whole]
+        more = ", ..." if len(keys) > _NAMED else ""
+        raise MalformedError(
+            f"no state dict: it holds {', '.join(keys[:_NAMED])}{more}"
+        )
+    if wrong is not None:
+        kind = type(found[wrong]).__name__
+        raise MalformedError(f"{held[0]}: {wrong!r} is a {kind}, not a tensor")
+    return found
+
+
+def _is_tensor(name: object, value: object) -> bool:
+    import torch
+
+    return isinstance(name, str) and isinstance(value, torch.Tensor)
+
+
+def _without_prefixes(tensors: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
+    """Return the tensors by bare names.
+
+    Raises:
+        MalformedError: Two become one.
+    """
+    found: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        bare = name
+        while bare.startswith(PREFIXES):
+            bare = bare.partition(".")[2]
+        if bare in found:
+            raise MalformedError(f"it holds {bare} twice, once as {name}")
+        found[bare] = tensor
+    return found
+
+
+def _count(whole: object, keys: tuple[str, ...]) -> int | None:
+    """Return the first whole number under any of the keys, in ``meta`` or beside it."""
+    if not isinstance(whole, Mapping):
+        return None
+    for place in (whole.get("meta"), whole):
+        for key in keys:
+            value = place.get(key) if isinstance(place, Mapping) else None
+            if isinstance(value, int) and not isinstance(value, bool):
+                return value
+    return None

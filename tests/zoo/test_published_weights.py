@@ -1,0 +1,275 @@
+"""Weights of a checkpoint: what fits is taken whole, what does not is named."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.workflows.export import ExportOptions, export_stack
+from me2e_compress.zoo.export import save, trace
+from me2e_compress.zoo.name_match import NameMatch
+from me2e_compress.zoo.published_names import PUBLISHED
+from me2e_compress.zoo.published_weights import (
+    PublishedWeights,
+    WeightsRecord,
+    mismatch,
+    published_weights,
+    taken,
+)
+from me2e_compress.zoo.state_dict import read_state_dict
+from me2e_compress.zoo.tcp.stack import Tcp
+from tests.zoo.published_files import Tensors, averaged, lightning, mmcv, saved, thin
+from tests.zoo.published_layouts import tcp, vad_tiny
+from tests.zoo.tcp.small import SMALL, small_spec
+
+
+@pytest.fixture
+def tensors() -> Tensors:
+    return thin(tcp())
+
+
+@pytest.fixture
+def trained() -> Tcp:
+    """A small original: its statistics are no fresh model's."""
+    torch.manual_seed(5)
+    model = Tcp(training_branches=True, config=SMALL).requires_grad_(False).eval()
+    for name, each in model.state_dict().items():
+        if each.is_floating_point():
+            drawn = 0.2 * torch.randn(each.shape)
+            each.copy_(drawn.abs() + 0.5 if name.endswith("running_var") else drawn)
+    return model
+
+
+def read(path: Path, *, ema: bool = False) -> PublishedWeights:
+    """Read a small original."""
+    own = Tcp(config=SMALL)
+    return taken(NameMatch(own, PUBLISHED["tcp"], read_state_dict(path), ema))
+
+
+def test_the_graph_answers_as_the_original(tmp_path: Path, trained: Tcp) -> None:
+    weights = read(saved(tmp_path / "a.ckpt", lightning(trained.state_dict())))
+    model = Tcp(config=SMALL).requires_grad_(False).eval()
+    weights.fill(model)
+    spec = small_spec("bench2drive")
+    graph = trace(spec, model, 17)
+
+    rng = np.random.default_rng(1)
+    feed = {
+        name: rng.standard_normal(shape, dtype=np.float32)
+        for name, shape in spec.inputs.items()
+    }
+    session = onnxruntime.InferenceSession(graph.SerializeToString())
+    wanted = trained(*(torch.from_numpy(each) for each in feed.values()))
+    for got, want in zip(session.run(None, feed), wanted, strict=True):
+        np.testing.assert_allclose(np.asarray(got), want, rtol=1e-4, atol=1e-4)
+    held = {
+        each.name: onnx.numpy_helper.to_array(each) for each in graph.graph.initializer
+    }
+    name = "perception.layer1.0.bn1.running_var"
+    np.testing.assert_array_equal(held[name], trained.state_dict()[name])
+
+
+@pytest.mark.parametrize(
+    ("stack", "heads", "layout"),
+    [
+        ("vad-tiny", None, vad_tiny()),
+        ("vad-tiny", "bench2drive", vad_tiny(classes=9, map_classes=6, modes=6)),
+        ("tcp", "beta", tcp("beta")),
+    ],
+)
+def test_published_files_fit_at_full_size(
+    tmp_path: Path, stack: str, heads: str | None, layout: dict[str, tuple[int, ...]]
+) -> None:
+    path = saved(tmp_path / "a.pth", mmcv(thin(layout)))
+    assert not mismatch(stack, path, heads=heads)
+
+
+def test_the_record_names_file_digest_and_count(
+    tmp_path: Path, tensors: Tensors
+) -> None:
+    path = saved(tmp_path / "tcp.pth", mmcv(tensors))
+    record = published_weights("tcp", path).record
+
+    said = json.loads(record.metadata()["me2e.weights"])
+    assert said == {
+        "file": "tcp.pth",
+        "sha256": record.sha256,
+        "epoch": 60,
+        "iteration": 211_080,
+        "averaged": False,
+    }
+    assert record.lines()[0] == (
+        f"weights: tcp.pth, epoch 60, iteration 211080, sha256 {record.sha256}"
+    )
+
+
+def test_what_only_training_reads_is_left_out_and_said(
+    tmp_path: Path, tensors: Tensors
+) -> None:
+    record = published_weights("tcp", saved(tmp_path / "a.pth", tensors)).record
+
+    assert record.lines()[1] == (
+        "left out, 22 tensors that driving does not read: speed_branch,"
+        " value_branch_traj, value_branch_ctrl, feature_branch_traj,"
+        " feature_branch_ctrl"
+    )
+
+
+@pytest.mark.parametrize("type_", [torch.float16, torch.bfloat16, torch.float64])
+def test_other_precisions_become_float32_and_are_said(
+    tmp_path: Path, tensors: Tensors, type_: torch.dtype
+) -> None:
+    cast = {n: each.to(type_) if each.dim() else each for n, each in tensors.items()}
+    found = published_weights("tcp", saved(tmp_path / "a.pth", cast))
+
+    floats = {each.dtype for n, each in found.tensors.items() if "tracked" not in n}
+    assert floats == {torch.float32}
+    count = sum("tracked" not in name for name in found.tensors)
+    kind = str(type_).removeprefix("torch.")
+    said = f"{count} tensors of {kind} converted to float32"
+    assert said in found.record.lines()
+
+
+def test_counters_may_be_missing(tmp_path: Path, tensors: Tensors) -> None:
+    old = {name: each for name, each in tensors.items() if "tracked" not in name}
+    found = published_weights("tcp", saved(tmp_path / "a.pth", old)).tensors
+
+    assert found["perception.bn1.num_batches_tracked"] == 0
+
+
+def test_moving_averages_are_left_out_and_said(tmp_path: Path, trained: Tcp) -> None:
+    state = trained.state_dict()
+    names = [name for name, _ in trained.named_parameters()]
+    found = read(saved(tmp_path / "a.pth", mmcv(averaged(state, names))))
+
+    assert torch.equal(found.tensors["output_traj.bias"], state["output_traj.bias"])
+    said = f"left out: {len(names)} moving averages; --ema takes them"
+    assert said in found.record.lines()
+
+
+def test_moving_averages_are_taken_where_asked(tmp_path: Path, trained: Tcp) -> None:
+    state = trained.state_dict()
+    names = [name for name, _ in trained.named_parameters()]
+    found = read(saved(tmp_path / "a.pth", mmcv(averaged(state, names))), ema=True)
+
+    assert torch.equal(found.tensors["output_traj.bias"], state["output_traj.bias"] + 1)
+    statistics = "perception.bn1.running_mean"
+    assert torch.equal(found.tensors[statistics], state[statistics])
+    assert found.record.averaged
+
+
+def test_averages_that_are_not_there_are_missing(
+    tmp_path: Path, tensors: Tensors
+) -> None:
+    path = saved(tmp_path / "a.pth", tensors)
+    with pytest.raises(GraphError, match=r"missing \(ema_perception_conv1_weight, "):
+        published_weights("tcp", path, ema=True)
+
+
+def without(tensors: Tensors) -> Tensors:
+    return {name: each for name, each in tensors.items() if name != "merge.2.bias"}
+
+
+def of_another_model(tensors: Tensors) -> Tensors:
+    return thin(vad_tiny())
+
+
+def of_another_shape(tensors: Tensors) -> Tensors:
+    return {**tensors, "merge.2.bias": torch.zeros(255)}
+
+
+def of_integers(tensors: Tensors) -> Tensors:
+    return {**tensors, "merge.2.bias": torch.zeros(256, dtype=torch.int64)}
+
+
+def not_finite(tensors: Tensors) -> Tensors:
+    return {**tensors, "merge.2.bias": torch.full((256,), float("nan"))}
+
+
+def too_large(tensors: Tensors) -> Tensors:
+    """Finite in float64 alone."""
+    return {**tensors, "merge.2.bias": torch.full((256,), 1e300, dtype=torch.float64)}
+
+
+def with_more(tensors: Tensors) -> Tensors:
+    return {**tensors, "brake_head.bias": torch.zeros(1)}
+
+
+@pytest.mark.parametrize(
+    ("alter", "words"),
+    [
+        (without, "names missing (merge.2.bias)"),
+        (of_another_shape, "1 of another shape (merge.2.bias is [255] in it, [256] h"),
+        (of_integers, "1 not floating-point (merge.2.bias is int64)"),
+        (not_finite, "1 not finite (merge.2.bias)"),
+        (too_large, "1 not finite (merge.2.bias)"),
+        (with_more, "1 unexpected (brake_head.bias)"),
+        (of_another_model, "names missing (perception.conv1.weight, perception.bn1.w"),
+    ],
+)
+def test_what_does_not_fit_is_named_in_one_line(
+    tmp_path: Path, tensors: Tensors, alter: object, words: str
+) -> None:
+    assert callable(alter)
+    path = saved(tmp_path / "a.pth", alter(tensors))
+    with pytest.raises(GraphError) as error:
+        published_weights("tcp", path)
+    line = str(error.value)
+    assert line.startswith(f"{path}: not the weights of tcp: ")
+    assert words in line
+    assert len(line) < 600 + len(str(path))
+    assert "\n" not in line
+
+
+def test_the_heads_that_would_fit_are_said(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.pth", thin(vad_tiny(classes=9, map_classes=6, modes=6)))
+    with pytest.raises(GraphError, match=r"; it fits --heads bench2drive$"):
+        published_weights("vad-tiny", path)
+
+
+def test_every_name_that_does_not_fit_can_be_asked_for(tmp_path: Path) -> None:
+    found = mismatch("tcp", saved(tmp_path / "a.pth", thin(vad_tiny())))
+    assert len(found.missing) > 100
+    assert set(found.unexpected) == set(vad_tiny())
+
+
+def test_a_stack_without_an_original(tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match="highway has no original"):
+        published_weights("highway", tmp_path / "a.pth")
+
+
+def test_nothing_is_written_of_what_does_not_fit(
+    tmp_path: Path, tensors: Tensors
+) -> None:
+    path = saved(tmp_path / "a.pth", without(tensors))
+    with pytest.raises(GraphError, match="names missing"):
+        export_stack("tcp", tmp_path / "out.onnx", ExportOptions(weights=path))
+    assert not (tmp_path / "out.onnx").exists()
+
+
+def test_a_checkpoint_is_not_overwritten(tmp_path: Path, tensors: Tensors) -> None:
+    path = saved(tmp_path / "a.pth", tensors)
+    with pytest.raises(GraphError, match=r"a\.pth"):
+        export_stack("tcp", path, ExportOptions(weights=path, force=True))
+
+
+def test_a_seed_has_nothing_to_draw() -> None:
+    with pytest.raises(RecipeError, match="--seed draws weights, --weights brings"):
+        ExportOptions(seed=0, weights=Path("a.pth"))
+
+
+def test_averages_of_no_checkpoint() -> None:
+    with pytest.raises(RecipeError, match="--ema needs --weights"):
+        ExportOptions(ema=True)
+
+
+def test_the_metadata_of_a_file_names_its_weights(tmp_path: Path) -> None:
+    record = WeightsRecord("a.pth", "0" * 64, epoch=3)
+    save(onnx.ModelProto(), record.metadata(), tmp_path / "a.onnx")
+    (entry,) = onnx.load(tmp_path / "a.onnx").metadata_props
+    assert json.loads(entry.value)["epoch"] == 3
