@@ -5,6 +5,7 @@ To add a policy: write its class, then add it to this table.
 
 import abc
 import hashlib
+import re
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
@@ -16,6 +17,7 @@ from me2e_compress.registry import Registry, name_in
 __all__ = [
     "MODEL",
     "POLICIES",
+    "PYTHON",
     "Driver",
     "SizedPolicy",
     "driver_named",
@@ -81,11 +83,17 @@ POLICIES: Registry[Driver] = Registry(
         "blind": f"{_HIGHWAY}:BlindDriver",
         "onnx": f"{_HIGHWAY}:OnnxDriver",
         "highway": "me2e_compress.workflows.shipped_driver:ShippedDriver",
+        "python": "me2e_compress.driving.python_policy:PythonDriver",
     },
 )
 
 MODEL = "onnx"
 """The policy that a path means."""
+
+PYTHON = "python"
+"""The policy that ``package.module:function`` means."""
+
+_FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 def driver_named(text: str, adapter: Path | None = None) -> Driver:
@@ -94,7 +102,8 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
     Args:
         text: ``expert``, ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``,
             ``highway`` for the driver that ships, the name of another package's policy,
-            or else a path.
+            ``package.module:function`` for what a Python function makes, or else a
+            path.
         adapter: TOML file that adapts a model; a policy without models ignores it.
 
     Raises:
@@ -103,6 +112,8 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
     """
     if name_in(text) in POLICIES.names():
         driver = POLICIES.parse(text).resolved()
+    elif _FACTORY.fullmatch(text) and not Path(text).exists():
+        driver = POLICIES.build(PYTHON, {"factory": text})
     else:
         driver = POLICIES.build(MODEL, {"path": text})
     if adapter is None or "adapter" not in type(driver).__dataclass_fields__:

@@ -12,7 +12,8 @@ from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import evaluate as workflow
 
 Policy = Annotated[
-    str | None, typer.Argument(help="M.onnx, highway, expert, blind:MPS, or see list")
+    str | None,
+    typer.Argument(help="M.onnx, highway, expert, module:function, or see list"),
 ]
 Evaluator = Annotated[
     str, typer.Option(help="who drives it: highway, NAME{option=value}, or see list")

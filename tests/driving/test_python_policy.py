@@ -1,0 +1,112 @@
+"""Policies that a function of a user's own module makes."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from me2e_compress.driving.policies import driver_named
+from me2e_compress.driving.python_policy import PythonDriver
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
+from me2e_compress.testing import check_policy
+
+Write = Callable[[str], str]
+
+BLIND = """
+from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.drivers import BlindDriver
+
+def make():
+    return Blind(5.0)
+
+def driver():
+    return BlindDriver(6.0)
+"""
+
+
+@pytest.fixture
+def write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> Write:
+    """Write a module into the working folder, and name it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    name = "policy_" + "".join(c if c.isalnum() else "_" for c in request.node.name)
+
+    def written(text: str) -> str:
+        (tmp_path / f"{name}.py").write_text(text)
+        return name
+
+    return written
+
+
+def test_a_function_of_the_working_folder_makes_a_policy(write: Write) -> None:
+    module = write(BLIND)
+
+    driver = driver_named(f"{module}:make")
+
+    assert driver == PythonDriver(f"{module}:make")
+    assert driver.label == f"{module}:make"
+    assert driver.open() == Blind(5.0)
+
+
+def test_it_keeps_the_contract(write: Write) -> None:
+    assert len(check_policy(driver_named(f"{write(BLIND)}:make"))) == 8
+
+
+def test_a_driver_is_opened(write: Write) -> None:
+    module = write(BLIND)
+
+    assert driver_named(f"{module}:driver").open() == Blind(6.0)
+
+
+def test_results_know_it_by_its_code(write: Write) -> None:
+    driver = driver_named(f"{write(BLIND)}:make")
+    before = driver.fingerprint()
+
+    assert write(BLIND + "# new") in before
+    assert driver.fingerprint() != before
+
+
+def test_names_and_files_win(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models:best").write_bytes(b"")
+
+    assert driver_named("blind:8") == BlindDriver(8.0)
+    assert driver_named("models:best") == OnnxDriver(Path("models:best"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("import nowhere_at_all", "ModuleNotFoundError: No module named 'nowhere_at"),
+        ("make = 3", "has no function make"),
+        ("other = 3", "has no function make"),
+        ("def make(): raise KeyError('weights')", "KeyError: 'weights'"),
+        ("def make(speed): return speed", "TypeError: make.. missing 1 required"),
+        ("make = dict", "a dict is no policy: it has no needs_images, privileged, res"),
+        ("def make(:", "SyntaxError: "),
+    ],
+)
+def test_what_makes_no_policy_is_one_line(
+    write: Write, text: str, message: str
+) -> None:
+    module = write(text)
+
+    with pytest.raises(EvaluationError, match=message) as caught:
+        driver_named(f"{module}:make").open()
+    assert str(caught.value).startswith(f"policy {module}:make: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_no_such_module() -> None:
+    with pytest.raises(EvaluationError, match="No module named 'nowhere_at_all'"):
+        driver_named("nowhere_at_all:make").open()
+
+
+def test_another_form_is_refused() -> None:
+    with pytest.raises(EvaluationError, match=r"not of the form package\.module:func"):
+        driver_named("python:here")
