@@ -25,11 +25,8 @@ from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.result import Result, Table, megabytes
 from me2e_compress.zoo import export as exporter
 from me2e_compress.zoo import shipped
-from me2e_compress.zoo.published_weights import (
-    PublishedWeights,
-    WeightsRecord,
-    published_weights,
-)
+from me2e_compress.zoo.published_weights import PublishedWeights, published_weights
+from me2e_compress.zoo.weights_record import WeightsRecord
 
 OPSET = 17
 """Of the shipped models, and of the others unless asked otherwise."""

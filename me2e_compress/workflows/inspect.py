@@ -32,6 +32,7 @@ from me2e_compress.workflows.result import (
     number,
     table,
 )
+from me2e_compress.zoo.weights_record import named_weights
 
 _SHOWN = 8
 """Operators of unknown MACs that are named."""
@@ -62,6 +63,7 @@ class InspectResult(Result):
         open_dimensions: of the inputs, by name: MACs wait for their sizes.
         recurrent: inputs that are fed back from frame to frame, with the output.
         modelled_energy: what its MACs and bytes would take; None: not asked for.
+        weights: the checkpoint that its metadata names, in a line; empty: none.
     """
 
     file: str
@@ -81,6 +83,7 @@ class InspectResult(Result):
     hint: str = ""
     recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
     modelled_energy: ModelledEnergy | None = None
+    weights: str = ""
 
     @property
     def headline(self) -> str:
@@ -91,8 +94,8 @@ class InspectResult(Result):
         return f"{self.file}: {size}, opset {self.opset}{more}{read}"
 
     def lines(self) -> tuple[str, ...]:
-        """Return the headline, and what the graph lacks."""
-        return tuple(filter(None, (self.hint, self.headline)))
+        """Return the headline, what the graph lacks, and what it was made of."""
+        return tuple(filter(None, (self.hint, self.headline, self.weights)))
 
     def tables(self) -> tuple[Table, ...]:
         """Return the interface, and the modules."""
@@ -204,6 +207,7 @@ def inspect(
         None
         if process is None
         else modelled_energy(folded, process, provenance.module_of),
+        named_weights(loaded.metadata_props),
     )
 
 

@@ -1,9 +1,8 @@
 """Weights of a published checkpoint, name by name in a stack of ours."""
 
-import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,59 +12,10 @@ from me2e_compress.zoo.name_match import Mismatch, NameMatch
 from me2e_compress.zoo.published_names import PUBLISHED
 from me2e_compress.zoo.stacks import Stack, find
 from me2e_compress.zoo.state_dict import StateDict, read_state_dict
+from me2e_compress.zoo.weights_record import WeightsRecord
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
-
-RECORD = "me2e.weights"
-"""Key of the metadata that says which checkpoint a graph was made of."""
-
-
-@dataclass(frozen=True)
-class WeightsRecord:
-    """What is known of the weights in a graph, and what became of the rest of a file.
-
-    Attributes:
-        file: Name of the checkpoint.
-        sha256: Of it, lower-case hex.
-        epoch: That it states.
-        iteration: That it states.
-        averaged: Its moving averages were taken.
-        converted: How many tensors became float32, by the type they had.
-        unread: Names of tensors left out, since driving does not read them.
-        averages: How many moving averages were left out.
-    """
-
-    file: str
-    sha256: str
-    epoch: int | None = None
-    iteration: int | None = None
-    averaged: bool = False
-    converted: Mapping[str, int] = field(default_factory=dict)
-    unread: Sequence[str] = ()
-    averages: int = 0
-
-    def metadata(self) -> dict[str, str]:
-        """Return the ONNX metadata property that names the checkpoint."""
-        keys = ("file", "sha256", "epoch", "iteration", "averaged")
-        return {RECORD: json.dumps({key: getattr(self, key) for key in keys})}
-
-    def lines(self) -> tuple[str, ...]:
-        """Return what there is to say, a line each."""
-        counts = {"epoch": self.epoch, "iteration": self.iteration}
-        stated = [f"{key} {n}" for key, n in counts.items() if n is not None]
-        said = [", ".join([f"weights: {self.file}", *stated, f"sha256 {self.sha256}"])]
-        for type_, count in self.converted.items():
-            said.append(f"{count} tensors of {type_} converted to float32")
-        if self.unread:
-            parts = list(dict.fromkeys(name.split(".")[0] for name in self.unread))
-            said.append(
-                f"left out, {len(self.unread)} tensors that driving does not read:"
-                f" {', '.join(parts)}"
-            )
-        if self.averages:
-            said.append(f"left out: {self.averages} moving averages; --ema takes them")
-        return tuple(said)
 
 
 @dataclass(frozen=True, eq=False)

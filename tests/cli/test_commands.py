@@ -51,6 +51,28 @@ def test_inspect_counts_by_module(
     assert found["inputs"] == [{"name": "camera", "type": "FLOAT", "shape": "[1,4]"}]
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('{"file": "vad.pth", "sha256": "ab", "epoch": 60}', "weights: vad.pth, epoch"),
+        ('{"file": 1}', "metadata me2e.weights is malformed"),
+        ("", "metadata me2e.weights is malformed"),
+    ],
+)
+def test_inspect_names_the_checkpoint(
+    command: Command,
+    files: Path,
+    capsys: pytest.CaptureFixture[str],
+    text: str,
+    line: str,
+) -> None:
+    model = graph.load(files / "in.onnx")
+    model.metadata_props["me2e.weights"] = text
+    graph.save(model, files / "in.onnx")
+    assert command("inspect", files / "in.onnx", "--map", files / "map.toml") == 0
+    assert line in capsys.readouterr().out
+
+
 def test_inspect_for_people(
     command: Command, files: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,7 +10,7 @@ from me2e_compress.training.course import RoundResult
 from me2e_compress.workflows.export import ExportResult
 from me2e_compress.workflows.frames import FramesOptions, FramesResult
 from me2e_compress.workflows.train import TrainResult
-from me2e_compress.zoo.published_weights import WeightsRecord
+from me2e_compress.zoo.weights_record import WeightsRecord
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
 from tests.metrics.drives import drive

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import onnx
@@ -11,19 +12,30 @@ import torch
 
 from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.workflows.export import ExportOptions, export_stack
-from me2e_compress.zoo.export import save, trace
+from me2e_compress.zoo import export as exporting
+from me2e_compress.zoo.export import build, trace
 from me2e_compress.zoo.name_match import NameMatch
 from me2e_compress.zoo.published_names import PUBLISHED
 from me2e_compress.zoo.published_weights import (
     PublishedWeights,
-    WeightsRecord,
     mismatch,
     published_weights,
     taken,
 )
+from me2e_compress.zoo.stacks import VAD_TINY, Stack
 from me2e_compress.zoo.state_dict import read_state_dict
+from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.tcp.stack import Tcp
-from tests.zoo.published_files import Tensors, averaged, lightning, mmcv, saved, thin
+from me2e_compress.zoo.vad.stack import VadTiny
+from tests.zoo.published_files import (
+    Tensors,
+    averaged,
+    lightning,
+    mmcv,
+    parallel,
+    saved,
+    thin,
+)
 from tests.zoo.published_layouts import tcp, vad_tiny
 from tests.zoo.tcp.small import SMALL, small_spec
 
@@ -268,8 +280,51 @@ def test_averages_of_no_checkpoint() -> None:
         ExportOptions(ema=True)
 
 
-def test_the_metadata_of_a_file_names_its_weights(tmp_path: Path) -> None:
-    record = WeightsRecord("a.pth", "0" * 64, epoch=3)
-    save(onnx.ModelProto(), record.metadata(), tmp_path / "a.onnx")
-    (entry,) = onnx.load(tmp_path / "a.onnx").metadata_props
-    assert json.loads(entry.value)["epoch"] == 3
+@pytest.mark.parametrize("operators", ["standard", "plugin"])
+def test_an_export_is_of_the_checkpoint_and_names_it(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    operators: Literal["standard", "plugin"],
+) -> None:
+    """As far as the trace, which takes minutes at full size."""
+    layout = {name: each for name, each in vad_tiny().items() if "tracked" not in name}
+    path = saved(tmp_path / "a.pth", mmcv(thin(layout)))
+    traced: list[torch.nn.Module] = []
+
+    def trace(spec: Stack, model: torch.nn.Module, opset: int) -> onnx.ModelProto:
+        traced.append(model)
+        return onnx.parser.parse_model(
+            '<ir_version: 8, opset_import: ["" : 17]>'
+            "m (float[1] img) => (float[1] plan) { plan = Relu(img) }"
+        )
+
+    monkeypatch.setattr(exporting, "trace", trace)
+    options = ExportOptions(weights=path, operators=operators)
+    found = export_stack("vad-tiny", tmp_path / "out.onnx", options)
+
+    (model,) = traced
+    assert all(bool((each == 0.5).all()) for each in model.parameters())
+    entries = onnx.load(found.output).metadata_props
+    said = {entry.key: entry.value for entry in entries}
+    assert json.loads(said["me2e.weights"])["epoch"] == 60
+    assert found.weights is not None
+    assert found.lines()[1] == found.weights.lines()[0]
+
+
+@pytest.mark.slow
+def test_vad_of_a_checkpoint_answers_as_in_torch(tmp_path: Path) -> None:
+    """Names that the original has otherwise, at full size: the plan reads them all."""
+    drawn = build("vad-tiny", seed=3)
+    assert isinstance(drawn, VadTiny)
+    names = PUBLISHED["vad-tiny"]
+    state = {names.published(name): each for name, each in drawn.state_dict().items()}
+    path = saved(tmp_path / "vad.pth", mmcv(parallel(state)))
+    options = ExportOptions(weights=path)
+    found = export_stack("vad-tiny", tmp_path / "vad.onnx", options).output
+
+    (frame,) = frames(VAD_TINY, 1, seed=7)
+    feed = {**frame, "prev_bev": np.zeros(VAD_TINY.inputs["prev_bev"], np.float32)}
+    session = onnxruntime.InferenceSession(found)
+    wanted = drawn(*(torch.from_numpy(feed[name]) for name in VAD_TINY.inputs))
+    for got, want in zip(session.run(None, feed), wanted, strict=True):
+        assert np.abs(got - want.numpy()).max() <= 1e-4 * want.abs().max()
