@@ -3,6 +3,7 @@
 A recording is a folder: one ``.npz`` a frame, keyed by input name, in the order of
 their names, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
 frame of every scene, and which inputs are pixels (`me2e_compress.calibration.pixels`).
+Beside a frame there may be a ``.future.json``: what really happened next.
 """
 
 import hashlib
@@ -23,7 +24,11 @@ from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.recorded_future import RecordedFuture
 from me2e_compress.runtime.recurrence import not_fed_back, recurrent_inputs, sides
+
+FUTURE = ".future.json"
+"""Beside a frame: what really happened next, `RecordedFuture`."""
 
 T = TypeVar("T", Array, Declared)
 
@@ -83,11 +88,12 @@ class CalibrationSet(Displayed):
         """Read one frame; its pixels are normalised.
 
         Raises:
-            FramesError: the file cannot be read as arrays, or its pixels are none.
+            FramesError: the file cannot be read as arrays, its pixels are none, or
+                what happened next is malformed.
         """
         path = self.files[index]
         arrays = self._as_fed(path, load_arrays(path), PixelInput.normalised)
-        return Frame(index, index in self.scenes, arrays)
+        return Frame(index, index in self.scenes, arrays, future=_future(path))
 
     def _as_fed(
         self, path: Path, held: Mapping[str, T], turn: Callable[[PixelInput, T], T]
@@ -242,6 +248,16 @@ def _draw(value: ir.Value, generator: np.random.Generator) -> Array:
     if dtype.kind == "f":
         return np.asarray(generator.standard_normal(shape)).astype(dtype)
     return np.asarray(generator.integers(0, 2, shape)).astype(dtype)
+
+
+def _future(frame: Path) -> RecordedFuture | None:
+    """Read what happened after a frame; None where nobody recorded it."""
+    path = frame.with_suffix(FUTURE)
+    if not path.is_file():
+        return None
+    with documents.reading(path, FramesError, "not a recorded future"):
+        found = documents.from_json(documents.content(path))
+        return RecordedFuture.model_validate(found)
 
 
 def _index(path: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from me2e_compress import documents
+from me2e_compress.calibration.dataset import FUTURE
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_json
@@ -50,10 +51,11 @@ def write_recording(
 ) -> Path:
     """Write a folder that `CalibrationSet` reads, all or nothing.
 
-    One ``000000.npz`` a frame, keyed by input name, and ``scenes.json``, which says
-    where scenes begin. A folder that holds an earlier recording of ours is replaced.
-    The same frames give the same bytes. Whole scenes of a run that was killed wait
-    beside the folder, and the same run goes on from them.
+    One ``000000.npz`` a frame, keyed by input name, ``000000.future.json`` where it is
+    known what happened next, and ``scenes.json``, which says where scenes begin. A
+    folder that holds an earlier recording of ours is replaced. The same frames give
+    the same bytes. Whole scenes of a run that was killed wait beside the folder, and
+    the same run goes on from them.
 
     Args:
         folder: To write.
@@ -142,7 +144,10 @@ class _Draft:
             self.places.append(frame.place)
             record = {"scenes": self.scenes, "places": self.places}
             write_json(self.folder / PROGRESS, {"key": self.key, **record})
-        _write_npz(self._frame(self.count), frame.arrays)
+        path = self._frame(self.count)
+        _write_npz(path, frame.arrays)
+        if frame.future is not None:
+            path.with_suffix(FUTURE).write_text(frame.future.model_dump_json() + "\n")
         self.count += 1
 
     def finish(self) -> None:
@@ -166,7 +171,8 @@ def _check_replaceable(folder: Path) -> None:
     if INDEX not in names:
         raise FramesError(f"{folder} is not empty, and no recording: it has {names[0]}")
     for name in names:
-        if name != INDEX and not (name.endswith(".npz") and name[:-4].isdigit()):
+        number = name.removesuffix(FUTURE).removesuffix(".npz")
+        if name != INDEX and not (number != name and number.isdigit()):
             raise FramesError(f"{folder} holds frames but also {name}: not replaced")
 
 

@@ -7,6 +7,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.runtime.recorded_future import RecordedFuture
+
 Array: TypeAlias = npt.NDArray[np.generic]
 
 
@@ -19,12 +21,14 @@ class Frame:
         starts_scene: True where a new scene begins: recurrent state is reset here.
         arrays: one array for every input, by input name; recurrent ones may be missing.
         place: of its scene among those that its source tried; some give no frame.
+        future: what really happened next; None where nobody recorded it.
     """
 
     index: int
     starts_scene: bool
     arrays: dict[str, Array]
     place: int = 0
+    future: RecordedFuture | None = None
 
     def __repr__(self) -> str:
         """Show index and shapes, not the pictures."""

@@ -6,6 +6,7 @@ from me2e_compress.errors import MissingExtraError
 
 PACKAGES = {
     "highway": ("highway_env", "cv2", "jinja2", "matplotlib", "scipy"),
+    "logs": ("cv2",),
     "zoo": ("torch",),
 }
 """What each extra brings, as it is imported."""
@@ -26,5 +27,14 @@ def need_closed_loop(what: str) -> None:
     Raises:
         MissingExtraError: it is not, and ``what`` needs it.
     """
-    if missing_extra("highway"):
-        raise MissingExtraError(what, "highway")
+    need_extra("highway", what)
+
+
+def need_extra(extra: str, what: str) -> None:
+    """Go on if an extra is installed.
+
+    Raises:
+        MissingExtraError: it is not, and ``what`` needs it.
+    """
+    if missing_extra(extra):
+        raise MissingExtraError(what, extra)

@@ -5,15 +5,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from me2e_compress import graph
+from me2e_compress.calibration.logs import LOGS, DriveLog
+from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.extras import need_closed_loop
+from me2e_compress.workflows.extras import need_closed_loop, need_extra
 from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.logged_inputs import inputs_of_model, inputs_of_stack
 from me2e_compress.workflows.result import Result, Table
 from me2e_compress.zoo.stacks import STACKS, find
 from me2e_compress.zoo.synthetic_frames import frames as synthetic
@@ -32,9 +35,10 @@ class FramesOptions:
         count: how many.
         seed: of everything.
         scene_length: frames a scene; None is `SCENE_LENGTH` of a synthetic world,
-            `DRIVEN_SCENE_LENGTH` of a driven route.
+            `DRIVEN_SCENE_LENGTH` of a driven route, all that a log has.
         force: replace outputs that are not as we left them, too.
         provider: what opens the model whose frames they are.
+        log: recorded driving that they are made from; None makes them up.
 
     Raises:
         RecipeError: a seed below 0.
@@ -45,6 +49,7 @@ class FramesOptions:
     scene_length: int | None = None
     force: bool = False
     provider: Provider = CPU
+    log: DriveLog | None = None
 
     def __post_init__(self) -> None:
         """Check the seed."""
@@ -66,10 +71,16 @@ class FramesResult(Result):
     options: FramesOptions
 
     @property
+    def count(self) -> int:
+        """Frames that there are: a log may have fewer than were asked for."""
+        return sum(1 for _ in self.output.glob("*.npz"))
+
+    @property
     def headline(self) -> str:
-        """Folder, frames, stack, seed."""
-        count, seed = self.options.count, self.options.seed
-        return f"{self.output}: {count} frames of {self.stack}, seed {seed}"
+        """Folder, frames, stack, and seed or log."""
+        log, seed = self.options.log, self.options.seed
+        said = f"{self.output}: {self.count} frames of {self.stack}"
+        return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
 
     def tables(self) -> tuple[Table, ...]:
         """Return none: the line says it."""
@@ -77,17 +88,19 @@ class FramesResult(Result):
 
     def records(self) -> list[dict[str, object]]:
         """Return one row: the recording."""
+        log = self.options.log
         return [
             {
                 "stack": self.stack,
                 "output": self.output,
-                "frames": self.options.count,
-                "seed": self.options.seed,
+                "frames": self.count,
+                "seed": self.options.seed if log is None else None,
+                "log": None if log is None else LOGS.text(log),
             }
         ]
 
     def to_json(self) -> object:
-        """Return the recording: stack, folder, frames, seed."""
+        """Return the recording: stack, folder, frames, seed, log."""
         return self.records()[0]
 
 
@@ -103,7 +116,7 @@ def record_frames(
 
     Of ``vad-tiny`` and ``tcp`` a synthetic world is drawn; for ``highway``, or any
     ONNX file that keeps the policy contract, the expert drives fresh routes of
-    highway-env.
+    highway-env. With a log, recorded driving is laid out as either takes it.
 
     Args:
         source: a stack of the zoo, or an ONNX file that keeps the policy contract.
@@ -117,10 +130,11 @@ def record_frames(
     Raises:
         GraphError: no such stack and no such file, or altered weights; or the folder
             is the input.
-        FramesError: a count below 1, or the folder holds something else.
+        FramesError: a count below 1, the folder holds something else, or the log
+            lacks something or cannot feed the model.
         EvaluationError: the file does not keep the policy contract.
         ProviderError: the provider is not there.
-        MissingExtraError: driving needs the extra ``highway``.
+        MissingExtraError: driving needs the extra ``highway``, a log ``logs``.
     """
     options, folder = options or FramesOptions(), Path(folder)
     check_folder(folder, (source,))
@@ -131,13 +145,17 @@ def record_frames(
 def _recorded(
     source: str | Path, folder: Path, options: FramesOptions, listener: Listener
 ) -> Path:
-    if Path(source).is_file() or find(str(source)).trained:
+    pixels = dict[str, PixelInput]()
+    about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
+    if options.log is not None:
+        make, of, pixels = _logged(source, options.log, options)
+        about = {"stack": str(source), "log": LOGS.text(options.log)}
+    elif Path(source).is_file() or find(str(source)).trained:
         model = model_path(source)
         try_file(model, listener, options.provider)
         make, of = _driven(model, options), graph.sha256_of(model)
     else:
         make, of = _synthetic(str(source), options), str(source)
-    about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
 
     def reported(begin: Begin) -> Iterator[Frame]:
         for frame in make(begin):
@@ -146,7 +164,30 @@ def _recorded(
             listener.on_progress("frames", done, options.count, folder.name)
 
     key = f"{__version__} {of} {options.count} {options.scene_length}"
-    return write_recording(folder, reported, about, key)
+    return write_recording(folder, reported, about, key, pixels)
+
+
+def _logged(
+    source: str | Path, log: DriveLog, options: FramesOptions
+) -> tuple[Source, str, dict[str, PixelInput]]:
+    need_extra("logs", "what reads pictures")
+    from me2e_compress.calibration.logs.log_frames import log_frames
+
+    if Path(source).is_file():
+        model, of = (
+            inputs_of_model(Path(source), log.size),
+            graph.sha256_of(Path(source)),
+        )
+    else:
+        model, of = inputs_of_stack(find(str(source))), str(source)
+    count, length = options.count, options.scene_length
+
+    def make(begin: Begin) -> Iterator[Frame]:
+        return log_frames(
+            log, model, count, length, done=begin.frame, first=begin.place
+        )
+
+    return make, of, {} if model.image is None else {"img": model.image}
 
 
 def _driven(model: Path, options: FramesOptions) -> Source:

@@ -9,6 +9,7 @@ from importlib.resources.abc import Traversable
 from typing import Any
 
 from me2e_compress import modules, recipe
+from me2e_compress.calibration.logs import LOGS
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.latency import LATENCY_SOURCES
@@ -120,6 +121,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "rules": RULES,
     "rule-sets": RULE_SETS,
     "observers": OBSERVERS,
+    "logs": LOGS,
     "targets": TARGETS,
     "policies": POLICIES,
     "latency-sources": LATENCY_SOURCES,

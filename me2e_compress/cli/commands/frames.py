@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from me2e_compress.calibration.logs import LOGS
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
@@ -14,8 +15,12 @@ Length = Annotated[
     int | None,
     typer.Option(
         help=f"frames a scene; default {workflow.SCENE_LENGTH} for vad-tiny and tcp,"
-        f" else {workflow.DRIVEN_SCENE_LENGTH}"
+        f" else {workflow.DRIVEN_SCENE_LENGTH}, of a log all"
     ),
+]
+Log = Annotated[
+    str | None,
+    typer.Option("--from", help="recorded driving: nuscenes:ROOT, bench2drive:ROOT"),
 ]
 
 
@@ -24,6 +29,7 @@ def frames(
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     count: given.Count = 256,
     scene_length: Length = None,
+    log: Log = None,
     seed: given.Seed = 0,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
@@ -33,10 +39,16 @@ def frames(
     """Write calibration frames, coherent in time, seen by six cameras.
 
     For vad-tiny and tcp a synthetic world is drawn; for highway, or any ONNX file that
-    keeps the policy contract, the expert drives fresh routes of highway-env.
+    keeps the policy contract, the expert drives fresh routes of highway-env. With
+    --from, recorded driving of nuScenes or Bench2Drive is laid out as either takes it.
     """
     options = workflow.FramesOptions(
-        count, seed, scene_length, force, provider_named(provider, plugins or ())
+        count,
+        seed,
+        scene_length,
+        force,
+        provider_named(provider, plugins or ()),
+        None if log is None else LOGS.parse(log),
     )
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)

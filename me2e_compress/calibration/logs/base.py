@@ -1,0 +1,209 @@
+"""What a driving log tells of a moment, whatever its files look like.
+
+Frames: *lidar* is x right, y forward, z up at the roof lidar (nuScenes, UniAD, VAD);
+*ego* is x forward, y left, z up on the ground under the centre of the vehicle; the
+*world* is right-handed. A matrix ``a_to_b`` [4, 4] takes (x, y, z, 1) of a to b.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.errors import FramesError
+
+Floats: TypeAlias = npt.NDArray[np.float64]
+
+CAMERAS = (
+    "CAM_FRONT",
+    "CAM_FRONT_LEFT",
+    "CAM_FRONT_RIGHT",
+    "CAM_BACK",
+    "CAM_BACK_LEFT",
+    "CAM_BACK_RIGHT",
+)
+"""In the order of Bench2Drive's models."""
+
+CAN_BUS_SIZE = 18
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A road user, a box on the ground of the world; metres, radians.
+
+    Attributes:
+        x: of its centre.
+        y: the same.
+        heading: counter-clockwise from the x axis.
+        length: along its heading.
+        width: across.
+    """
+
+    x: float
+    y: float
+    heading: float
+    length: float
+    width: float
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What was recorded at one moment.
+
+    Attributes:
+        time_us: microseconds since any fixed time.
+        pictures: the file of each camera.
+        lidar_to_image: of each camera [4, 4]: lidar metres to (u * depth, v * depth,
+            depth, 1), pixels of the whole picture.
+        lidar_to_world: [4, 4].
+        lidar_to_ego: [4, 4].
+        l2g_rows: whether the data set's own models are fed the rotation of lidar to
+            world for rows (p @ r), which is its transpose.
+        can_bus: [18] as the data set's own models are fed it, but [0:3] is the
+            position and [17] the heading in degrees, not their changes.
+        agents: the road users; None where the log does not tell.
+        command: where the route goes next, counted as the data set's models do; None
+            where the log does not tell.
+    """
+
+    time_us: int
+    pictures: Mapping[str, Path]
+    lidar_to_image: Mapping[str, Floats]
+    lidar_to_world: Floats
+    lidar_to_ego: Floats
+    l2g_rows: bool
+    can_bus: Floats
+    agents: tuple[Agent, ...] | None
+    command: int | None
+
+
+LogScene: TypeAlias = Sequence[Moment]
+"""Moments in order; what is not asked for need not be read."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveLog(ABC):
+    """A data set of recorded driving.
+
+    Attributes:
+        scenes: which, by name; none means all.
+        cameras: which, in the order of the image input; none means the six of
+            Bench2Drive's order, front first.
+        every: takes every n-th moment.
+        size: rows and columns of the image input, where the model leaves them open.
+    """
+
+    name: ClassVar[str]
+    half_second: ClassVar[int]
+    """Moments in half a second."""
+    ego_size: ClassVar[tuple[float, float]]
+    """Length and width of the ego vehicle, metres."""
+
+    scenes: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()
+    every: int = 1
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the step."""
+        if self.every < 1:
+            raise ValueError(f"every {self.every}: must be at least 1")
+
+    @abstractmethod
+    def names(self) -> Sequence[str]:
+        """List the scenes that there are, in order.
+
+        Raises:
+            FramesError: it is no such data set; the message names what is missing.
+        """
+
+    @abstractmethod
+    def scene(self, name: str) -> LogScene:
+        """Return the moments of a scene.
+
+        Raises:
+            FramesError: the first thing of it that is missing or malformed.
+        """
+
+    @abstractmethod
+    def command_of(self, right_m: float) -> int:
+        """Return the command of a route that ends so far to the right in 3 s.
+
+        Asked where `Moment.command` is None.
+        """
+
+    def chosen(self) -> tuple[str, ...]:
+        """List the scenes that are asked for.
+
+        Raises:
+            FramesError: one of them is not there.
+        """
+        there = tuple(self.names())
+        for name in self.scenes:
+            if name not in there:
+                some = ", ".join(there[:5]) + (", ..." if len(there) > 5 else "")
+                raise FramesError(f"{self.name}: no scene {name!r}; there are {some}")
+        return self.scenes or there
+
+    @property
+    def seen(self) -> tuple[str, ...]:
+        """Name the cameras in their order."""
+        return self.cameras or CAMERAS
+
+
+def pose(rotation: Sequence[float], translation: Sequence[float], what: str) -> Floats:
+    """Return the [4, 4] of a quaternion w, x, y, z and a translation.
+
+    Raises:
+        FramesError: one of the numbers is not finite, or the quaternion is zero.
+    """
+    w, x, y, z = found = np.array(rotation, np.float64)
+    size = float(found @ found)
+    if not (np.isfinite(size) and np.isfinite(translation).all() and size > 0):
+        raise FramesError(f"{what}: the pose is not finite")
+    s = 2.0 / size
+    out = np.eye(4)
+    out[:3, :3] = [
+        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+    ]
+    out[:3, 3] = translation
+    return out
+
+
+def intrinsics(matrix: object, what: str) -> Floats:
+    """Return the [4, 4] of a [3, 3] camera matrix.
+
+    Raises:
+        FramesError: it has another shape, or is not finite.
+    """
+    out = np.eye(4)
+    out[:3, :3] = matrix_of(matrix, (3, 3), what)
+    return out
+
+
+def matrix_of(value: object, shape: tuple[int, ...], what: str) -> Floats:
+    """Return an array of numbers that a file holds.
+
+    Raises:
+        FramesError: it has another shape, or is not finite.
+    """
+    try:
+        found = np.array(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise FramesError(f"{what}: no {list(shape)} of numbers") from error
+    if found.shape != shape:
+        raise FramesError(f"{what}: has shape {list(found.shape)}, not {list(shape)}")
+    if not np.isfinite(found).all():
+        raise FramesError(f"{what}: is not finite")
+    return found
+
+
+def heading_of(a_to_b: Floats) -> float:
+    """Return where the y axis of lidar points in b, radians from its x axis."""
+    return float(np.arctan2(a_to_b[1, 1], a_to_b[0, 1]))

@@ -1,0 +1,103 @@
+"""Ground truth of a frame: what the moments after it tell."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from me2e_compress.calibration.logs.base import (
+    Agent,
+    DriveLog,
+    Floats,
+    LogScene,
+    Moment,
+    heading_of,
+)
+from me2e_compress.runtime.recorded_future import (
+    STEP_S,
+    STEPS,
+    Box,
+    Point,
+    RecordedFuture,
+)
+
+TOLERANCE_S = 0.25
+"""A moment counts as that of a step if it is at most half a step off."""
+
+
+def recorded_future(
+    log: DriveLog, scene: LogScene, at: int, lidar_to_ground: Floats
+) -> RecordedFuture:
+    """Return what happened in the three seconds after a moment.
+
+    Args:
+        log: whose the scene is.
+        scene: all of its moments.
+        at: which one.
+        lidar_to_ground: [4, 4] to the ground frame of the model's plan.
+    """
+    now = scene[at]
+    later = [_later(scene, at, step, log.half_second) for step in range(1, STEPS + 1)]
+    from_world = lidar_to_ground @ np.linalg.inv(now.lidar_to_world)
+    back = np.linalg.inv(lidar_to_ground)
+    waypoints = [
+        None if each is None else _place(from_world @ each.lidar_to_world @ back)
+        for each in later
+    ]
+    return RecordedFuture(
+        waypoints=tuple(waypoints),
+        forward=heading_of(lidar_to_ground),
+        ego=log.ego_size,
+        centre=_place(lidar_to_ground @ np.linalg.inv(now.lidar_to_ego)),
+        agents=_agents(later, from_world),
+        command=command_at(log, scene, at),
+    )
+
+
+def command_at(log: DriveLog, scene: LogScene, at: int) -> int:
+    """Return the recorded command, or else what the vehicle went on to do.
+
+    UniAD and VAD: how far to the right of the lidar it was at the last moment of the
+    next three seconds.
+    """
+    now = scene[at]
+    if now.command is not None:
+        return now.command
+    later = [_later(scene, at, step, log.half_second) for step in range(1, STEPS + 1)]
+    last = next((each for each in reversed(later) if each is not None), now)
+    right, _ = _place(np.linalg.inv(now.lidar_to_world) @ last.lidar_to_world)
+    return log.command_of(right)
+
+
+def _later(scene: LogScene, at: int, step: int, half_second: int) -> Moment | None:
+    """Return the moment so many half seconds later; None where the log has none."""
+    index = at + step * half_second
+    if index >= len(scene):
+        return None
+    found = scene[index]
+    passed_s = (found.time_us - scene[at].time_us) / 1e6
+    return found if abs(passed_s - step * STEP_S) <= TOLERANCE_S else None
+
+
+def _place(to_ground: Floats) -> Point:
+    return float(to_ground[0, 3]), float(to_ground[1, 3])
+
+
+def _agents(
+    later: Sequence[Moment | None], from_world: Floats
+) -> tuple[tuple[Box, ...], ...] | None:
+    known = [each.agents for each in later if each is not None]
+    if not known or None in known:
+        return None
+    turn = math.atan2(from_world[1, 0], from_world[0, 0])
+    return tuple(
+        tuple(_box(agent, from_world, turn) for agent in (each.agents or ()))
+        if each is not None
+        else ()
+        for each in later
+    )
+
+
+def _box(agent: Agent, from_world: Floats, turn: float) -> Box:
+    x, y = (from_world[:2, :2] @ [agent.x, agent.y] + from_world[:2, 3]).tolist()
+    return x, y, agent.heading + turn, agent.length, agent.width

@@ -1,0 +1,190 @@
+"""Frames of a model from a driving log."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from me2e_compress.calibration.logs.base import DriveLog, Floats, LogScene, Moment
+from me2e_compress.calibration.logs.futures import command_at, recorded_future
+from me2e_compress.calibration.logs.pictures import read_picture
+from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.frames import Array, Frame
+
+MADE = (
+    "img",
+    "lidar2img",
+    "can_bus",
+    "command",
+    "timestamp",
+    "l2g_r_mat",
+    "l2g_t",
+)
+"""Inputs that a log gives."""
+
+
+@dataclass(frozen=True)
+class InputForm:
+    """What an input takes.
+
+    Attributes:
+        shape: of it; None where a side is open.
+        dtype: of its elements.
+    """
+
+    shape: tuple[int | None, ...]
+    dtype: np.dtype[Any]
+
+
+@dataclass(frozen=True)
+class LoggedInputs:
+    """How a model is fed from a log.
+
+    Attributes:
+        forms: of the inputs that are to be made, by name; recurrent ones are not.
+        image: normalisation and size of the input img; None without one.
+        forward_left: whether the model's ground frame is the ego's (x forward, y left)
+            and not the lidar's (x right, y forward).
+    """
+
+    forms: Mapping[str, InputForm]
+    image: PixelInput | None
+    forward_left: bool = False
+
+    def check(self, log: DriveLog) -> None:
+        """Check that a log can feed the model.
+
+        Raises:
+            FramesError: it takes what no log gives, or another number of cameras.
+        """
+        for name in self.forms:
+            if name not in MADE:
+                raise FramesError(
+                    f"input {name} is not made from a log; there are {', '.join(MADE)}"
+                )
+        image = self.forms.get("img")
+        if image is None:
+            return
+        if image.dtype != np.float32 or len(image.shape) < 4:
+            raise FramesError(
+                f"input img is {image.dtype} {list(image.shape)}; from a log it is"
+                " float32 [1, cameras, 3, rows, columns]"
+            )
+        if image.shape[-4] not in (None, len(log.seen)):
+            raise FramesError(
+                f"input img takes {image.shape[-4]} cameras, the log gives"
+                f" {len(log.seen)}: name them (cameras=[CAM_FRONT, ...])"
+            )
+
+
+def log_frames(
+    log: DriveLog,
+    model: LoggedInputs,
+    count: int,
+    scene_length: int | None = None,
+    *,
+    done: int = 0,
+    first: int = 0,
+) -> Iterator[Frame]:
+    """Read frames of a model off a log, one after the other, images as bytes.
+
+    Args:
+        log: the data set.
+        model: how it is fed.
+        count: frames at most, in all.
+        scene_length: frames a scene at most; None takes all.
+        done: frames that are there already, in whole scenes.
+        first: place of the scene to begin with.
+
+    Yields:
+        Frames keyed by input name, with what happened next.
+
+    Raises:
+        FramesError: the first thing that is missing or malformed, by its name; or a
+            count below 1.
+    """
+    if count < 1 or (scene_length is not None and scene_length < 1):
+        raise FramesError(
+            f"{count} frames in scenes of {scene_length}: both must be at least 1"
+        )
+    model.check(log)
+    for place, name in list(enumerate(log.chosen()))[first:]:
+        scene = log.scene(name)
+        chosen = range(0, len(scene), log.every)[
+            : min(count - done, scene_length or count)
+        ]
+        before = None
+        for at in chosen:
+            arrays = _arrays(log, model, scene, at, before)
+            future = recorded_future(log, scene, at, _ground(model, scene[at]))
+            yield Frame(done, before is None, arrays, place, future)
+            before, done = at, done + 1
+        if done == count:
+            return
+
+
+def _ground(model: LoggedInputs, now: Moment) -> Floats:
+    return now.lidar_to_ego if model.forward_left else np.eye(4)
+
+
+def _arrays(
+    log: DriveLog, model: LoggedInputs, scene: LogScene, at: int, before: int | None
+) -> dict[str, Array]:
+    now = scene[at]
+    back = np.linalg.inv(_ground(model, now))
+    to_world = now.lidar_to_world @ back
+    turn = to_world[:3, :3]
+    made: dict[str, Array] = {
+        "can_bus": _changes(now, None if before is None else scene[before]),
+        "command": np.asarray(command_at(log, scene, at)),
+        "timestamp": np.asarray((now.time_us - scene[0].time_us) / 1e6),
+        "l2g_r_mat": turn.T if now.l2g_rows else turn,
+        "l2g_t": to_world[:3, 3],
+    }
+    projections = [now.lidar_to_image[camera] @ back for camera in log.seen]
+    if model.image is not None:
+        pictures = [read_picture(now.pictures[c], model.image) for c in log.seen]
+        if len({each.planes.shape for each in pictures}) > 1:
+            sizes = [list(each.planes.shape) for each in pictures]
+            raise FramesError(
+                f"{now.pictures[log.seen[0]]}: pictures of several sizes: {sizes}"
+            )
+        made["img"] = np.stack([each.planes for each in pictures])
+        places = [each.place for each in pictures]
+        projections = [p @ m for p, m in zip(places, projections, strict=True)]
+    made["lidar2img"] = np.stack(projections)
+    return {name: _fed(made[name], form, name) for name, form in model.forms.items()}
+
+
+def _changes(now: Moment, before: Moment | None) -> Floats:
+    """Turn position and heading into what they changed by since the frame before.
+
+    As UniAD and VAD do between the frames that they are shown; zero at the first.
+    """
+    bus = now.can_bus.copy()
+    if before is None:
+        bus[0:3] = bus[17] = 0.0
+        return bus
+    bus[0:3] -= before.can_bus[0:3]
+    bus[17] = math.remainder(bus[17] - before.can_bus[17], 360.0)
+    return bus
+
+
+def _fed(array: Array, form: InputForm, name: str) -> Array:
+    """Return an array with the dimensions and the type of an input."""
+    if name == "img":
+        lead = (1,) * (len(form.shape) - array.ndim)
+        return array.reshape(lead + array.shape)
+    missing = len(form.shape) - array.ndim
+    sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]
+    fits = len(sides) == len(form.shape) and all(
+        want in (None, have) for have, want in zip(sides, form.shape, strict=True)
+    )
+    if not fits:
+        raise FramesError(
+            f"input {name} takes {list(form.shape)}, a log gives {list(array.shape)}"
+        )
+    return array.reshape(sides).astype(form.dtype)

@@ -1,0 +1,199 @@
+"""The tables of nuScenes: files of rows that refer to each other by token.
+
+``sample_data.json`` of v1.0-trainval has more than 1 GB; tables are read row by row,
+and only what is asked for is kept.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from me2e_compress import documents
+from me2e_compress.calibration.logs.base import Agent, Floats, matrix_of, pose
+from me2e_compress.errors import FramesError
+
+Row: TypeAlias = Mapping[str, Any]
+
+ROAD_USERS = ("vehicle.", "human.")
+"""Categories that a plan collides with, as UniAD and VAD take them."""
+PIECE = 1 << 22
+"""Characters that are read at once; no row is larger."""
+_SPACE = " \t\r\n,"
+
+
+def rows(path: Path, *fields: str) -> Iterator[Row]:
+    """Read the rows of a table one by one.
+
+    Args:
+        path: of the table.
+        fields: that every row must have.
+
+    Raises:
+        FramesError: no such table, malformed, or a row lacks a field.
+    """
+    with documents.reading(path, FramesError, "not a table of nuScenes"):
+        for index, row in enumerate(_objects(path)):
+            lacks = [name for name in fields if name not in row]
+            if lacks:
+                raise documents.MalformedError(f"row {index} has no {lacks[0]}")
+            yield row
+
+
+def by_token(path: Path, keep: Callable[[Row], bool], *fields: str) -> dict[str, Row]:
+    """Read those rows that are to be kept, by their token.
+
+    Raises:
+        FramesError: see :func:`rows`.
+    """
+    return {row["token"]: row for row in rows(path, "token", *fields) if keep(row)}
+
+
+class NuScenesTables:
+    """The rows of some scenes.
+
+    Args:
+        folder: of the tables.
+        wanted: scenes by name; none means all.
+    """
+
+    def __init__(self, folder: Path, wanted: Sequence[str]) -> None:
+        self.folder = folder
+        self.scenes = [
+            *rows(folder / "scene.json", "token", "name", "first_sample_token")
+        ]
+        tokens = {s["token"] for s in self.scenes if not wanted or s["name"] in wanted}
+        self.samples = by_token(
+            folder / "sample.json",
+            lambda row: row["scene_token"] in tokens,
+            *("scene_token", "timestamp", "next"),
+        )
+        self.sensors = by_token(
+            folder / "calibrated_sensor.json",
+            lambda row: True,
+            *("sensor_token", "translation", "rotation", "camera_intrinsic"),
+        )
+        self.data = self._key_frames()
+        used = {
+            d["ego_pose_token"] for each in self.data.values() for d in each.values()
+        }
+        self.poses = by_token(
+            folder / "ego_pose.json",
+            lambda row: row["token"] in used,
+            *("translation", "rotation"),
+        )
+        self._agents = self._boxes()
+
+    def _key_frames(self) -> dict[str, dict[str, Row]]:
+        """Return what each sensor recorded of each sample."""
+        channels = by_token(self.folder / "sensor.json", lambda row: True, "channel")
+        found: dict[str, dict[str, Row]] = {token: {} for token in self.samples}
+        path = self.folder / "sample_data.json"
+        names = ("sample_token", "ego_pose_token", "calibrated_sensor_token")
+        for row in rows(path, *names, "is_key_frame", "filename"):
+            if row["is_key_frame"] and row["sample_token"] in found:
+                sensor = channels.get(self.sensor(row)["sensor_token"])
+                if sensor is None:
+                    raise FramesError(f"{path}: {row['filename']} is of no sensor")
+                found[row["sample_token"]][sensor["channel"]] = row
+        return found
+
+    def _boxes(self) -> dict[str, list[Agent]]:
+        kinds = by_token(self.folder / "category.json", lambda row: True, "name")
+        things = by_token(
+            self.folder / "instance.json", lambda row: True, "category_token"
+        )
+        found: dict[str, list[Agent]] = {}
+        path = self.folder / "sample_annotation.json"
+        names = ("sample_token", "instance_token", "translation", "size", "rotation")
+        for row in rows(path, "token", *names):
+            thing = things.get(row["instance_token"])
+            kind = None if thing is None else kinds.get(thing["category_token"])
+            if kind is None:
+                raise FramesError(f"{path}: {row['token']} has no instance or category")
+            sample = row["sample_token"]
+            if sample in self.samples and kind["name"].startswith(ROAD_USERS):
+                found.setdefault(sample, []).append(_agent(row, path))
+        return found
+
+    def samples_of(self, scene: Row) -> list[Row]:
+        """Return the samples of a scene in order."""
+        token, found = scene["first_sample_token"], list[Row]()
+        while token:
+            if token not in self.samples or len(found) > len(self.samples):
+                path = self.folder / "sample.json"
+                raise FramesError(f"{path}: {scene['name']} breaks off at {token!r}")
+            found.append(self.samples[token])
+            token = found[-1]["next"]
+        return found
+
+    def agents_of(self, sample: str) -> tuple[Agent, ...] | None:
+        """Return the road users; None where the version has no annotations at all."""
+        return tuple(self._agents.get(sample, ())) if self._agents else None
+
+    def sensor(self, data: Row) -> Row:
+        """Return the calibration of what recorded a row of sample_data."""
+        return self._of(self.sensors, data, "calibrated_sensor")
+
+    def ego(self, data: Row) -> Row:
+        """Return where the vehicle was at a row of sample_data."""
+        return self._of(self.poses, data, "ego_pose")
+
+    def pose_of(self, row: Row) -> Floats:
+        """Return the [4, 4] of a row with translation and rotation."""
+        what = f"{self.folder}: {row['token']}"
+        rotation = matrix_of(row["rotation"], (4,), f"{what}: rotation")
+        translation = matrix_of(row["translation"], (3,), f"{what}: translation")
+        return pose(rotation.tolist(), translation.tolist(), what)
+
+    def _of(self, table: Mapping[str, Row], data: Row, name: str) -> Row:
+        found = table.get(data[f"{name}_token"])
+        if found is None:
+            raise FramesError(
+                f"{self.folder / name}.json: no {data[f'{name}_token']}, which"
+                f" {data['filename']} names"
+            )
+        return found
+
+
+def _agent(row: Row, path: Path) -> Agent:
+    what = f"{path}: {row['token']}"
+    x, y, _ = matrix_of(row["translation"], (3,), what).tolist()
+    width, length, _ = matrix_of(row["size"], (3,), what).tolist()
+    turn = pose(matrix_of(row["rotation"], (4,), what).tolist(), (0, 0, 0), what)
+    return Agent(x, y, math.atan2(turn[1, 0], turn[0, 0]), length, width)
+
+
+def _objects(path: Path) -> Iterator[dict[str, Any]]:
+    decode = json.JSONDecoder().raw_decode
+    with path.open(encoding="utf-8") as file:
+        text, at = file.read(PIECE), 0
+        at = _past(text, at, " \t\r\n")
+        if text[at : at + 1] != "[":
+            raise documents.MalformedError("it does not begin with [")
+        at += 1
+        while True:
+            at = _past(text, at, _SPACE)
+            if text[at : at + 1] == "]":
+                return
+            try:
+                row, at = decode(text, at)
+            except (ValueError, RecursionError) as error:
+                more = file.read(PIECE)
+                if not more or len(text) - at > PIECE:
+                    line = (
+                        f"it breaks off or is malformed behind {text[at : at + 40]!r}"
+                    )
+                    raise documents.MalformedError(line) from error
+                text, at = text[at:] + more, 0
+                continue
+            if not isinstance(row, dict):
+                raise documents.MalformedError(f"{row!r} is not a row")
+            yield row
+
+
+def _past(text: str, at: int, what: str) -> int:
+    while at < len(text) and text[at] in what:
+        at += 1
+    return at

@@ -1,0 +1,70 @@
+"""Pictures of a log as bytes of an image input, and where points of space land there.
+
+Sizes as the published stacks have them: a picture is scaled to the columns of the
+input; what is then too tall loses its upper rows (Lift-Splat, BEVDet, SparseDrive),
+what is too short is padded below when it is fed (mmdetection, UniAD, VAD: 1600 x 900
+at 0.4 is 640 x 360, padded to 384).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.calibration.logs.base import Floats
+from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.errors import FramesError
+
+_JPEG, _PNG = b"\xff\xd8", b"\x89PNG"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture that was read.
+
+    Attributes:
+        planes: uint8 [3, h, w], at most as large as the input.
+        place: [4, 4] pixels of the whole picture to those of the input, both times
+            depth.
+    """
+
+    planes: npt.NDArray[np.uint8]
+    place: Floats
+
+
+def read_picture(path: Path, pixels: PixelInput) -> Picture:
+    """Read a JPEG or PNG and lay it out as an input takes it.
+
+    Raises:
+        FramesError: it is missing, half-written, or no picture.
+    """
+    import cv2  # takes a tenth of a second to import
+
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise FramesError(f"{path}: {error.strerror}") from error
+    if not _is_whole(content):
+        raise FramesError(f"{path}: the picture breaks off, or is no JPEG or PNG")
+    found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    if found is None:
+        raise FramesError(f"{path}: not a readable picture")
+    height, width = found.shape[:2]
+    scale = pixels.columns / width
+    rows = round(height * scale)
+    if (rows, pixels.columns) != (height, width):
+        found = cv2.resize(found, (pixels.columns, rows))
+    above = max(0, rows - pixels.rows)
+    order = slice(None, None, -1) if pixels.order == "rgb" else slice(None)
+    planes = np.moveaxis(found[above:, :, order], -1, 0)
+    place = np.diag([scale, rows / height, 1.0, 1.0])
+    place[1, 2] = -above
+    return Picture(np.ascontiguousarray(planes, np.uint8), place)
+
+
+def _is_whole(content: bytes) -> bool:
+    """Look for the end of the file: OpenCV pads with grey what breaks off."""
+    if content.startswith(_JPEG):  # a thumbnail ends before the picture begins
+        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
+    return content.startswith(_PNG) and b"IEND" in content[-16:]

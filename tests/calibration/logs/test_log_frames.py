@@ -1,0 +1,329 @@
+"""What a known drive, written as nuScenes and as Bench2Drive, is read as."""
+
+import json
+import math
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.logs import LOGS, DriveLog
+from me2e_compress.calibration.logs.log_frames import (
+    InputForm,
+    LoggedInputs,
+    log_frames,
+)
+from me2e_compress.calibration.logs.pictures import Picture, read_picture
+from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.calibration.recording import write_recording
+from me2e_compress.errors import FramesError
+from me2e_compress.runtime.frames import Frame
+from tests.calibration.logs.small_logs import (
+    BEND,
+    CLIP,
+    LIDAR_M,
+    SPEED,
+    YAWS,
+    car_at,
+    pixel,
+    seen_point,
+    write_bench2drive,
+    write_nuscenes,
+)
+
+F32 = np.dtype(np.float32)
+FORMS = {
+    "img": InputForm((1, 6, 3, 64, 80), F32),
+    "lidar2img": InputForm((1, 6, 4, 4), F32),
+    "can_bus": InputForm((18,), F32),
+    "command": InputForm((1,), np.dtype(np.int64)),
+    "timestamp": InputForm((1,), F32),
+    "l2g_r_mat": InputForm((3, 3), F32),
+    "l2g_t": InputForm((3,), F32),
+}
+PIXELS = PixelInput(mean=(0, 0, 0), std=(1, 1, 1), order="rgb", rows=64, columns=80)
+MODEL = LoggedInputs(FORMS, PIXELS)
+"""Half the pictures' 160 x 90, padded to 64 rows."""
+
+MAKERS: dict[str, Callable[[Path], Path]] = {
+    "nuscenes": write_nuscenes,
+    "bench2drive": write_bench2drive,
+}
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return {name: make(tmp_path_factory.mktemp(name)) for name, make in MAKERS.items()}
+
+
+@pytest.fixture(params=MAKERS)
+def log(request: pytest.FixtureRequest, roots: dict[str, Path]) -> DriveLog:
+    name: str = request.param
+    return LOGS.parse(f"{name}:{roots[name]}")
+
+
+def frames(log: DriveLog, model: LoggedInputs = MODEL, count: int = 99) -> list[Frame]:
+    return list(log_frames(log, model, count))
+
+
+def to_lidar(car: np.ndarray) -> np.ndarray:
+    """From the car (x forward, y left) to its lidar (x right, y forward)."""
+    x, y, z = car[:3] - LIDAR_M
+    return np.array([-y, x, z, 1.0])
+
+
+def bright(planes: np.ndarray) -> tuple[float, float]:
+    """Return the middle of what is white."""
+    rows, columns = np.nonzero(planes.mean(axis=0) > 128)
+    return columns.mean() + 0.5, rows.mean() + 0.5
+
+
+@pytest.mark.parametrize("forward_left", [False, True])
+def test_a_point_lands_on_the_pixel_it_was_drawn_at(
+    log: DriveLog, forward_left: bool
+) -> None:
+    frame = frames(log, LoggedInputs(FORMS, PIXELS, forward_left), 1)[0]
+
+    for index, camera in enumerate(YAWS):
+        point = to_lidar(seen_point(camera))
+        if forward_left:
+            point = log.scene(log.chosen()[0])[0].lidar_to_ego @ point
+        u, v, depth, _ = frame.arrays["lidar2img"][0, index] @ point
+        found = bright(frame.arrays["img"][0, index])
+        assert found == pytest.approx((u / depth, v / depth), abs=1.0)
+        assert 2 * u / depth == pytest.approx(pixel(camera)[0], abs=1e-3)
+
+
+def test_pictures_are_bytes_and_what_is_short_is_left_to_pad(log: DriveLog) -> None:
+    image = frames(log, count=1)[0].arrays["img"]
+
+    assert str(image.dtype) == "uint8"
+    assert image.shape == (1, 6, 3, 45, 80)
+
+
+def test_what_is_too_tall_loses_its_upper_rows(log: DriveLog) -> None:
+    short = PIXELS.model_copy(update={"rows": 32})
+    whole = frames(log, count=1)[0].arrays
+    cut = frames(log, LoggedInputs(FORMS, short), 1)[0].arrays
+
+    np.testing.assert_array_equal(cut["img"], whole["img"][..., 13:, :])
+    point = to_lidar(seen_point("CAM_FRONT"))
+    before, after = (each["lidar2img"][0, 0] @ point for each in (whole, cut))
+    assert before[1] / before[2] - after[1] / after[2] == pytest.approx(13, abs=1e-3)
+
+
+def test_frames_are_half_a_second_apart_and_one_scene(log: DriveLog) -> None:
+    found = frames(log)
+
+    assert [each.starts_scene for each in found] == [True, False, False, False]
+    seconds = [each.arrays["timestamp"].item() for each in found]
+    assert seconds == pytest.approx([0, 0.5, 1, 1.5])
+
+
+def test_the_can_bus_holds_changes_since_the_frame_before(log: DriveLog) -> None:
+    first, second = (
+        each.arrays["can_bus"].astype(float) for each in frames(log, count=2)
+    )
+    a, b = car_at(0), car_at(0.5)
+
+    assert (*first[:3], first[17]) == (0, 0, 0, 0)
+    np.testing.assert_allclose(second[:3], [b.x - a.x, b.y - a.y, 0], atol=1e-4)
+    turned = math.degrees(SPEED * BEND * 0.5)
+    assert second[17] == pytest.approx(turned, abs=1e-3)
+    assert second[16] == pytest.approx(b.heading, abs=1e-5)
+    assert (second[3], second[6]) == pytest.approx(
+        (math.cos(b.heading / 2), math.sin(b.heading / 2)), abs=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("nuscenes", {7: 0.1, 8: 0.2, 9: 9.8, 12: SPEED * BEND, 13: SPEED}),
+        ("bench2drive", {7: SPEED, 10: 0.1, 11: 0.2, 12: 9.8, 15: SPEED * BEND}),
+    ],
+)
+def test_the_can_bus_is_filled_as_each_data_set_does(
+    roots: dict[str, Path], text: str, expected: dict[int, float]
+) -> None:
+    like = LOGS.parse(f"{text}:{roots[text]}")
+    other = LOGS.build("nuscenes", {"root": roots["nuscenes"], "layout": text})
+    for log in (like, other):
+        bus = frames(log, count=1)[0].arrays["can_bus"]
+        wanted = {at: expected.get(at, 0.0) for at in range(7, 16)}
+        assert dict(enumerate(bus[7:16].tolist(), 7)) == pytest.approx(wanted, abs=1e-5)
+
+
+def test_no_can_bus_is_zeros(tmp_path: Path) -> None:
+    root = write_nuscenes(tmp_path, 1)
+    (root / "can_bus" / "scene-0001_pose.json").unlink()
+
+    bus = frames(LOGS.parse(f"nuscenes:{root}"))[0].arrays["can_bus"]
+
+    assert not bus[7:16].any()
+
+
+def test_the_lidar_is_placed_in_the_world(log: DriveLog) -> None:
+    arrays = frames(log, count=1)[0].arrays
+    turn = arrays["l2g_r_mat"]
+    turn = turn.T if log.name == "nuscenes" else turn  # UniAD multiplies rows
+    point = to_lidar(seen_point("CAM_FRONT"))[:3]
+
+    expected = car_at(0).to_world @ seen_point("CAM_FRONT")
+    np.testing.assert_allclose(turn @ point + arrays["l2g_t"], expected[:3], atol=1e-3)
+
+
+def test_the_future_is_where_the_car_went(log: DriveLog) -> None:
+    future = frames(log)[0].future
+    assert future is not None
+
+    at_lidar = np.array([*LIDAR_M[:2], 0, 1])
+    back = np.linalg.inv(car_at(0).to_world)
+    for step, waypoint in enumerate(future.waypoints[:3], 1):
+        there = back @ car_at(0.5 * step).to_world @ at_lidar
+        assert waypoint == pytest.approx(to_lidar(there)[:2].tolist(), abs=1e-6)
+    assert future.waypoints[3:] == (None, None, None)
+    assert not future.whole
+    assert future.forward == pytest.approx(math.pi / 2)
+
+
+def test_the_others_are_boxes_in_the_frame_of_the_plan(log: DriveLog) -> None:
+    future = frames(log)[0].future
+    assert future is not None
+    assert future.agents is not None
+
+    car = future.agents[1][0]
+    back = np.linalg.inv(car_at(0).to_world)
+    there = car_at(1.0).to_world @ [8.0, 0, 0, 1]
+    assert car[:2] == pytest.approx(to_lidar(back @ there)[:2].tolist(), abs=1e-5)
+    assert car[2] == pytest.approx(math.pi / 2 + SPEED * BEND)
+    assert car[3:] == pytest.approx((4.5, 1.9))
+    names = {"nuscenes": 1, "bench2drive": 2}  # no barrier; a walker, nobody above
+    assert len(future.agents[0]) == names[log.name]
+
+
+def test_the_ego_stands_around_its_centre(roots: dict[str, Path]) -> None:
+    future = frames(LOGS.parse(f"nuscenes:{roots['nuscenes']}"))[0].future
+
+    assert future is not None
+    assert future.ego == (4.084, 1.85)
+    assert future.centre == pytest.approx((0.0, 0.5))
+
+
+@pytest.mark.parametrize(("layout", "left"), [("nuscenes", 1), ("bench2drive", 0)])
+def test_the_command_follows_what_the_car_did(
+    tmp_path: Path, layout: str, left: int
+) -> None:
+    root = write_nuscenes(tmp_path, 8)
+    log = LOGS.build("nuscenes", {"root": root, "layout": layout})
+    straight = {"nuscenes": 2, "bench2drive": 3}[layout]
+
+    found = [each.arrays["command"].item() for each in frames(log)]
+
+    # 18 m of the bend are 4.7 m to the left, 12 m are 2.1 m, 6 m are 0.5 m
+    assert found == [left] * 4 + [straight] * 4
+
+
+def test_bench2drive_gives_its_command(roots: dict[str, Path]) -> None:
+    log = LOGS.parse(f"bench2drive:{roots['bench2drive']}")
+    assert frames(log, count=1)[0].arrays["command"].item() == 3
+
+
+def test_scenes_cameras_and_every_nth_are_chosen(tmp_path: Path) -> None:
+    write_bench2drive(tmp_path, 4)
+    options = {
+        "root": tmp_path,
+        "scenes": [CLIP],
+        "cameras": ["CAM_BACK", "CAM_FRONT"],
+        "every": 2,
+    }
+    form = {"img": InputForm((2, 3, 45, 80), F32)}
+
+    found = frames(LOGS.build("bench2drive", options), LoggedInputs(form, PIXELS))
+
+    assert len(found) == 2
+    assert found[0].arrays["img"].shape == (2, 3, 45, 80)
+    away = [bright(planes) for planes in found[0].arrays["img"]]
+    assert away[1] == pytest.approx([each / 2 for each in pixel("CAM_FRONT")], abs=1)
+
+
+def test_pictures_are_read_when_their_frame_is_asked_for(
+    log: DriveLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[Path]()
+
+    def read(path: Path, pixels: PixelInput) -> Picture:
+        asked.append(path)
+        return read_picture(path, pixels)
+
+    monkeypatch.setattr(f"{log_frames.__module__}.read_picture", read)
+
+    list(islice(log_frames(log, MODEL, 99), 2))
+
+    assert len(asked) == 12
+
+
+def test_it_goes_on_with_a_scene(tmp_path: Path) -> None:
+    for name in ("b", "a"):
+        write_bench2drive(tmp_path / name, 2)
+    log = LOGS.parse(f"bench2drive:{tmp_path}")
+
+    found = list(log_frames(log, MODEL, 2, 1, done=1, first=1))
+
+    assert [(each.index, each.place, each.starts_scene) for each in found] == [
+        (1, 1, True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ({"state": InputForm((1, 9), F32)}, "input state is not made from a log;.*img"),
+        (
+            {"img": InputForm((1, 1, 3, 64, 80), F32)},
+            r"img takes 1 cameras, the log gives 6: name them \(cameras=\[CAM_FRONT",
+        ),
+        ({"img": InputForm((1, 6, 3, 64, 80), np.dtype(np.uint8))}, "img is uint8"),
+        ({"l2g_t": InputForm((1, 4), F32)}, r"l2g_t takes \[1, 4\], a log gives \[3\]"),
+    ],
+)
+def test_what_a_log_cannot_feed_is_named(
+    roots: dict[str, Path], form: dict[str, InputForm], message: str
+) -> None:
+    log = LOGS.parse(f"nuscenes:{roots['nuscenes']}")
+    with pytest.raises(FramesError, match=message):
+        frames(log, LoggedInputs(form, PIXELS if "img" in form else None), 1)
+
+
+def test_a_future_is_written_and_read_again(log: DriveLog, tmp_path: Path) -> None:
+    made = frames(log)
+    pixels = {"img": PIXELS}
+    folder = write_recording(tmp_path / "f", lambda _: iter(made), {}, pixels=pixels)
+
+    assert [each.future for each in CalibrationSet(folder)] == [x.future for x in made]
+    write_recording(folder, lambda _: iter(made[:1]), {}, pixels=pixels)
+    assert not (folder / "000001.future.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 2}, "000000.future.json: not a recorded future: version"),
+        ({"ego": [1]}, "000000.future.json: not a recorded future: ego"),
+    ],
+)
+def test_a_malformed_future_is_named(
+    roots: dict[str, Path], tmp_path: Path, change: dict[str, object], message: str
+) -> None:
+    made = frames(LOGS.parse(f"nuscenes:{roots['nuscenes']}"), count=1)
+    folder = write_recording(
+        tmp_path / "f", lambda _: iter(made), {}, pixels={"img": PIXELS}
+    )
+    path = folder / "000000.future.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+
+    with pytest.raises(FramesError, match=message):
+        _ = CalibrationSet(folder)[0]

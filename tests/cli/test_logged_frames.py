@@ -1,0 +1,110 @@
+"""``frames --from``: recorded driving as the frames of a stack or a file."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.zoo.stacks import VAD_TINY
+from tests.calibration.logs.small_logs import write_bench2drive, write_nuscenes
+from tests.cli.conftest import Command, strict
+from tests.docs.documents import faults
+
+FRONT = """
+<ir_version: 9, opset_import: ["" : 17]>
+front (float[1,1,3,H,80] img, float[1,1,4,4] lidar2img, float[1,2] prev_memory)
+    => (float[1,1,3,H,80] plan, float[1,2] prev_memory_out)
+{
+    plan = Relu(img)
+    prev_memory_out = Relu(prev_memory)
+}
+"""
+IMAGE = {"mean": [100, 110, 120], "std": [1, 1, 1], "order": "bgr"}
+
+
+@pytest.fixture
+def front(tmp_path: Path) -> Path:
+    model = ir.from_onnx_text(FRONT)
+    model.metadata_props["me2e.image"] = json.dumps(IMAGE)
+    graph.save(model, tmp_path / "front.onnx")
+    return tmp_path / "front.onnx"
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("nuscenes", write_nuscenes), ("bench2drive", write_bench2drive)],
+)
+def test_a_log_becomes_frames_of_vad(
+    command: Command,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    write: Callable[[Path, int], Path],
+) -> None:
+    log = f"{name}:{write(tmp_path / 'log', 2)}"
+    words = ("frames", "vad-tiny", "--from", log, "-o", tmp_path / "out", "--json")
+
+    assert command(*words) == 0
+
+    found = strict(capsys.readouterr().out)
+    assert faults("frames", found) == []
+    count = {"nuscenes": 2, "bench2drive": 1}[name]
+    assert (found["frames"], found["seed"]) == (count, None)
+    recording = CalibrationSet(tmp_path / "out")
+    arrays = recording[0].arrays
+    image = arrays["img"].astype(float)
+    assert {each: array.shape for each, array in arrays.items()} == {
+        each: VAD_TINY.inputs[each] for each in ("img", "lidar2img", "can_bus")
+    }
+    black = -np.array(VAD_TINY.image.mean) / VAD_TINY.image.std
+    np.testing.assert_allclose(image[0, 0, :, 0, 0], black, rtol=1e-5)
+    assert not image[0, 0, :, 360:].any()
+
+
+def test_a_file_with_one_camera_sees_it_alone(
+    command: Command, tmp_path: Path, front: Path
+) -> None:
+    root = write_nuscenes(tmp_path / "log", 1)
+    log = f"nuscenes{{root={root}, cameras=[CAM_FRONT], size=[48, 80]}}"
+
+    assert command("frames", front, "--from", log, "-o", tmp_path / "out") == 0
+
+    frame = CalibrationSet(tmp_path / "out")[0]
+    assert list(frame.arrays) == ["img", "lidar2img"]
+    assert frame.arrays["img"][0, 0, :, 0, 0].tolist() == [-100, -110, -120]
+    assert frame.future is not None
+    assert frame.future.forward == pytest.approx(0.0)  # as the policy contract sees
+
+
+@pytest.mark.parametrize(
+    ("model", "log", "message"),
+    [
+        ("tcp", "nuscenes:{root}", "input state is not made from a log"),
+        ("front.onnx", "nuscenes:{root}", "img is [None, 80], an open size: give it"),
+        ("vad-tiny", "kitti:{root}", "no driving log 'kitti'; there are nuscenes"),
+        ("nothing", "nuscenes:{root}", "no stack 'nothing' in the zoo"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(
+    command: Command,
+    tmp_path: Path,
+    front: Path,
+    capsys: pytest.CaptureFixture[str],
+    model: str,
+    log: str,
+    message: str,
+) -> None:
+    root = write_nuscenes(tmp_path / "log", 1)
+    stack = front if model == front.name else model
+    words = ("--from", log.format(root=root), "-o", tmp_path / "out")
+
+    assert command("frames", stack, *words) == 1
+
+    shown = " ".join(capsys.readouterr().err.split())
+    assert message in shown
+    assert not (tmp_path / "out").exists()
