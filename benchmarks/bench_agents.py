@@ -32,12 +32,12 @@ import onnx
 
 from benchmarks.zoo_stubs import Network, RoadOption, install
 from me2e_compress.agents import graph_agent, real_time
-from me2e_compress.driving.adapter import Adapter, Axes
+from me2e_compress.driving.adapter import Axes
 from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
 from tests.agents.small_leaderboard import SAVE_NAME, World, gps_of
 
-LIDAR = Adapter(axes=Axes.RIGHT_FORWARD)
+LIDAR = Axes.RIGHT_FORWARD
 ROUTE = [
     (float(x), 0.01 * x * x, RoadOption.RIGHT if x > 40 else RoadOption.LANEFOLLOW)
     for x in range(120)

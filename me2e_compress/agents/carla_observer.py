@@ -17,8 +17,9 @@ from me2e_compress.agents.carla_interface import SensorData
 from me2e_compress.agents.carla_rig import GPS, IMU, SPEED, CarlaRig, Triple
 from me2e_compress.agents.geo_reference import GeoReference
 from me2e_compress.agents.route_follower import RouteFollower
-from me2e_compress.driving.can_bus import EgoKinematics, can_bus_between
+from me2e_compress.driving.can_bus import can_bus_between
 from me2e_compress.driving.contract import Observation
+from me2e_compress.driving.ego_kinematics import EgoKinematics
 from me2e_compress.errors import MissingExtraError
 
 if find_spec("cv2") is None:
@@ -37,11 +38,13 @@ class CarlaReading:
         motion: Of the ego.
         command: Where the route goes next, 0 to 5.
         node: The next node of the route, metres to the right and forward.
+        node_after: The one after it; at the end of the route the same.
     """
 
     motion: EgoKinematics
     command: int
     node: tuple[float, float]
+    node_after: tuple[float, float]
 
 
 class Preprocessing(Protocol):
@@ -100,10 +103,10 @@ class RouteReader:
             (-imu[3], -imu[4], -imu[5]),
         )
         place, command = self._follower.next(x, y)
-        east, north = place - (x, y)
+        nodes = np.stack([place, self._follower.after_next]) - (x, y)
         sin, cos = math.sin(heading), math.cos(heading)
-        node = (east * sin - north * cos, east * cos + north * sin)
-        return CarlaReading(motion, command, node)
+        near, far = nodes @ np.array([[sin, cos], [-cos, sin]])
+        return CarlaReading(motion, command, (near[0], near[1]), (far[0], far[1]))
 
 
 @dataclass
@@ -143,6 +146,8 @@ class CarlaObserver:
             can_bus,
             reading.command,
             reading.motion.speed_mps,
+            motion=reading.motion,
+            target_points=_ego_frame(reading.node, reading.node_after),
         )
 
     def _images(self, sensors: SensorData) -> Images:
@@ -163,3 +168,8 @@ class CarlaObserver:
         taken[:] = self.fill
         taken[:rows, :columns] = smaller
         return taken
+
+
+def _ego_frame(*places: tuple[float, float]) -> npt.NDArray[np.float32]:
+    """Return [n, 2] of places that lie so many metres to the right and forward."""
+    return np.array([(forward, -right) for right, forward in places], np.float32)

@@ -54,6 +54,12 @@ class RouteFollower:
         index = min(self._at + 1, len(self._places) - 1)
         return self._places[index], command_of(self._options[index])
 
+    @property
+    def after_next(self) -> npt.NDArray[np.float64]:
+        """Return the node after the one that `next` told last, float64 [2]."""
+        after: npt.NDArray[np.float64] = self._places[self._at :][:3][-1]
+        return after
+
 
 def command_of(option: Any) -> int:
     """Return the command 0 to 5 of a RoadOption: 1 to 6, or -1 for none."""

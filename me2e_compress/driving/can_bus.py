@@ -1,35 +1,12 @@
 """The CAN bus of an observation: how the ego moves, and moved since it last decided."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.driving.contract import CAN_BUS_SIZE
-
-Triple = tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class EgoKinematics:
-    """Where the ego is and how it moves, in a right-handed world (x east, y north).
-
-    Args:
-        x: Metres.
-        y: Metres.
-        heading: Radians counter-clockwise from east.
-        speed_mps: Forward.
-        acceleration_mps2: In the ego frame.
-        angular_velocity_radps: In the ego frame.
-    """
-
-    x: float
-    y: float
-    heading: float
-    speed_mps: float
-    acceleration_mps2: Triple
-    angular_velocity_radps: Triple
+from me2e_compress.driving.ego_kinematics import EgoKinematics
 
 
 def can_bus_between(

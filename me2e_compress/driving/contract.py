@@ -37,6 +37,7 @@ from typing import ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.driving.ego_kinematics import EgoKinematics
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.trajectory import Trajectory
 
@@ -149,6 +150,12 @@ class Observation:
         speed_mps: The ego's speed.
         scene: Ground truth at this instant; None unless `Policy.privileged`.
         world: The world itself; None unless `Policy.privileged`.
+        motion: Where the ego is and how it moves, as its own sensors tell; None where
+            a simulator does not say. The CAN bus alone has no place.
+        target_points: float32 [2, 2], the next node of the route's sparse plan and the
+            one after it, metres in the ego frame; None where a simulator has none.
+            Nodes are at most 50 m apart, and the next is at least 4 m ahead, as in the
+            route planner of Bench2Drive's agents.
     """
 
     time_us: int
@@ -159,6 +166,8 @@ class Observation:
     speed_mps: float
     scene: SceneView | None = None
     world: WorldView | None = None
+    motion: EgoKinematics | None = None
+    target_points: npt.NDArray[np.float32] | None = None
 
 
 class Policy(Protocol):

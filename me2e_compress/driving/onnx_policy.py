@@ -96,20 +96,21 @@ class OnnxPolicy:
     @property
     def needs_images(self) -> bool:
         """Whether the model has an image input."""
-        return self.normalization is not None
+        return bool(self.inputs.images)
 
     @property
     def normalization(self) -> ImageNormalization | None:
-        """How the images are normalised; None without an image input."""
+        """How the images are normalised; None where they are not."""
         return self.inputs.normalization
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the images."""
+        """Rows and columns in which the cameras are rendered."""
         return self.inputs.image_size
 
     def reset(self, route: RouteInfo | None) -> None:
         """Begin a route: recurrent inputs are zeros again."""
+        self.inputs.reset()
         self._state = {
             name: zeros(name, self.session.inputs[name]) for name in self.recurrent
         }

@@ -2,11 +2,10 @@ import numpy as np
 import pytest
 
 from me2e_compress.agents.carla_rig import BENCH2DRIVE_CAMERAS, CarlaRig
-from me2e_compress.driving.adapter import Adapter, Axes
+from me2e_compress.driving.adapter import Axes
 
 LIDAR_M = (-0.39, 0.0, 1.84)
 FULL = CarlaRig(BENCH2DRIVE_CAMERAS, (1600, 900), (900, 1600))
-LIDAR = Adapter(axes=Axes.RIGHT_FORWARD)
 
 ZOO = {
     0: [
@@ -35,7 +34,7 @@ ZOO = {
 
 @pytest.mark.parametrize("camera", ZOO)
 def test_cameras_project_as_bench2drives_agents_have_it(camera: int) -> None:
-    found = LIDAR.projection(FULL.lidar2img(LIDAR_M))[camera]
+    found = Axes.RIGHT_FORWARD.projection(FULL.lidar2img(LIDAR_M))[camera]
 
     np.testing.assert_allclose(found[:3], ZOO[camera], atol=1e-3)
 

@@ -100,6 +100,36 @@ def test_a_model_is_told_what_the_contract_says(board: Leaderboard, echo: Path) 
     assert bus[10:] == pytest.approx((3.0, 0.15))
 
 
+AIMS = """
+axes = "forward-right"
+[feeds.aims]
+parts = [{ source = "target-point" }, { source = "target-point", which = "far" }]
+"""
+
+
+def test_a_model_is_told_what_to_aim_at(board: Leaderboard, tmp_path: Path) -> None:
+    """Nodes every 20 m to the east, 2 m to the right of where it starts."""
+    model = straight_on(
+        tmp_path / "m.onnx",
+        inputs="float[4] aims",
+        body="some = Gather (aims, picked) plan = Reshape (some, plan_shape)",
+        initializers=""", int64[3] plan_shape = {1, 6, 2},
+            int64[12] picked = {0, 1, 2, 3, 0, 0, 0, 0, 0, 0, 0, 0}""",
+    )
+    (tmp_path / "a.toml").write_text(AIMS)
+    conf = tmp_path / "graph.toml"
+    conf.write_text(f'model = "{model}"\nadapter = "{tmp_path / "a.toml"}"')
+    board.noise = 0.0
+    route = [(20.0 * k, 2.0, RoadOption.LANEFOLLOW) for k in range(1, 6)]
+    agent = board.make(graph_agent, f"{conf}+{SAVE_NAME}", route)
+    found = heard(agent)
+
+    board.run(agent, 4)  # in the first frames there is no compass
+
+    # as a plan, so to the left
+    np.testing.assert_allclose(found[-1][:4], [40.0, -2.0, 60.0, -2.0], atol=2.0)
+
+
 def test_the_first_decision_has_nothing_before_it(
     board: Leaderboard, echo: Path
 ) -> None:

@@ -8,12 +8,13 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from me2e_compress import documents
-from me2e_compress.driving.adapter.axes import Axes
+from me2e_compress.driving.adapter.feeds import Feed
+from me2e_compress.driving.adapter.image_inputs import ImageInput
 from me2e_compress.driving.adapter.images import ImageNormalization
+from me2e_compress.driving.axes import Axes
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 
-Floats: TypeAlias = npt.NDArray[np.float32]
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]
 
 
@@ -23,16 +24,20 @@ class Adapter(BaseModel):
     Attributes:
         inputs: The contract's name (img, lidar2img, can_bus, command, timestamp) to
             the graph's.
+        feeds: What each other input of the graph is made of, by its name.
+        images: What each image input shows, by its name.
         recurrent: Recurrent input to the output that answers it.
         plan: Which output is the plan, whether it holds steps, which mode is taken;
             ``command_input = "command"`` lets the navigator's command pick it.
-        image: Normalisation.
+        image: Normalisation of image inputs that have none of their own.
         axes: Ground frame of the model.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     inputs: dict[Contract, str] = {}
+    feeds: dict[str, Feed] = {}
+    images: dict[str, ImageInput] = {}
     recurrent: dict[str, str] | None = None
     plan: PlanAdapter | None = None
     image: ImageNormalization | None = None
@@ -54,13 +59,8 @@ class Adapter(BaseModel):
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
-            raise EvaluationError(f"{path}: adapter {where}: {first['msg']}") from error
-
-    def projection(self, lidar2img: Floats) -> Floats:
-        """Turn [6, 4, 4] of the ego frame into that of the model's frame."""
-        turn = np.eye(4)
-        turn[:3, :3] = self.axes.to_ego
-        return np.asarray(lidar2img @ turn, np.float32)
+            words = first["msg"].removeprefix("Value error, ")
+            raise EvaluationError(f"{path}: adapter {where}: {words}") from error
 
     def to_ego(self, waypoints: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Turn [n, 2] waypoints of the model's frame into the ego frame."""

@@ -1,31 +1,40 @@
 """An observation laid out as the inputs of a graph."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, field
+from typing import Literal, Self
 
 import numpy as np
 
 from me2e_compress.driving.adapter.adapter import Adapter
+from me2e_compress.driving.adapter.feeds import Feed
+from me2e_compress.driving.adapter.image_inputs import (
+    CAMERA_NAMES,
+    ImageInput,
+    ImagePort,
+    rendered_size,
+)
 from me2e_compress.driving.adapter.images import ImageNormalization
+from me2e_compress.driving.adapter.input_images import InputImages
 from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
-from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape, fed, fits, image_size
+from me2e_compress.driving.ego_kinematics import EgoKinematics
+from me2e_compress.driving.ego_track import EgoTrack
+from me2e_compress.driving.input_sources import INPUT_SOURCES, Observed
+from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape, fed, fits
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, SessionPort
 
-CAMERAS = 6
-CONTRACT: Mapping[str, Shape] = {
-    "img": (CAMERAS, 3, None, None),
-    "lidar2img": (CAMERAS, 4, 4),
-    "can_bus": (CAN_BUS_SIZE,),
-    "command": (),
-    "timestamp": (),
+IMAGES: Literal["img"] = "img"
+CONTRACT: Mapping[str, str] = {
+    "lidar2img": "lidar2img",
+    "can_bus": "can-bus",
+    "command": "command",
+    "timestamp": "timestamp",
 }
-"""Inputs of the contract without their batch dimension, which is one or open."""
+"""Inputs of the contract that are no images, to what feeds them."""
 
-MICROSECONDS = 1_000_000
-"""In a second."""
+BYTES = "tensor(uint8)"
 
 
 @dataclass(frozen=True)
@@ -35,16 +44,17 @@ class ModelInputs:
     Attributes:
         ports: Of the graph.
         adapter: How they relate to the contract.
-        names: The graph's name for each input of the contract.
-        normalization: Of the images; None without an image input.
-        image_size: Rows and columns of the images.
+        images: Image inputs, by the graph's name.
+        given: The other ones.
+        image_size: Rows and columns in which the cameras are rendered.
     """
 
     ports: Mapping[str, SessionPort]
     adapter: Adapter
-    names: Mapping[str, str]
-    normalization: ImageNormalization | None
+    images: Mapping[str, InputImages]
+    given: Mapping[str, Feed]
     image_size: tuple[int, int]
+    _track: EgoTrack = field(default_factory=EgoTrack, init=False)
 
     @classmethod
     def of(
@@ -58,88 +68,148 @@ class ModelInputs:
             recurrent: Recurrent input to the output that answers it.
 
         Raises:
-            EvaluationError: Naming the first port that is missing, unknown, or of a
-                shape or type that cannot be fed.
+            EvaluationError: Naming the first port that is missing, unknown, fed by
+                nothing, or of a shape or type that cannot be fed.
         """
-        names = {ours: ours for ours in CONTRACT} | {**adapter.inputs}
-        check_inputs(session.inputs, session.outputs, names, recurrent)
-        image = session.inputs.get(names["img"])
-        found = None
-        if image is not None:
-            found = adapter.image or ImageNormalization.of(session.metadata)
-        size = DEFAULT_IMAGE_SIZE if image is None else image_size(image)
-        return cls(session.inputs, adapter, names, found, size)
+        ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
+        _check_names(session, adapter, recurrent)
+        tables, given = _tables(adapter, ports), _given(adapter, ports)
+        for name in ports:
+            if name not in tables and name not in given:
+                raise EvaluationError(_unfed(name))
+        images, size = _images(session, adapter, tables)
+        found = cls(session.inputs, adapter, images, given, size)
+        found._check()
+        return found
+
+    @property
+    def normalization(self) -> ImageNormalization | None:
+        """How the first image input is normalised; None where it is not."""
+        found = (each.normalization for each in self.images.values())
+        return next(found, None)
+
+    def reset(self) -> None:
+        """Begin a route: nothing was before."""
+        self._track.clear()
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
-        """Lay an observation out as the graph takes it.
+        """Lay an observation out as the graph takes it; call it once a decision.
 
         Raises:
-            EvaluationError: It needs images and there are none.
+            EvaluationError: It lacks what an input is made of.
         """
-        arrays: dict[str, Array] = {
-            "lidar2img": self.adapter.projection(observation.lidar2img),
-            "can_bus": observation.can_bus,
-            "command": np.asarray(observation.command),
-            "timestamp": np.asarray(observation.time_us / MICROSECONDS),
-        }
-        if self.normalization is not None:
+        arrays: dict[str, Array] = {}
+        if self.images:
             if observation.images is None:
                 raise EvaluationError("the model needs images, and none were rendered")
-            arrays["img"] = self.normalization.apply(observation.images)
-        return {
-            self.names[ours]: fed(array, self.ports[self.names[ours]])
-            for ours, array in arrays.items()
-            if self.names[ours] in self.ports
-        }
+            for name, each in self.images.items():
+                arrays[name] = each.apply(observation.images)
+        self._track.note(observation.time_us, observation.motion)
+        seen = self._seen(observation)
+        arrays |= {name: feed.value(seen) for name, feed in self.given.items()}
+        return {name: fed(array, self.ports[name]) for name, array in arrays.items()}
 
     def nothing(self, command: int) -> Observation:
         """Return an observation of zeros, for a dry run."""
+        still = (0.0, 0.0, 0.0)
         return Observation(
             0,
-            np.zeros((CAMERAS, *self.image_size, 3), np.uint8),
-            np.tile(np.eye(4, dtype=np.float32), (CAMERAS, 1, 1)),
+            np.zeros((len(CAMERA_NAMES), *self.image_size, 3), np.uint8),
+            np.tile(np.eye(4, dtype=np.float32), (len(CAMERA_NAMES), 1, 1)),
             np.zeros(CAN_BUS_SIZE, np.float32),
             command,
             0.0,
+            motion=EgoKinematics(0.0, 0.0, 0.0, 0.0, still, still),
+            target_points=np.zeros((2, 2), np.float32),
         )
 
+    def _seen(self, observation: Observation) -> Observed:
+        lidar2img = observation.lidar2img
+        projections = {
+            name: each.projections(lidar2img) for name, each in self.images.items()
+        }
+        return Observed(
+            observation,
+            self.adapter.axes,
+            self._track,
+            projections or {"": lidar2img},
+        )
 
-def check_inputs(
-    inputs: Mapping[str, SessionPort],
-    outputs: Mapping[str, SessionPort],
-    names: Mapping[str, str],
-    recurrent: Mapping[str, str],
+    def _check(self) -> None:
+        """Hold what every input is fed against its port."""
+        nothing = self.nothing(0)
+        self._track.note(0, nothing.motion)
+        seen = self._seen(nothing)
+        for name, feed in self.given.items():
+            try:
+                array, sizes = feed.value(seen), feed.sizes(seen)
+            except EvaluationError as error:
+                raise EvaluationError(f"input {name}: {error}") from error
+            _check_fed(name, self.ports[name], array, sizes if feed.joined else "")
+        self._track.clear()
+
+
+def _tables(
+    adapter: Adapter, ports: Mapping[str, SessionPort]
+) -> dict[str, ImageInput]:
+    """Return what each image input shows: as the adapter says, and the contract's."""
+    usual = adapter.inputs.get(IMAGES, IMAGES)
+    if usual in ports and usual not in {**adapter.images, **adapter.feeds}:
+        return {usual: ImageInput(), **adapter.images}
+    return dict(adapter.images)
+
+
+def _given(adapter: Adapter, ports: Mapping[str, SessionPort]) -> dict[str, Feed]:
+    """Return how each other input is fed: as the adapter says, and the contract's."""
+    named = {**adapter.images, **adapter.feeds}
+    usual = {ours: ours for ours in CONTRACT} | {**adapter.inputs}
+    return {
+        usual[ours]: Feed.by(INPUT_SOURCES.build(source, {}))
+        for ours, source in CONTRACT.items()
+        if usual[ours] in ports and usual[ours] not in named
+    } | adapter.feeds
+
+
+def _images(
+    session: Session, adapter: Adapter, tables: Mapping[str, ImageInput]
+) -> tuple[dict[str, InputImages], tuple[int, int]]:
+    """Return the image inputs, and the size in which the cameras are rendered."""
+    ports = {
+        name: ImagePort.of(name, session.inputs[name].shape, table)
+        for name, table in tables.items()
+    }
+    sizes = [rendered_size(name, tables[name], port) for name, port in ports.items()]
+    rows, columns = zip(*(sizes or [DEFAULT_IMAGE_SIZE]), strict=True)
+    rendered = max(rows), max(columns)
+    found: dict[str, InputImages] = {}
+    for name, table in tables.items():
+        norm = None
+        if session.inputs[name].type != BYTES:
+            usual = adapter.image
+            if usual is None and table.mean is None:
+                usual = ImageNormalization.of(session.metadata)
+            norm = table.normalization(name, usual)
+        found[name] = InputImages(table, ports[name], rendered, norm)
+    return found, rendered
+
+
+def _check_names(
+    session: Session, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> None:
-    """Check the inputs of a graph against the contract.
-
-    Args:
-        inputs: Of the graph.
-        outputs: Of the graph.
-        names: The graph's name for each input of the contract.
-        recurrent: Recurrent input to the output that answers it.
-
-    Raises:
-        EvaluationError: Naming the first port that is missing, unknown, or of a shape
-            or type that cannot be fed.
-    """
-    contract = {names[ours]: ours for ours in CONTRACT}
-    for name in recurrent:
-        _exists(name, inputs, "input")
-        _exists(recurrent[name], outputs, "output")
-    for ours, name in names.items():
+    """Check that what the adapter names is there, and named once."""
+    for name, answer in recurrent.items():
+        _exists(name, session.inputs, "input")
+        _exists(answer, session.outputs, "output")
+    for ours, name in adapter.inputs.items():
         if name != ours:
-            _exists(name, inputs, "input")
-    for name, port in inputs.items():
+            _exists(name, session.inputs, "input")
+    for name in (*adapter.images, *adapter.feeds):
+        _exists(name, session.inputs, "input")
+        if name in recurrent or (name in adapter.images and name in adapter.feeds):
+            raise EvaluationError(f"the adapter feeds input {name} in two ways")
+    for name, port in session.inputs.items():
         if port.type not in DTYPES:
             raise EvaluationError(f"input {name} is {port.type}: it cannot be fed")
-        if name in recurrent:
-            continue
-        if name not in contract:
-            raise EvaluationError(
-                f"input {name} is none of {', '.join(CONTRACT)}, and no output is "
-                "known to feed it"
-            )
-        _check_shape(name, port.shape, CONTRACT[contract[name]])
 
 
 def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
@@ -149,12 +219,29 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
         )
 
 
-def _check_shape(name: str, found: Shape, wanted: Shape) -> None:
-    batch = found[: max(0, len(found) - len(wanted))]
+def _unfed(name: str) -> str:
+    """Say what could feed an input."""
+    return (
+        f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output is known"
+        f" to feed it back, and the adapter has no [feeds.{name}] (sources:"
+        f" {', '.join(INPUT_SOURCES.names())}) or [images.{name}]"
+    )
+
+
+def _check_fed(name: str, port: SessionPort, array: Array, sizes: str) -> None:
+    """Check that an array fits a port, which may have a batch of one before it."""
+    found: Shape = port.shape
+    batch = found[: max(0, len(found) - array.ndim)]
     if any(isinstance(side, int) and side != 1 for side in batch) or not fits(
-        found[len(batch) :], wanted
+        found[len(batch) :], array.shape
     ):
-        must = [1, *("any" if side is None else side for side in wanted)]
+        must = [1, *array.shape]
         raise EvaluationError(
             f"input {name} has shape {list(found)}, it must be {must}"
+            + (f": it is {sizes}" if sizes else "")
+        )
+    wanted = DTYPES[port.type]
+    if not np.can_cast(array.dtype, wanted, "same_kind"):
+        raise EvaluationError(
+            f"input {name} is {port.type}, and what feeds it {array.dtype}"
         )

@@ -106,6 +106,7 @@ def _look(
     cameras = Cameras(texture, rig) if policy.needs_images else None
     driver = ObservationBuilder(world, expert, rig, None)
     passenger = ObservationBuilder(world, policy, rig, cameras)
+    policy.reset(route)
     scene = world.scene()
     while count and rules.ending(world, scene.ego.speed_mps) is None:
         since_us = scene.time_us - begin_us

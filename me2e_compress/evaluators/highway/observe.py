@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.can_bus import EgoKinematics, can_bus_between
+from me2e_compress.driving.can_bus import can_bus_between
 from me2e_compress.driving.contract import Observation, Policy
+from me2e_compress.driving.ego_kinematics import EgoKinematics
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.route_nodes import RouteNodes
 from me2e_compress.simulator.cameras import CameraRig, Cameras
 from me2e_compress.simulator.scene import ActorKind, Ego, Scene
 from me2e_compress.simulator.world import World
@@ -30,6 +32,11 @@ class ObservationBuilder:
     rig: CameraRig
     cameras: Cameras | None
     _last: Ego | None = field(default=None, init=False)
+    _nodes: RouteNodes = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Lay the nodes of the route."""
+        self._nodes = RouteNodes.along(self.world.path)
 
     def observe(self, scene: Scene) -> Observation:
         """Return what the policy sees at this scene; call it once a decision.
@@ -48,6 +55,8 @@ class ObservationBuilder:
             scene.ego.speed_mps,
             scene if self.policy.privileged else None,
             self.world if self.policy.privileged else None,
+            motion_of(scene.ego),
+            self._nodes.ahead(self.world.ego_s, scene.ego),
         )
 
 
@@ -92,10 +101,11 @@ def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
 
 def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:
     """Return float32 [18], see `Observation`; ``last`` is the ego a decision ago."""
-    return can_bus_between(_motion(ego), None if last is None else _motion(last))
+    return can_bus_between(motion_of(ego), None if last is None else motion_of(last))
 
 
-def _motion(ego: Ego) -> EgoKinematics:
+def motion_of(ego: Ego) -> EgoKinematics:
+    """Return the ego's place and motion."""
     return EgoKinematics(
         ego.x,
         ego.y,

@@ -229,7 +229,7 @@ def test_the_projection_is_turned_with_the_axes() -> None:
     ego = np.array([12.0, -3.0, 1.0, 1.0])
     lidar = np.array([3.0, 12.0, 1.0, 1.0])
 
-    turned = Adapter(axes=Axes.RIGHT_FORWARD).projection(RIG.lidar2img)
+    turned = Axes.RIGHT_FORWARD.projection(RIG.lidar2img)
 
     assert turned.dtype == np.float32
     assert turned @ lidar == pytest.approx(RIG.lidar2img @ ego, rel=1e-5)

@@ -1,0 +1,143 @@
+"""One input of a graph, made of input sources."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, model_validator
+
+from me2e_compress.driving.input_sources import INPUT_SOURCES, InputSource, Observed
+from me2e_compress.driving.input_sources.navigation import NavigationCommand
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.frames import Array
+
+Levels = float | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class FeedPart:
+    """A source, normalised: (value - mean) / std.
+
+    Attributes:
+        source: What it is made of.
+        mean: One number, or as many as the last dimension has.
+        std: The same.
+    """
+
+    source: InputSource
+    mean: Levels = 0.0
+    std: Levels = 1.0
+
+    @classmethod
+    def read(cls, table: dict[str, Any]) -> Self:
+        """Make it of a table: source, mean, std, and the source's own options.
+
+        Raises:
+            ValueError: It names no source, or one that does not exist, or a wrong
+                option.
+        """
+        options = dict(table)
+        name = options.pop("source", None)
+        if not isinstance(name, str):
+            names = ", ".join(INPUT_SOURCES.names())
+            raise ValueError(f"no source is named; there are {names}")
+        mean = _levels("mean", options.pop("mean", 0.0))
+        std = _levels("std", options.pop("std", 1.0))
+        if not np.all(std):
+            raise ValueError(f"{name}: std is zero")
+        try:
+            return cls(INPUT_SOURCES.build(name, options), mean, std)
+        except EvaluationError as error:
+            raise ValueError(str(error)) from error
+
+    def value(self, seen: Observed) -> Array:
+        """Return it, of the source's shape.
+
+        Raises:
+            EvaluationError: The observation does not tell it, or there are not as many
+                means as numbers.
+        """
+        array = self.source.value(seen)
+        if self.mean == 0.0 and self.std == 1.0:
+            return array
+        try:
+            scaled: Array = (array - np.array(self.mean)) / np.array(self.std)
+        except ValueError as error:
+            raise EvaluationError(
+                f"{self.source.name}: mean or std: {error}"
+            ) from error
+        if scaled.shape != array.shape:
+            raise EvaluationError(
+                f"{self.source.name}: mean and std make {list(scaled.shape)} of its "
+                f"shape {list(array.shape)}"
+            )
+        return scaled
+
+
+class Feed(BaseModel):
+    """How one input is made: of a source, or of parts in a row.
+
+    As a table: ``source`` and its options, ``mean``, ``std``; or ``parts``, a list of
+    such tables, whose numbers are flattened and stand one after the other.
+
+    Attributes:
+        parts: At least one.
+        joined: Whether they were given as ``parts``.
+    """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+
+    parts: tuple[FeedPart, ...]
+    joined: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_table(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            raise ValueError("it must be a table with a source, or with parts")
+        if "parts" not in table:
+            return {"parts": (FeedPart.read(table),)}
+        listed = table["parts"]
+        if not (isinstance(listed, list) and listed) or len(table) > 1:
+            raise ValueError("parts must be a list of tables, and stand alone")
+        if not all(isinstance(each, dict) for each in listed):
+            raise ValueError("each of parts must be a table with a source")
+        return {"parts": tuple(map(FeedPart.read, listed)), "joined": True}
+
+    @classmethod
+    def by(cls, source: InputSource) -> Self:
+        """Return the feed that is a source as it is."""
+        return cls.model_construct(parts=(FeedPart(source),))
+
+    def value(self, seen: Observed) -> Array:
+        """Return what the input is fed, without a batch dimension.
+
+        Raises:
+            EvaluationError: See `FeedPart.value`.
+        """
+        arrays = [part.value(seen) for part in self.parts]
+        if not self.joined:
+            return arrays[0]
+        return np.concatenate([each.reshape(-1) for each in arrays])
+
+    def sizes(self, seen: Observed) -> str:
+        """Tell the sources with how many numbers each gives, for messages."""
+        found = ((p.source.name, p.source.value(seen).size) for p in self.parts)
+        return ", ".join(f"{name} {size}" for name, size in found)
+
+    @property
+    def command(self) -> NavigationCommand | None:
+        """The command that it is, where it is nothing else."""
+        source = self.parts[0].source
+        if len(self.parts) > 1 or not isinstance(source, NavigationCommand):
+            return None
+        return source
+
+
+def _levels(name: str, value: Any) -> Levels:
+    numbers = value if isinstance(value, list) else [value]
+    if not numbers or not all(
+        isinstance(each, int | float) and not isinstance(each, bool) for each in numbers
+    ):
+        raise ValueError(f"{name} must be a number, or a list of numbers")
+    return tuple(map(float, value)) if isinstance(value, list) else float(value)

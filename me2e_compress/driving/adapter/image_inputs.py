@@ -1,0 +1,191 @@
+"""One image input of a graph: which cameras, which part of them, how laid out."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from me2e_compress.driving.adapter.images import ImageNormalization, Triple
+from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape
+from me2e_compress.errors import EvaluationError
+
+CameraName = Literal[
+    "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
+]
+CAMERA_NAMES: tuple[CameraName, ...] = (
+    "FRONT",
+    "FRONT_LEFT",
+    "FRONT_RIGHT",
+    "BACK",
+    "BACK_LEFT",
+    "BACK_RIGHT",
+)
+"""In the order of `Observation.images`."""
+
+Side: TypeAlias = Annotated[int, Field(ge=1, le=8192)]
+Size: TypeAlias = tuple[Side, Side]
+Crop: TypeAlias = tuple[int, int, int, int]
+
+
+class ImageInput(BaseModel):
+    """What an image input shows; what is left out follows from the graph.
+
+    Attributes:
+        cameras: Which, in the model's order.
+        camera_size: Rows and columns of a camera's picture, to which `crop` refers.
+        rendered: Rows and columns that cameras are rendered in, where that is not
+            `camera_size`; pictures are scaled to it as wholes.
+        crop: Left, top, right and bottom, pixels of `camera_size`, of each camera, or
+            of one for all; None takes all of a picture.
+        stitch: Join the cameras from left to right into one picture.
+        size: Rows and columns to which the result is resized, bilinearly; where the
+            input has more, the rest below and to the right is zero.
+        layout: Letters of the dimensions: b batch, n cameras, c channels, h rows, w
+            columns.
+        mean: See `ImageNormalization`; without it the adapter's [image] or the model's
+            metadata tells. An input of uint8 takes no normalisation.
+        std: The same.
+        scale: What grey levels are multiplied by before that: 0.00392156862745098 (1 /
+            255) where mean and std are of 0 to 1.
+        order: Red first or blue first.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    cameras: tuple[CameraName, ...] = Field(default=CAMERA_NAMES, min_length=1)
+    camera_size: Size | None = None
+    rendered: Size | None = None
+    crop: tuple[Crop, ...] | None = None
+    stitch: bool = False
+    size: Size | None = None
+    layout: str | None = None
+    mean: Triple | None = None
+    std: Triple | None = None
+    scale: float = Field(default=1.0, gt=0.0)
+    order: Literal["rgb", "bgr"] | None = None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if (self.mean is None) != (self.std is None):
+            raise ValueError("mean and std belong together")
+        if self.std is not None and not all(self.std):
+            raise ValueError("std is zero")
+        letters = self.layout
+        if letters is not None and (
+            set(letters) - set("bnchw")
+            or len(set(letters)) != len(letters)
+            or not set("chw") <= set(letters)
+        ):
+            raise ValueError(
+                f"layout {letters!r} must be the letters c, h and w, with b and n if "
+                "there are such dimensions"
+            )
+        if self.crop is not None:
+            if self.camera_size is None:
+                raise ValueError("crop needs the camera_size whose pixels it counts")
+            self._check_crops(*self.camera_size)
+        return self
+
+    @property
+    def crops(self) -> tuple[Crop, ...] | None:
+        """The crop of each camera."""
+        if self.crop is None or len(self.crop) > 1:
+            return self.crop
+        return self.crop * len(self.cameras)
+
+    def _check_crops(self, rows: int, columns: int) -> None:
+        crops = self.crops or ()
+        if len(crops) != len(self.cameras):
+            raise ValueError(f"{len(crops)} crops for {len(self.cameras)} cameras")
+        for left, top, right, bottom in crops:
+            if not (0 <= left < right <= columns and 0 <= top < bottom <= rows):
+                raise ValueError(
+                    f"crop {[left, top, right, bottom]} does not lie in {rows} rows of "
+                    f"{columns} columns"
+                )
+        if self.stitch and len({bottom - top for _, top, _, bottom in crops}) > 1:
+            raise ValueError("stitch: the crops have different heights")
+
+    def normalization(
+        self, name: str, otherwise: ImageNormalization | None
+    ) -> ImageNormalization | None:
+        """Return this table's own normalisation, or else another with its order."""
+        if self.mean is not None and self.std is not None:
+            order = self.order or "rgb"
+            return ImageNormalization(
+                input=name, mean=self.mean, std=self.std, order=order, scale=self.scale
+            )
+        if otherwise is None or self.order is None:
+            return otherwise
+        return otherwise.model_copy(update={"order": self.order})
+
+
+@dataclass(frozen=True)
+class ImagePort:
+    """The dimensions of an image input of a graph, read by a layout.
+
+    Attributes:
+        layout: Letters of its dimensions.
+        size: Its rows and columns, where the graph tells them; else the usual ones.
+    """
+
+    layout: str
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, name: str, shape: Shape, table: ImageInput) -> Self:
+        """Read a port's shape.
+
+        Raises:
+            EvaluationError: It is not that of these images.
+        """
+        pictures = 1 if table.stitch else len(table.cameras)
+        single = {5: "bnchw", 4: "bchw", 3: "chw"}
+        several = {5: "bnchw", 4: "nchw"}
+        usual = (single if pictures == 1 else several).get(len(shape), "bnchw")
+        layout = table.layout or usual
+        known = {"b": 1, "n": pictures, "c": 3}
+        wanted = [known.get(letter, "any") for letter in layout]
+        if (
+            len(shape) != len(layout)
+            or any(
+                isinstance(side, int) and isinstance(must, int) and side != must
+                for side, must in zip(shape, wanted, strict=True)
+            )
+            or ("n" not in layout and pictures > 1)
+        ):
+            raise EvaluationError(
+                f"input {name} has shape {list(shape)}, it must be {wanted}"
+            )
+        rows, columns = (shape[layout.index(letter)] for letter in "hw")
+        usual_rows, usual_columns = table.size or DEFAULT_IMAGE_SIZE
+        return cls(
+            layout,
+            (
+                rows if isinstance(rows, int) else usual_rows,
+                columns if isinstance(columns, int) else usual_columns,
+            ),
+        )
+
+
+def rendered_size(name: str, table: ImageInput, port: ImagePort) -> tuple[int, int]:
+    """Return rows and columns that an image input wants its cameras rendered in.
+
+    Raises:
+        EvaluationError: Nothing tells it, or the input is smaller than its pictures.
+    """
+    rows, columns = table.size or port.size
+    if rows > port.size[0] or columns > port.size[1]:
+        raise EvaluationError(
+            f"input {name} has {port.size[0]} rows and {port.size[1]} columns: a size "
+            f"of {rows} x {columns} does not fit"
+        )
+    asked = table.rendered or table.camera_size
+    if asked is not None or not table.stitch:
+        return asked or (rows, columns)
+    if columns % len(table.cameras):
+        raise EvaluationError(
+            f"input {name}: {columns} columns of {len(table.cameras)} cameras: "
+            "camera_size must say what one of them has"
+        )
+    return rows, columns // len(table.cameras)

@@ -1,0 +1,46 @@
+"""Where the ego has been on this route, as its decisions saw it."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from me2e_compress.driving.ego_kinematics import EgoKinematics
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass
+class EgoTrack:
+    """Poses and speeds by time, since the route began."""
+
+    decisions: int = field(default=0, init=False)
+    _times_us: list[int] = field(default_factory=list, init=False)
+    _states: list[tuple[float, float, float, float]] = field(
+        default_factory=list, init=False
+    )
+
+    def note(self, time_us: int, motion: EgoKinematics | None) -> None:
+        """Count a decision, and keep where the ego is at it if that is known."""
+        self.decisions += 1
+        if motion is not None:
+            state = (motion.x, motion.y, motion.heading, motion.speed_mps)
+            self._times_us.append(time_us)
+            self._states.append(state)
+
+    def clear(self) -> None:
+        """Begin a route."""
+        self.decisions = 0
+        self._times_us.clear()
+        self._states.clear()
+
+    def at(self, times_us: npt.NDArray[np.floating]) -> Floats:
+        """Return [n, 4] of n times: x, y (m), heading (rad, unwrapped), speed (m/s).
+
+        Between decisions it is interpolated; before the first one the ego stood where
+        it then was, at the speed that it had. At least one pose must have been noted.
+        """
+        states = np.array(self._states, np.float64)
+        states[:, 2] = np.unwrap(states[:, 2])
+        columns = [np.interp(times_us, self._times_us, each) for each in states.T]
+        return np.stack(columns, axis=1)

@@ -1,0 +1,41 @@
+"""What never changes."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from me2e_compress.driving.input_sources.base import InputSource, Observed
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.frames import Array
+
+
+@dataclass(frozen=True)
+class Constant(InputSource):
+    """The same numbers at every decision.
+
+    Attributes:
+        values: The numbers, row by row.
+        shape: Their shape; empty for one row of them.
+
+    Raises:
+        EvaluationError: The shape has not as many.
+    """
+
+    name: ClassVar[str] = "constant"
+    values: tuple[float, ...]
+    shape: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the shape."""
+        if self.shape and math.prod(self.shape) != len(self.values):
+            raise EvaluationError(
+                f"constant: {len(self.values)} values have no shape {list(self.shape)}"
+            )
+
+    def value(self, seen: Observed) -> Array:
+        """Return float64, or int64 where all values are whole numbers."""
+        whole = all(each.is_integer() for each in self.values)
+        array = np.array(self.values, np.int64 if whole else np.float64)
+        return array.reshape(self.shape) if self.shape else array

@@ -1,0 +1,78 @@
+"""Where the route goes next: a command, a point to aim at."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from me2e_compress.driving.input_sources.base import InputSource, Observed
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.frames import Array
+
+Six = tuple[int, int, int, int, int, int]
+
+
+@dataclass(frozen=True)
+class NavigationCommand(InputSource):
+    """The command, a number [] or one-hot [classes].
+
+    Attributes:
+        numbers: The model's number of left, right, straight, follow the lane, change
+            to the left and change to the right. The default is Bench2Drive's (CARLA's
+            RoadOption less one); nuScenes' VAD, which has right, left and straight
+            alone, is [1, 0, 2, 2, 1, 0].
+        one_hot: How many classes the vector has; 0 gives the number itself.
+
+    Raises:
+        EvaluationError: A number has no place in the vector, or is negative.
+    """
+
+    name: ClassVar[str] = "command"
+    numbers: Six = (0, 1, 2, 3, 4, 5)
+    one_hot: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.one_hot and not 0 <= min(self.numbers) <= max(self.numbers) < (
+            self.one_hot
+        ):
+            raise EvaluationError(
+                f"command: numbers {list(self.numbers)} do not fit one_hot = "
+                f"{self.one_hot} classes"
+            )
+
+    def value(self, seen: Observed) -> Array:
+        """Return int64 [], or float32 [classes]."""
+        number = self.number(seen.observation.command)
+        if not self.one_hot:
+            return np.asarray(number, np.int64)
+        return np.asarray(np.eye(self.one_hot)[number], np.float32)
+
+    def number(self, command: int) -> int:
+        """Return the model's number of a command 0 to 5."""
+        return self.numbers[command]
+
+
+@dataclass(frozen=True)
+class TargetPoint(InputSource):
+    """A node of the route's sparse plan, metres in the model's axes: [2].
+
+    Attributes:
+        which: The next node, ``near``, or the one after it, ``far``.
+    """
+
+    name: ClassVar[str] = "target-point"
+    which: Literal["near", "far"] = "near"
+
+    def value(self, seen: Observed) -> Array:
+        """Return float64 [2].
+
+        Raises:
+            EvaluationError: The simulator tells none.
+        """
+        points = seen.observation.target_points
+        if points is None:
+            raise EvaluationError(
+                "the adapter asks for a target point, and the observation has none"
+            )
+        return seen.turned(points[0 if self.which == "near" else 1])

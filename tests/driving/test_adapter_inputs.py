@@ -1,0 +1,217 @@
+"""An adapter's inputs, held against a graph's."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.session import Session
+from tests.driving.observed import RIG, motion, observation
+from tests.evaluators.highway.drivers import straight_on
+
+STATE = """
+axes = "forward-right"
+[feeds.state]
+parts = [
+    { source = "speed", std = 12.0 },
+    { source = "target-point" },
+    { source = "command", one_hot = 6 },
+]
+"""
+NOW = motion(0.0, 0.0, 0.0, 6.0)
+
+
+def inputs_of(folder: Path, ports: str, text: str) -> ModelInputs:
+    """Open a model of these inputs, which no node reads, with an adapter."""
+    session = Session(straight_on(folder / "m.onnx", inputs=ports), threads=1)
+    toml = folder / "a.toml"
+    toml.write_text(text)
+    return ModelInputs.of(session, Adapter.load(toml), session.recurrent)
+
+
+def test_parts_stand_one_after_the_other(tmp_path: Path) -> None:
+    """TCP's state: speed over 12 m/s, target point, one-hot command."""
+    inputs = inputs_of(tmp_path, "float[1, 9] state", STATE)
+
+    found = inputs.feeds(observation(NOW))
+
+    state = [[0.5, 20.0, -5.0, 0, 0, 0, 1, 0, 0]]
+    assert found["state"].dtype == np.float32
+    np.testing.assert_allclose(found["state"].astype(float), np.array(state))
+
+
+def test_one_source_keeps_its_shape_and_a_list_of_one_is_flat(tmp_path: Path) -> None:
+    text = """
+    [feeds.way]
+    source = "past"
+    steps = 3
+    [feeds.flat]
+    parts = [{ source = "past", steps = 3, mean = [1.0, 0.0], std = [2.0, 1.0] }]
+    """
+    inputs = inputs_of(tmp_path, "double[1, 3, 2] way, float16[6] flat", text)
+
+    found = inputs.feeds(observation(NOW))
+
+    assert found["way"].shape == (1, 3, 2)
+    np.testing.assert_allclose(found["flat"].astype(float), np.tile([-0.5, 0], 3))
+
+
+def test_cameras_come_one_by_one_and_are_rendered_in_the_largest_size(
+    tmp_path: Path,
+) -> None:
+    text = """
+    [image]
+    mean = [0, 0, 0]
+    std = [1, 1, 1]
+    order = "rgb"
+    [images.wide]
+    cameras = ["FRONT"]
+    [images.behind]
+    cameras = ["BACK"]
+    layout = "bhwc"
+    [feeds.k]
+    source = "intrinsics"
+    images = "behind"
+    """
+    ports = "float[1, 3, 90, 160] wide, uint8[1, 45, 80, 3] behind"
+    inputs = inputs_of(tmp_path, f"{ports}, float[1, 3, 3] k", text)
+    pictures = np.full((6, 90, 160, 3), 7, np.uint8)
+    seen = observation(NOW)
+    object.__setattr__(seen, "images", pictures)
+
+    found = inputs.feeds(seen)
+
+    assert inputs.image_size == (90, 160)
+    assert found["behind"].dtype == np.uint8
+    assert (found["behind"] == 7).all()
+    expected = RIG.intrinsics[3] * [[0.5], [0.5], [1.0]]
+    np.testing.assert_allclose(found["k"][0], expected, rtol=1e-4)
+
+
+UNIAD = """
+axes = "right-forward"
+[feeds.timestamp]
+source = "timestamp"
+[feeds.l2g_r_mat]
+source = "l2g-rotation"
+[feeds.l2g_t]
+source = "l2g-translation"
+[feeds.img_metas_can_bus]
+source = "can-bus"
+[feeds.use_prev_bev]
+source = "use-previous"
+"""
+
+
+def test_uniads_own_inputs(tmp_path: Path) -> None:
+    ports = """double[1] timestamp, float[1, 3, 3] l2g_r_mat, float[1, 3] l2g_t,
+        float[18] img_metas_can_bus, int32[1] use_prev_bev"""
+    inputs = inputs_of(tmp_path, ports, UNIAD)
+
+    first, second = (inputs.feeds(observation(NOW, at)) for at in (0, 50_000))
+    inputs.reset()
+
+    assert second["timestamp"] == pytest.approx([0.05])
+    assert first["l2g_r_mat"].shape == (1, 3, 3)
+    assert [int(each["use_prev_bev"][0]) for each in (first, second)] == [0, 1]
+    assert inputs.feeds(observation(NOW))["use_prev_bev"] == [0]
+
+
+@pytest.mark.parametrize(
+    ("ports", "text", "words"),
+    [
+        ("float[1] v", "", "input v is none of img, lidar2img, can_bus, command, time"),
+        ("float[1] v", "", r"\[feeds.v\] \(sources: speed, velocity, acceleration"),
+        (
+            "float[1] v",
+            "[feeds.w]\nsource = 'speed'",
+            "the adapter names input w; there are v",
+        ),
+        (
+            "float[1] v",
+            "[images.w]",
+            "the adapter names input w; there are v",
+        ),
+        (
+            "float[1, 2] v",
+            "[feeds.v]\nsource = 'speed'",
+            r"input v has shape \[1, 2\], it must be \[1\]",
+        ),
+        (
+            "float[1, 8] state",
+            STATE,
+            r"must be \[1, 9\]: it is speed 1, target-point 2, command 6",
+        ),
+        (
+            "float[1, 4] v",
+            "[feeds.v]\nsource = 'command'\none_hot = 6",
+            r"input v has shape \[1, 4\], it must be \[1, 6\]",
+        ),
+        (
+            "int64[1] v",
+            "[feeds.v]\nsource = 'speed'",
+            r"input v is tensor\(int64\), and what feeds it float64",
+        ),
+        (
+            "float[1] v",
+            "[feeds.v]\nsource = 'speed'\nmean = [1, 2]",
+            "input v: speed: mean and std make",
+        ),
+        (
+            "float[1, 6, 4, 4] v",
+            "[feeds.v]\nsource = 'lidar2img'\nimages = 'wide'",
+            "input v: images = 'wide' names no image input",
+        ),
+        (
+            "float[1, 3, 8, 8] v",
+            "[images.v]\n[feeds.v]\nsource = 'speed'",
+            "feeds input v in two ways",
+        ),
+        (
+            "float[1, 3, 8, 8] v",
+            "[images.v]\ncameras = ['FRONT']",
+            "image normalisation unknown",
+        ),
+    ],
+)
+def test_what_does_not_fit_the_graph_is_one_line(
+    tmp_path: Path, ports: str, text: str, words: str
+) -> None:
+    with pytest.raises(EvaluationError, match=words) as caught:
+        inputs_of(tmp_path, ports, text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[feeds.v]\nsource = 'velocities'", "feeds.v: no input source 'velocities'"),
+        ("[feeds.v]\nspeed = 1", "feeds.v: no source is named; there are speed"),
+        ("[feeds.v]\nsource = 'speed'\nunit = 'm'", "speed has no option 'unit'"),
+        ("[feeds.v]\nsource = 'speed'\nstd = 0", "speed: std is zero"),
+        ("[feeds.v]\nsource = 'speed'\nmean = 'x'", "mean must be a number"),
+        ("[feeds.v]\nparts = []", "parts must be a list of tables"),
+        ("[feeds.v]\nparts = ['speed']", "each of parts must be a table"),
+        ("[feeds]\nv = 'speed'", "feeds.v: it must be a table"),
+        (
+            "[images.v]\ncameras = ['TOP']",
+            "images.v.cameras.0: Input should be 'FRONT'",
+        ),
+    ],
+)
+def test_a_file_that_makes_no_sense_is_one_line(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    toml = tmp_path / "a.toml"
+    toml.write_text(text)
+
+    with pytest.raises(EvaluationError) as caught:
+        Adapter.load(toml)
+    message: Any = str(caught.value)
+    assert message.startswith(f"{toml}: adapter ")
+    assert words in message
+    assert "\n" not in message

@@ -1,0 +1,248 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from me2e_compress.driving.adapter.image_inputs import (
+    CAMERA_NAMES,
+    ImageInput,
+    ImagePort,
+    rendered_size,
+)
+from me2e_compress.driving.adapter.images import ImageNormalization
+from me2e_compress.driving.adapter.input_images import InputImages
+from me2e_compress.errors import EvaluationError
+from me2e_compress.simulator.cameras import CAMERA_NAMES as RIG_NAMES
+from me2e_compress.simulator.cameras import CameraRig
+
+ROWS, COLUMNS = 18, 32
+IMAGES = np.random.default_rng(0).integers(0, 256, (6, ROWS, COLUMNS, 3), np.uint8)
+NORM = ImageNormalization(mean=(10, 20, 30), std=(2, 4, 5), order="rgb")
+TCP = {
+    "cameras": ["FRONT_LEFT", "FRONT", "FRONT_RIGHT"],
+    "camera_size": [900, 1600],
+    "rendered": [288, 512],
+    "crop": [[0, 0, 1400, 900], [200, 0, 1400, 900], [200, 0, 1600, 900]],
+    "stitch": True,
+    "size": [256, 900],
+}
+
+
+def images_of(
+    table: dict[str, Any],
+    shape: tuple[int, ...],
+    norm: ImageNormalization | None = None,
+) -> InputImages:
+    read = ImageInput.model_validate(table)
+    port = ImagePort.of("img", shape, read)
+    return InputImages(read, port, rendered_size("img", read, port), norm)
+
+
+def test_the_cameras_are_those_of_the_rig() -> None:
+    assert CAMERA_NAMES == RIG_NAMES
+
+
+chosen = st.lists(st.sampled_from(CAMERA_NAMES), min_size=1, max_size=6)
+
+
+@given(
+    cameras=chosen,
+    left=st.integers(0, 15),
+    width=st.integers(1, 16),
+    top=st.integers(0, 8),
+    height=st.integers(1, 9),
+)
+def test_a_crop_that_is_not_resized_keeps_every_pixel(
+    cameras: list[str], left: int, width: int, top: int, height: int
+) -> None:
+    made = images_of(
+        {
+            "cameras": cameras,
+            "camera_size": [ROWS, COLUMNS],
+            "crop": [[left, top, left + width, top + height]],
+            "layout": "bnhwc",
+        },
+        (1, len(cameras), height, width, 3),
+    )
+
+    found = made.apply(IMAGES)
+
+    for at, name in enumerate(cameras):
+        whole = IMAGES[CAMERA_NAMES.index(name)]
+        expected = whole[top : top + height, left : left + width]
+        np.testing.assert_array_equal(found[0, at], expected)
+
+
+@given(cameras=chosen, lefts=st.lists(st.integers(0, 15), min_size=6, max_size=6))
+def test_a_strip_that_is_not_resized_keeps_every_pixel(
+    cameras: list[str], lefts: list[int]
+) -> None:
+    crops = [[at, 2, COLUMNS - at, 12] for at, _ in zip(lefts, cameras, strict=False)]
+    width = sum(right - left for left, _, right, _ in crops)
+    table = {"cameras": cameras, "crop": crops, "stitch": True, "layout": "hwc"}
+    made = images_of({**table, "camera_size": [ROWS, COLUMNS]}, (10, width, 3))
+
+    found, begin = made.apply(IMAGES), 0
+
+    for name, (left, _, right, _) in zip(cameras, crops, strict=True):
+        part = found[:, begin : begin + right - left]
+        whole = IMAGES[CAMERA_NAMES.index(name)]
+        np.testing.assert_array_equal(part, whole[2:12, left:right])
+        begin += right - left
+
+
+@given(
+    cameras=chosen,
+    crop=st.booleans(),
+    stitch=st.booleans(),
+    size=st.tuples(st.integers(5, 40), st.integers(5, 60)),
+)
+def test_a_point_projects_to_the_pixel_that_shows_it(
+    cameras: list[str], crop: bool, stitch: bool, size: tuple[int, int]
+) -> None:
+    """Where a picture's pixel goes, its projection goes, too."""
+    table: dict[str, Any] = {"cameras": cameras, "stitch": stitch, "size": list(size)}
+    table["camera_size"] = [ROWS, COLUMNS]
+    if crop:
+        table["crop"] = [[4, 2, 28, 16]]
+    shape = (1, 3, *size) if stitch else (1, len(cameras), 3, *size)
+    lidar2img = CameraRig(ROWS, COLUMNS).lidar2img
+    point = np.array([7.0, 3.0, 1.0, 1.0])
+
+    found = images_of(table, shape).projections(lidar2img) @ point
+
+    left, top, right, bottom = (4, 2, 28, 16) if crop else (0, 0, COLUMNS, ROWS)
+    joined = len(cameras) if stitch else 1
+    for at, name in enumerate(cameras):
+        u, v, depth, _ = lidar2img[CAMERA_NAMES.index(name)] @ point
+        before = at * (right - left) if stitch else 0
+        across = (u / depth - left + before) * size[1] / ((right - left) * joined)
+        down = (v / depth - top) * size[0] / (bottom - top)
+        assert found[at, :2] / found[at, 2] == pytest.approx((across, down), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("layout", "shape"),
+    [
+        ("bnchw", (1, 6, 3, ROWS, COLUMNS)),
+        ("nhwc", (6, ROWS, COLUMNS, 3)),
+        ("bhwnc", (1, ROWS, COLUMNS, 6, 3)),
+        ("cnhw", (3, 6, ROWS, COLUMNS)),
+    ],
+)
+def test_dimensions_stand_as_the_layout_says(
+    layout: str, shape: tuple[int, ...]
+) -> None:
+    found = images_of({"layout": layout}, shape, NORM).apply(IMAGES)
+
+    assert found.shape == shape
+    index = {"b": 0, "n": 4, "c": 2, "h": 5, "w": 7}
+    pixel = found[tuple(index[letter] for letter in layout)]
+    assert pixel == pytest.approx((float(IMAGES[4, 5, 7, 2]) - 30) / 5)
+
+
+def test_bytes_stay_bytes_in_the_models_order() -> None:
+    table = {"cameras": ["BACK"], "order": "bgr", "layout": "hwc"}
+
+    found = images_of(table, (ROWS, COLUMNS, 3)).apply(IMAGES)
+
+    assert found.dtype == np.uint8
+    np.testing.assert_array_equal(found, IMAGES[3][..., ::-1])
+
+
+def test_mean_and_std_of_zero_to_one_are_those_of_grey_levels() -> None:
+    part = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
+    table = ImageInput.model_validate({**part, "scale": 1 / 255})
+    grey = {key: tuple(255 * each for each in found) for key, found in part.items()}
+
+    found = table.normalization("img", None)
+
+    assert found is not None
+    expected = ImageNormalization(**grey, order="rgb").apply(IMAGES)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.apply(IMAGES), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_what_is_padded_is_zero_below_and_to_the_right() -> None:
+    table = {"size": [ROWS, COLUMNS]}
+
+    found = images_of(table, (1, 6, 3, 20, 40), NORM).apply(IMAGES)
+
+    assert found.shape == (1, 6, 3, 20, 40)
+    assert not found[..., ROWS:, :].any()
+    assert not found[..., COLUMNS:].any()
+    np.testing.assert_array_equal(found[..., :ROWS, :COLUMNS], NORM.apply(IMAGES))
+
+
+def test_tcps_strip_has_its_seams_where_the_published_one_has() -> None:
+    """1400, 1200 and 1400 of 4000 columns are 315, 270 and 315 of 900."""
+    grey = np.array([40, 80, 120], np.uint8)  # front, front left, front right
+    images = np.zeros((6, 288, 512, 3), np.uint8)
+    images[:3] = grey[:, None, None, None]
+
+    made = images_of({**TCP, "layout": "bhwc"}, (1, 256, 900, 3))
+    found = made.apply(images)
+
+    assert made.rendered == (288, 512)
+    row = found[0, 128, :, 0]
+    assert [int(row[at]) for at in (0, 313, 316, 583, 586, 899)] == [
+        80,
+        80,
+        40,
+        40,
+        120,
+        120,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"cameras": ["TOP"]}, "'FRONT', 'FRONT_LEFT'"),
+        ({"cameras": []}, "at least 1 item"),
+        ({"layout": "chv"}, "layout 'chv' must be the letters c, h and w"),
+        ({"layout": "nhw"}, "layout 'nhw'"),
+        ({"crop": [[0, 0, 5, 5]]}, "crop needs the camera_size"),
+        (
+            {"camera_size": [9, 16], "crop": [[0, 0, 17, 9]]},
+            "does not lie in 9 rows of 16 columns",
+        ),
+        (
+            {"camera_size": [9, 16], "crop": [[0, 0, 5, 5], [0, 0, 5, 5]]},
+            "2 crops for 6 cameras",
+        ),
+        ({"mean": [1, 2, 3]}, "mean and std belong together"),
+        ({"mean": [1, 2, 3], "std": [1, 0, 1]}, "std is zero"),
+        (
+            {
+                "cameras": ["FRONT", "BACK"],
+                "stitch": True,
+                "camera_size": [9, 16],
+                "crop": [[0, 0, 5, 5], [0, 0, 5, 6]],
+            },
+            "the crops have different heights",
+        ),
+    ],
+)
+def test_a_wrong_table_is_refused(table: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        ImageInput.model_validate(table)
+
+
+@pytest.mark.parametrize(
+    ("table", "shape", "words"),
+    [
+        ({}, (1, 5, 3, 8, 8), r"must be \[1, 6, 3, 'any', 'any'\]"),
+        ({}, (1, 3, 8, 8), r"has shape \[1, 3, 8, 8\]"),
+        ({"cameras": ["FRONT"]}, (1, 8, 8, 3), r"must be \[1, 3, 'any', 'any'\]"),
+        ({"layout": "chw"}, (3, 8, 8), r"has shape \[3, 8, 8\]"),
+        ({"size": [9, 8]}, (1, 6, 3, 8, 8), "a size of 9 x 8 does not fit"),
+        ({"stitch": True}, (1, 3, 8, 8), "camera_size must say"),
+    ],
+)
+def test_images_that_do_not_fit_the_input_are_refused(
+    table: dict[str, Any], shape: tuple[int, ...], words: str
+) -> None:
+    with pytest.raises(EvaluationError, match=words):
+        images_of(table, shape)
