@@ -26,8 +26,9 @@ from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.zoo.export import export
 
 STACK, CAMERAS = "vad-tiny", 6
-RECIPES = [name for name in recipe.shipped() if not name.startswith("minus-")]
-"""The others take modules from the driver highway."""
+OF_OTHERS = ("minus-", "uniad-")
+"""These take modules from the driver highway and from UniAD."""
+RECIPES = [name for name in recipe.shipped() if not name.startswith(OF_OTHERS)]
 HEAD = "recipe            MB   nodes  int8 MB  ego dB  plan m (max)  least move  CPU s"
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -32,10 +33,10 @@ class Edge:
     (``*.ego_map_decoder``).
 
     Attributes:
-        source: the part whose result is to be read: of what leaves it, what fits and
-            leaves last; what the reader reads already goes first.
-        reader: the part that is to read it, in one of the values that enter it: of
-            those that it fits, the one that is first read last.
+        source: the part whose result is to be read: of what leaves it and fits, what
+            the reader reads already, or else what leaves last.
+        reader: the part that is to read it, in one of the values that enter it: the
+            largest that it fits, of several the one that is first read last.
         how: ``append`` gives the reader more queries, those of the source behind its
             own; ``add`` gives it the sum; ``replace`` gives it the source's in the
             place of its own. A result of fewer queries is repeated for the last two:
@@ -133,17 +134,18 @@ def _ends(
             f" only {listed(read)}"
         )
     ranked = [
-        (_fit(edge, new, old), new in read, old_at, new_at)
+        (math.prod(graph.static_shape(old) or ()), old_at, best, new in read, new_at)
         for (old_at, old), (new_at, new) in itertools.product(
             enumerate(made), enumerate(left)
         )
+        if (best := _fit(edge, new, old))
     ]
-    best, _, old_at, new_at = max(ranked)
-    if not best:
+    if not ranked:
         raise PreconditionError(
             f"edge {edge.label}: nothing that leaves {edge.source} ({listed(left)})"
             f" fits what {edge.reader} reads ({listed(made)})"
         )
+    _, old_at, _, _, new_at = max(ranked)
     return left[new_at], made[old_at]
 
 
