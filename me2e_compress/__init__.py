@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.evaluate import EvaluateOptions, evaluate
     from me2e_compress.workflows.evaluate_result import EvaluateResult
     from me2e_compress.workflows.frames import FramesOptions, record_frames
-    from me2e_compress.workflows.inspect import InspectResult, inspect
+    from me2e_compress.workflows.inspect import inspect
+    from me2e_compress.workflows.inspect_result import InspectResult
     from me2e_compress.workflows.lint import LintOptions, LintResult, lint
     from me2e_compress.workflows.listener import Listener
     from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
@@ -139,7 +140,8 @@ _ROOMS = {
     "workflows.evaluate": ("EvaluateOptions", "evaluate"),
     "workflows.evaluate_result": ("EvaluateResult",),
     "workflows.frames": ("FramesOptions", "record_frames"),
-    "workflows.inspect": ("InspectResult", "inspect"),
+    "workflows.inspect": ("inspect",),
+    "workflows.inspect_result": ("InspectResult",),
     "workflows.lint": ("LintOptions", "LintResult", "lint"),
     "workflows.listener": ("Listener",),
     "workflows.plan": ("PlanOptions", "PlanResult", "plan"),

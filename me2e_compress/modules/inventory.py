@@ -26,6 +26,9 @@ class Item:
             unknown, a lower bound, and None instead of 0; None where nobody counts.
         unknown_macs_nodes: how many of its nodes are not in ``macs``; None where
             nobody counts.
+        activation_bytes: what its nodes write in a frame, alike.
+        unknown_activation_nodes: how many of its nodes are not in these, alike.
+        latency_share: of the time of a frame, 0 to 1; None where nobody measured.
     """
 
     module: str
@@ -34,6 +37,9 @@ class Item:
     weight_bytes: int
     macs: int | None
     unknown_macs_nodes: int | None
+    activation_bytes: int | None = None
+    unknown_activation_nodes: int | None = None
+    latency_share: float | None = None
 
 
 def itemise(

@@ -1,4 +1,4 @@
-"""What a graph holds: interface; nodes, parameters, MACs, modelled energy by module."""
+"""What a graph holds: interface; nodes, parameters, MACs, energy, time by module."""
 
 import dataclasses
 from collections import Counter
@@ -8,8 +8,8 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph, recipe
-from me2e_compress.errors import GraphError
-from me2e_compress.graph import Port, provenance
+from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.graph import provenance
 from me2e_compress.graph.macs import why_uncounted
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import PassManager
@@ -22,133 +22,19 @@ from me2e_compress.runtime.energy.modelled import (
     costs_of,
     modelled_energy,
 )
+from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.recurrence import recurrent_inputs
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
-from me2e_compress.workflows.result import (
-    Result,
-    Table,
-    giga,
-    megabytes,
-    number,
-    table,
+from me2e_compress.workflows.inspect_result import InspectResult
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.module_costs import (
+    trace_of,
+    with_activations,
+    with_latency,
 )
 from me2e_compress.zoo.weights_record import named_weights
 
-_SHOWN = 8
-"""Operators of unknown MACs that are named."""
-
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class InspectResult(Result):
-    """What a file holds.
-
-    Attributes:
-        file: its name.
-        file_bytes: with the weights beside it.
-        opset: of the default domain.
-        lowered: what was changed so that onnxruntime reads it; empty if nothing was.
-        hint: what the graph lacks, of which more could be known; empty if nothing.
-        domains: further operator domains.
-        map: the module map that was used.
-        inputs: what it takes.
-        outputs: what it answers.
-        modules: module by module.
-        rules: how many nodes each rule of the map placed.
-        macs: multiply-accumulates of the nodes whose count is known, all modules
-            together; None if none is.
-        unknown_macs_nodes: how many nodes are not in ``macs``.
-        uncounted: why, with the number of nodes.
-        open_dimensions: of the inputs, by name: MACs wait for their sizes.
-        recurrent: inputs that are fed back from frame to frame, with the output.
-        modelled_energy: what its MACs and bytes would take; None: not asked for.
-        weights: the checkpoint that its metadata names, in a line; empty: none.
-    """
-
-    file: str
-    file_bytes: int
-    opset: int | None
-    domains: tuple[str, ...]
-    map: str
-    inputs: tuple[Port, ...]
-    outputs: tuple[Port, ...]
-    modules: tuple[Item, ...]
-    rules: dict[str, int]
-    macs: int | None
-    unknown_macs_nodes: int
-    uncounted: dict[str, int]
-    open_dimensions: tuple[str, ...]
-    lowered: str = ""
-    hint: str = ""
-    recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
-    modelled_energy: ModelledEnergy | None = None
-    weights: str = ""
-
-    @property
-    def headline(self) -> str:
-        """File, size, opset."""
-        more = f" and {', '.join(self.domains)}" if self.domains else ""
-        read = f" ({self.lowered})" if self.lowered else ""
-        size = f"{megabytes(self.file_bytes)} MB"
-        return f"{self.file}: {size}, opset {self.opset}{more}{read}"
-
-    def lines(self) -> tuple[str, ...]:
-        """Return the headline, what the graph lacks, and what it was made of."""
-        return tuple(filter(None, (self.hint, self.headline, self.weights)))
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return the interface, and the modules."""
-        ports = [
-            (kind, port.name, port.type, port.shape)
-            for kind, side in (("in", self.inputs), ("out", self.outputs))
-            for port in side
-        ]
-        rows = [
-            (
-                item.module,
-                number(item.nodes),
-                number(item.parameters),
-                megabytes(item.weight_bytes),
-                giga(item.macs, item.unknown_macs_nodes, ".3f"),
-            )
-            for item in self.modules
-        ]
-        rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
-        note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
-        pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
-        back = f"fed back: {', '.join(pairs)}" if pairs else ""
-        columns = ("module", "nodes", "parameters", "MB", "GMACs")
-        modelled = self.modelled_energy
-        return (
-            table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
-            table(f"Modules (map {self.map})", columns, rows, note),
-            *(() if modelled is None else modelled.tables()),
-        )
-
-    def _total_macs(self) -> str:
-        """Write the MACs of the graph, and of how many nodes they are not known."""
-        total = giga(self.macs, 0, ".3f")
-        if not self.unknown_macs_nodes:
-            return total
-        known = "" if self.macs is None else f"at least {total}, "
-        found = [f"{count} {reason}" for reason, count in self.uncounted.items()]
-        why = ", ".join(found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
-        ways = ""
-        if self.open_dimensions:
-            ways = f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"
-        nodes = "node" if self.unknown_macs_nodes == 1 else "nodes"
-        return (
-            f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
-        )
-
-    def records(self) -> list[dict[str, object]]:
-        """Return a row a module."""
-        return [dataclasses.asdict(item) for item in self.modules]
-
-    def to_json(self) -> object:
-        """Return everything."""
-        return dataclasses.asdict(self)
 
 
 def inspect(
@@ -156,6 +42,9 @@ def inspect(
     module_map: str | Path | None = None,
     dims: Mapping[str, int] | None = None,
     process: str | None = None,
+    trace: str | Path | None = None,
+    frames: str | Path | None = None,
+    listener: Listener = SILENT,
 ) -> InspectResult:
     """Read a graph and weigh its modules.
 
@@ -165,16 +54,27 @@ def inspect(
         dims: sizes that open dimensions of the inputs are given first.
         process: model the energy of a frame by the figures of this silicon process,
             ``45nm`` or ``7nm``; None does not.
+        trace: latencies of this model by module, as ``profile`` writes them.
+        frames: folder of recorded frames: measure the latencies on them instead.
+        listener: is called with progress and warnings.
 
     Raises:
         EnergyError: no such process.
         GraphError: no such model.
         PreconditionError: no input has such a dimension.
         ModuleMapError: no such map.
+        EvaluationError: the trace is of another model or not by module.
+        RecipeError: a trace and frames.
+        FramesError: a frame does not fit.
     """
     if process is not None:
         costs_of(process)
+    if trace is not None and frames is not None:
+        raise RecipeError("--trace and --frames: the time is read, or measured")
     path = model_path(model)
+    taken = None if trace is None else trace_of(trace, path)
+    if frames is not None:
+        taken = _timed(path, module_map, frames, listener)
     loaded = graph.load(path)
     modules = load_map(module_map, loaded)
     if dims:
@@ -184,6 +84,10 @@ def inspect(
     items = itemise(loaded, modules, placed.module_of)
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
+    items = tuple(_with_cost(item, costs.get(item.module)) for item in items)
+    items = with_activations(items, folded)
+    if taken is not None:
+        items = with_latency(items, taken)
     fed_back, wrong = _fed_back(loaded)
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
@@ -195,7 +99,7 @@ def inspect(
         modules.name,
         inputs,
         outputs,
-        tuple(_with_cost(item, costs.get(item.module)) for item in items),
+        items,
         {str(rule): count for rule, count in placed.rules().items()},
         total if total or not unknown else None,
         unknown,
@@ -207,8 +111,25 @@ def inspect(
         None
         if process is None
         else modelled_energy(folded, process, provenance.module_of),
-        named_weights(loaded.metadata_props),
+        weights=named_weights(loaded.metadata_props),
+        latency_of="" if taken is None else taken.headline,
     )
+
+
+def _timed(
+    path: Path,
+    module_map: str | Path | None,
+    frames: str | Path,
+    listener: Listener,
+) -> LatencyTrace:
+    """Measure module by module, one inference a frame."""
+    from me2e_compress.workflows.profile import (  # opens sessions
+        ProfileOptions,
+        profile,
+    )
+
+    options = ProfileOptions(by_module=True, module_map=module_map)
+    return profile(path, frames, options=options, listener=listener).trace
 
 
 def model_energy(

@@ -1,11 +1,12 @@
 """``me2e-compress inspect``."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from me2e_compress.cli import arguments as given
-from me2e_compress.cli.console import show
+from me2e_compress.cli.console import listening, show
 from me2e_compress.workflows import inspect as workflow
 from me2e_compress.workflows.checks import sizes
 
@@ -18,8 +19,20 @@ def inspect(
         str | None,
         typer.Option(help="joules by published figures of 7nm or 45nm"),
     ] = None,
+    trace: Annotated[
+        Path | None, typer.Option(help="latencies by module, of profile --by-module")
+    ] = None,
+    frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
     as_json: given.Json = False,
 ) -> None:
-    """Show what a graph holds: interface, and nodes, parameters, MACs by module."""
+    """Show what a graph holds: interface, and nodes, parameters, MACs by module.
+
+    With --trace or --frames also each module's share of the time of a frame: as it was
+    measured, or measured now.
+    """
     dims = sizes(set_dim or ())
-    show(workflow.inspect(model, module_map, dims, modelled_energy), as_json)
+    with listening() as listener:
+        found = workflow.inspect(
+            *(model, module_map, dims, modelled_energy, trace, frames, listener)
+        )
+    show(found, as_json)

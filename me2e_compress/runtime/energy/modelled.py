@@ -14,7 +14,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.display import Displayed, Table, megabytes, table
 from me2e_compress.errors import EnergyError
-from me2e_compress.graph.shapes import static_shape
+from me2e_compress.graph.activations import VIEWS, as_written, value_bytes
 
 Number = Literal["int8", "float16", "float32"]
 """What is multiplied."""
@@ -55,10 +55,6 @@ PROCESSES: Mapping[str, EnergyCosts] = {
 DEFAULT_PROCESS = "7nm"
 _INT8 = (ir.DataType.INT8, ir.DataType.UINT8)
 _FLOAT16 = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
-_VIEWS = frozenset(
-    {"Identity", "Reshape", "Flatten", "Squeeze", "Transpose", "Unsqueeze"}
-)
-"""Operators between a DequantizeLinear and a product that runtimes look through."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -221,7 +217,7 @@ def _traffic(node: ir.Node, macs: int, module: str, seen: set[str]) -> _Traffic 
     weights, activations = 0, 0
     stored = [_stored(value) for value in node.inputs if value is not None]
     for value in stored:
-        size = _bytes(value)
+        size = value_bytes(value)
         if size is None:
             return None
         if not _is_weight(value):
@@ -230,7 +226,7 @@ def _traffic(node: ir.Node, macs: int, module: str, seen: set[str]) -> _Traffic 
             seen.add(str(value.name))
             weights += size
     for value in node.outputs:
-        size = _bytes(_written(value))
+        size = value_bytes(as_written(value))
         if size is None:
             return None
         activations += size
@@ -254,7 +250,7 @@ def _stored(value: ir.Value) -> ir.Value:
     while (node := at.producer()) is not None and node.inputs and node.inputs[0]:
         if node.op_type == "DequantizeLinear":
             return node.inputs[0]
-        if node.op_type not in _VIEWS:
+        if node.op_type not in VIEWS:
             break
         at = node.inputs[0]
     return value
@@ -266,23 +262,3 @@ def _is_weight(value: ir.Value) -> bool:
     if node is not None and node.op_type == "QuantizeLinear" and node.inputs[0]:
         return node.inputs[0].const_value is not None
     return value.const_value is not None
-
-
-def _written(value: ir.Value) -> ir.Value:
-    """Return what is written: the integers where nothing else is read."""
-    readers = [use.node for use in value.uses()]
-    if readers and all(each.op_type == "QuantizeLinear" for each in readers):
-        return readers[0].outputs[0]
-    return value
-
-
-def _bytes(value: ir.Value) -> int | None:
-    if value.const_value is not None:
-        return int(value.const_value.nbytes)
-    shape = static_shape(value)
-    if shape is None or value.dtype is None:
-        return None
-    count = 1
-    for dimension in shape:
-        count *= dimension
-    return int(count * value.dtype.itemsize)

@@ -1,0 +1,151 @@
+"""What inspection found, as it is shown."""
+
+import dataclasses
+
+from me2e_compress.graph import Port
+from me2e_compress.modules import Item
+from me2e_compress.runtime.energy.modelled import ModelledEnergy
+from me2e_compress.workflows.result import (
+    Result,
+    Table,
+    giga,
+    megabytes,
+    number,
+    table,
+)
+
+_SHOWN = 8
+"""Operators of unknown MACs that are named."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class InspectResult(Result):
+    """What a file holds.
+
+    Attributes:
+        file: its name.
+        file_bytes: with the weights beside it.
+        opset: of the default domain.
+        lowered: what was changed so that onnxruntime reads it; empty if nothing was.
+        hint: what the graph lacks, of which more could be known; empty if nothing.
+        domains: further operator domains.
+        map: the module map that was used.
+        inputs: what it takes.
+        outputs: what it answers.
+        modules: module by module.
+        rules: how many nodes each rule of the map placed.
+        macs: multiply-accumulates of the nodes whose count is known, all modules
+            together; None if none is.
+        unknown_macs_nodes: how many nodes are not in ``macs``.
+        uncounted: why, with the number of nodes.
+        open_dimensions: of the inputs, by name: MACs wait for their sizes.
+        recurrent: inputs that are fed back from frame to frame, with the output.
+        modelled_energy: what its MACs and bytes would take; None: not asked for.
+        weights: the checkpoint that its metadata names, in a line; empty: none.
+        latency_of: which inferences the shares of time are of; empty: not measured.
+    """
+
+    file: str
+    file_bytes: int
+    opset: int | None
+    domains: tuple[str, ...]
+    map: str
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    modules: tuple[Item, ...]
+    rules: dict[str, int]
+    macs: int | None
+    unknown_macs_nodes: int
+    uncounted: dict[str, int]
+    open_dimensions: tuple[str, ...]
+    lowered: str = ""
+    hint: str = ""
+    recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
+    modelled_energy: ModelledEnergy | None = None
+    weights: str = ""
+    latency_of: str = ""
+
+    @property
+    def headline(self) -> str:
+        """File, size, opset."""
+        more = f" and {', '.join(self.domains)}" if self.domains else ""
+        read = f" ({self.lowered})" if self.lowered else ""
+        size = f"{megabytes(self.file_bytes)} MB"
+        return f"{self.file}: {size}, opset {self.opset}{more}{read}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the headline, what the graph lacks, and what it was made of."""
+        return tuple(filter(None, (self.hint, self.headline, self.weights)))
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the interface, and the modules."""
+        ports = [
+            (kind, port.name, port.type, port.shape)
+            for kind, side in (("in", self.inputs), ("out", self.outputs))
+            for port in side
+        ]
+        rows = [
+            (
+                item.module,
+                number(item.nodes),
+                number(item.parameters),
+                megabytes(item.weight_bytes),
+                giga(item.macs, item.unknown_macs_nodes, ".3f"),
+                _activations(item),
+                *self._share(item),
+            )
+            for item in self.modules
+        ]
+        rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
+        note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
+        if self.latency_of:
+            note += f"\nshare of a frame's time: {self.latency_of}"
+        pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
+        back = f"fed back: {', '.join(pairs)}" if pairs else ""
+        time = ("time",) if self.latency_of else ()
+        counts = ("nodes", "parameters", "MB", "GMACs", "activations MB")
+        columns = ("module", *counts, *time)
+        modelled = self.modelled_energy
+        return (
+            table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
+            table(f"Modules (map {self.map})", columns, rows, note),
+            *(() if modelled is None else modelled.tables()),
+        )
+
+    def _share(self, item: Item) -> tuple[str, ...]:
+        if not self.latency_of:
+            return ()
+        share = item.latency_share
+        return ("-" if share is None else f"{share:.1%}",)
+
+    def _total_macs(self) -> str:
+        """Write the MACs of the graph, and of how many nodes they are not known."""
+        total = giga(self.macs, 0, ".3f")
+        if not self.unknown_macs_nodes:
+            return total
+        known = "" if self.macs is None else f"at least {total}, "
+        found = [f"{count} {reason}" for reason, count in self.uncounted.items()]
+        why = ", ".join(found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
+        ways = ""
+        if self.open_dimensions:
+            ways = f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"
+        nodes = "node" if self.unknown_macs_nodes == 1 else "nodes"
+        return (
+            f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
+        )
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a module."""
+        return [dataclasses.asdict(item) for item in self.modules]
+
+    def to_json(self) -> object:
+        """Return everything."""
+        return dataclasses.asdict(self)
+
+
+def _activations(item: Item) -> str:
+    """Write megabytes; of how many nodes they are not known."""
+    if item.activation_bytes is None:
+        return "-"
+    least = "at least " if item.unknown_activation_nodes else ""
+    return f"{least}{megabytes(item.activation_bytes)}"

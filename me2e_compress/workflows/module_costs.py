@@ -1,0 +1,70 @@
+"""What a module costs a frame beside its MACs: activations, its share of the time."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import EvaluationError
+from me2e_compress.graph import provenance
+from me2e_compress.graph.activations import activation_bytes
+from me2e_compress.modules import Item
+from me2e_compress.runtime.latency_trace import LatencyTrace, shares
+
+
+def with_activations(items: Iterable[Item], folded: ir.Model) -> tuple[Item, ...]:
+    """Return items with the bytes that the nodes of each module write in a frame.
+
+    Args:
+        items: module by module.
+        folded: the graph imported, shapes inferred.
+    """
+    known, unknown = Counter[str](), Counter[str]()
+    for node in folded.graph:
+        size, module = activation_bytes(node), provenance.module_of(node)
+        known[module] += size or 0
+        unknown[module] += size is None
+    return tuple(
+        dataclasses.replace(
+            item,
+            activation_bytes=known[item.module]
+            if known[item.module] or not unknown[item.module]
+            else None,
+            unknown_activation_nodes=unknown[item.module],
+        )
+        for item in items
+    )
+
+
+def with_latency(items: Iterable[Item], trace: LatencyTrace) -> tuple[Item, ...]:
+    """Return items with the share of a frame's time that each module took.
+
+    Args:
+        items: module by module.
+        trace: by module. What it has no module for, or takes between nodes, is no
+            module's: the shares need not add up to 1.
+    """
+    found = {each.name: each.share for each in shares(trace.modules_us)}
+    return tuple(
+        dataclasses.replace(item, latency_share=found.get(item.module))
+        for item in items
+    )
+
+
+def trace_of(path: str | Path, model: Path) -> LatencyTrace:
+    """Read a trace of this very model, by module.
+
+    Raises:
+        EvaluationError: It cannot be read, is of another model or not by module.
+    """
+    trace = LatencyTrace.load(Path(path))
+    if trace.model_sha256 != graph.sha256_of(model):
+        raise EvaluationError(f"{path}: a trace of another model than {model.name}")
+    if not trace.modules_us:
+        raise EvaluationError(
+            f"{path}: has no times by module: profile {model.name} with --by-module"
+        )
+    return trace
