@@ -13,14 +13,15 @@ from me2e_compress.driving.contract import Answer, Observation, RouteInfo, Traje
 from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.driving.ports import fits, zeros
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.stack.stack_session import open_session
 
 
 @dataclass
 class OnnxPolicy:
-    """Runs an ONNX graph in onnxruntime, on one thread that does not spin.
+    """Runs an ONNX graph or a stack of several, on one thread that does not spin.
 
     Inputs ``img`` float [1, 6, 3, H, W], ``lidar2img`` [1, 6, 4, 4], ``can_bus`` [18],
     ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route began, of
@@ -39,7 +40,7 @@ class OnnxPolicy:
         host_cells: That the stage took into account, for the latest plan.
     """
 
-    session: Session
+    session: AnySession
     adapter: Adapter
     inputs: ModelInputs
     outputs: ModelOutputs
@@ -49,6 +50,7 @@ class OnnxPolicy:
     host_cells: int = field(default=0, init=False)
     privileged: bool = field(default=False, init=False)
     _state: dict[str, Array] = field(default_factory=dict, init=False)
+    _begins: bool = field(default=True, init=False)
 
     @classmethod
     def open(
@@ -61,7 +63,7 @@ class OnnxPolicy:
         """Load a model and run it once on zeros.
 
         Args:
-            path: The file.
+            path: The file, or the TOML of a stack of several.
             adapter: How its ports relate to the contract; None where they keep it.
             provider: What runs it.
             stage: Changes the plan on the host; None leaves it.
@@ -71,7 +73,7 @@ class OnnxPolicy:
             ProviderError: The provider is not there.
         """
         try:
-            session = Session(path, threads=1, provider=provider)
+            session = open_session(path, threads=1, provider=provider)
             policy = cls._of(session, adapter or Adapter(), stage)
             policy._dry_run()
         except (GraphError, FramesError, EvaluationError) as error:
@@ -80,7 +82,9 @@ class OnnxPolicy:
         return policy
 
     @classmethod
-    def _of(cls, session: Session, adapter: Adapter, stage: HostStage | None) -> Self:
+    def _of(
+        cls, session: AnySession, adapter: Adapter, stage: HostStage | None
+    ) -> Self:
         recurrent = dict(
             session.recurrent if adapter.recurrent is None else adapter.recurrent
         )
@@ -109,11 +113,15 @@ class OnnxPolicy:
         return self.inputs.image_size
 
     def reset(self, route: RouteInfo | None) -> None:
-        """Begin a route: recurrent inputs are zeros again."""
+        """Begin a route: recurrent inputs hold their first values again."""
+        self._begins = True
+        known = self.session.first_state({})
         self.inputs.reset()
         self._state = {
-            name: zeros(name, self.session.inputs[name]) for name in self.recurrent
-        }
+            name: zeros(name, self.session.inputs[name])
+            for name in self.recurrent
+            if name not in self.session.recurrent
+        } | {name: value for name, value in known.items() if name in self.recurrent}
 
     def plan(self, observation: Observation) -> Answer:
         """Run the model once.
@@ -124,7 +132,8 @@ class OnnxPolicy:
             GraphError: A node of the model failed.
         """
         feeds = self.feeds(observation)
-        outputs = self.session.run({**self._state, **feeds})
+        outputs = self.session.run({**self._state, **feeds}, first=self._begins)
+        self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
         plan = self.outputs.trajectory(outputs, feeds, observation)
         if self.stage is None:

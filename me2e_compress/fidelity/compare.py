@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
+from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.session import Session, detached, replay
+from me2e_compress.runtime.session import detached, replay
 
 Float64: TypeAlias = npt.NDArray[np.float64]
 
@@ -85,17 +86,17 @@ class Reference:
         answers: its outputs on every frame, all in memory.
     """
 
-    session: Session
+    session: AnySession
     frames: Frames
     answers: tuple[dict[str, Array], ...]
 
     @classmethod
-    def of(cls, session: Session, frames: Frames) -> Self:
+    def of(cls, session: AnySession, frames: Frames) -> Self:
         """Run the model once over the frames."""
         answers = tuple(detached(each) for each in replay(session, frames))
         return cls(session, frames, answers)
 
-    def compare(self, other: Session, frames: Frames | None = None) -> Fidelity:
+    def compare(self, other: AnySession, frames: Frames | None = None) -> Fidelity:
         """Compare another model with it, as :func:`compare` does.
 
         Args:
@@ -106,7 +107,7 @@ class Reference:
         return _compare(self.session, iter(self.answers), other, shown)
 
 
-def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
+def compare(a: AnySession, b: AnySession, frames: Iterable[Frame]) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
 
     All arithmetic is float64. One frame is in memory at a time.
@@ -126,7 +127,10 @@ def compare(a: Session, b: Session, frames: Iterable[Frame]) -> Fidelity:
 
 
 def _compare(
-    a: Session, answers: Iterator[dict[str, Array]], b: Session, frames: Iterable[Frame]
+    a: AnySession,
+    answers: Iterator[dict[str, Array]],
+    b: AnySession,
+    frames: Iterable[Frame],
 ) -> Fidelity:
     shared = [name for name in a.outputs if name in b.outputs]
     if not shared:
@@ -166,7 +170,7 @@ def _compare(
     )
 
 
-def _common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
+def _common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, str]:
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"

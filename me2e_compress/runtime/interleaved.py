@@ -7,12 +7,13 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
 
-from me2e_compress import graph
+from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.profile import WARM_UP, TimedSession, check_work, processor
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import replay
+from me2e_compress.runtime.stack.split_stack import digest_of_files
 
 BLOCK = 10
 """Inferences of one model in a row: as warm as alone, and a noise that lasts a second
@@ -45,7 +46,7 @@ class RunTimes:
 
 
 def time_interleaved(
-    sessions: Mapping[str, Session],
+    sessions: Mapping[str, AnySession],
     frames: Sequence[Frame],
     rounds: int,
     on_run: Callable[[int, int, str], None] | None = None,
@@ -90,7 +91,7 @@ def record_traces(
     repeated as often as it takes.
 
     Args:
-        models: ONNX files by name.
+        models: ONNX files, or TOMLs of stacks, by name.
         frames: the recording.
         samples: latencies of each model.
         warm_up: inferences of each before the first block.
@@ -124,7 +125,7 @@ def record_traces(
             on_sample(done * len(models) + place * block, samples * len(models), name)
     machine = describe_machine(threads, provider)
     return {
-        name: LatencyTrace(graph.sha256_of(path), machine, tuple(kept[name]))
+        name: LatencyTrace(digest_of_files(path), machine, tuple(kept[name]))
         for name, path in models.items()
     }
 

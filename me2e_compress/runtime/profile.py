@@ -6,12 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, islice, repeat
 from pathlib import Path
 
-from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import replay
+from me2e_compress.runtime.stack.split_stack import digest_of_files
+from me2e_compress.runtime.stack.stack_session import open_session
 
 WARM_UP = 10
 
@@ -32,7 +33,7 @@ def profile(
     not counted. The recording is repeated as often as it takes.
 
     Args:
-        model: ONNX file.
+        model: ONNX file, or the TOML of a stack.
         frames: What it sees.
         samples: How many latencies; None for one a frame.
         warm_up: Inferences before the first that counts.
@@ -56,7 +57,7 @@ def profile(
     if provider != CPU:
         machine += f", {PROVIDERS.text(provider)}"
     taken = tuple(session.taken_us[warm_up:])
-    return LatencyTrace(graph.sha256_of(model), machine, taken)
+    return LatencyTrace(digest_of_files(model), machine, taken)
 
 
 def check_work(samples: int, warm_up: int, frames: Frames) -> None:
@@ -72,23 +73,31 @@ def check_work(samples: int, warm_up: int, frames: Frames) -> None:
         )
 
 
-class TimedSession(Session):
+class TimedSession:
     """A session that records how long each run took.
 
     Attributes:
-        taken_us: Microseconds, one a run.
+        taken_us: Microseconds, one a run; of a stack, all of its files together.
     """
 
     def __init__(self, model: Path, *, threads: int, provider: Provider = CPU) -> None:
-        super().__init__(model, threads=threads, provider=provider)
+        self._timed = open_session(model, threads=threads, provider=provider)
+        self.inputs, self.outputs = self._timed.inputs, self._timed.outputs
+        self.metadata, self.recurrent = self._timed.metadata, self._timed.recurrent
+        self.provider = provider
+        self.first_state = self._timed.first_state
         self.taken_us = list[int]()
 
     def run(
-        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
+        self,
+        feeds: Mapping[str, Array],
+        outputs: Sequence[str] | None = None,
+        *,
+        first: bool = False,
     ) -> dict[str, Array]:
         """Run once and record the time."""
         begun = time.perf_counter_ns()
-        values = super().run(feeds, outputs)
+        values = self._timed.run(feeds, outputs, first=first)
         self.taken_us.append((time.perf_counter_ns() - begun) // 1_000)
         return values
 

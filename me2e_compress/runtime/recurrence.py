@@ -44,8 +44,7 @@ def recurrence(
         GraphError: the metadata is not such a mapping, names an unknown port, or
             pairs ports of different types.
     """
-    text = metadata.get(RECURRENT)
-    named = None if text is None else _parse(text)
+    named = declared_pairs(metadata)
     if named == {}:
         return {}
     pairs = {source: to for source, to in (named or {}).items() if to is not None}
@@ -58,6 +57,16 @@ def recurrence(
         if _fits(inputs[source], outputs[found]):
             pairs[source] = found
     return {source: pairs[source] for source in inputs if source in pairs}
+
+
+def declared_pairs(metadata: Mapping[str, str]) -> dict[str, str | None] | None:
+    """Return what the metadata says; None where it says nothing.
+
+    Raises:
+        GraphError: it is not such a mapping.
+    """
+    text = metadata.get(RECURRENT)
+    return None if text is None else _parse(text)
 
 
 def not_fed_back(

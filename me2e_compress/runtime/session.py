@@ -10,6 +10,7 @@ import onnxruntime as ort
 
 from me2e_compress import rewrite
 from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.opening import (
     REFUSALS,
@@ -136,14 +137,30 @@ class Session:
         self.metadata = metadata
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
+    def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the first values of recurrent inputs: what is held, else zeros.
+
+        Raises:
+            GraphError: an input of unknown shape has no first value.
+        """
+        return {
+            name: held[name] if name in held else zeros(name, self.inputs[name])
+            for name in self.recurrent
+        }
+
     def run(
-        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
+        self,
+        feeds: Mapping[str, Array],
+        outputs: Sequence[str] | None = None,
+        *,
+        first: bool = False,
     ) -> dict[str, Array]:
         """Run once.
 
         Args:
             feeds: one array for every input; other names are ignored.
             outputs: which to return; None for all.
+            first: whether a scene begins here; it makes no difference to one graph.
 
         Raises:
             FramesError: an input is missing, or has not the type or shape it must.
@@ -171,7 +188,7 @@ class Session:
 
 
 def replay(
-    session: Session,
+    session: AnySession,
     frames: Iterable[Frame],
     outputs: Sequence[str] | None = None,
     state: Mapping[str, Array] | None = None,
@@ -179,8 +196,8 @@ def replay(
     """Run a model over a recording, its own recurrent state fed forward.
 
     At the start of a scene a recurrent input is what the frame says or, where the
-    frame says nothing, zeros; afterwards it is what the model answered a frame ago,
-    whatever the frame says.
+    frame says nothing, its first value: zeros, but in a stack that says otherwise.
+    Afterwards it is what the model answered a frame ago, whatever the frame says.
 
     Args:
         session: the model.
@@ -201,14 +218,10 @@ def replay(
     memory: Mapping[str, Array] = {} if state is None else state
     for frame in frames:
         if frame.starts_scene:
-            memory = {
-                name: frame.arrays[name]
-                if name in frame.arrays
-                else _zeros(name, session.inputs[name])
-                for name in session.recurrent
-            }
+            memory = session.first_state(frame.arrays)
         try:
-            values = session.run({**frame.arrays, **memory}, fetched)
+            fed = {**frame.arrays, **memory}
+            values = session.run(fed, fetched, first=frame.starts_scene)
         except FramesError as error:
             raise FramesError(f"frame {frame.index}: {error}") from error
         memory = {name: values[answer] for name, answer in session.recurrent.items()}
@@ -238,7 +251,12 @@ def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, SessionPort]:
     return {each.name: SessionPort(each.type, tuple(each.shape)) for each in arguments}
 
 
-def _zeros(name: str, port: SessionPort) -> Array:
+def zeros(name: str, port: SessionPort) -> Array:
+    """Return the first value of a recurrent input.
+
+    Raises:
+        GraphError: its shape is open.
+    """
     shape = [size for size in port.shape if isinstance(size, int)]
     if len(shape) < len(port.shape) or port.type not in DTYPES:
         raise GraphError(

@@ -3,16 +3,15 @@
 import dataclasses
 from pathlib import Path
 
-from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.stack.stack_session import open_session
 from me2e_compress.workflows.checks import model_path
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_try import load_interface, try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, table
 
@@ -92,7 +91,8 @@ def compare(
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
     Args:
-        reference: the graph to be true to: a file, or the name of one that ships.
+        reference: the graph to be true to: a file, the TOML of a stack of several, or
+            the name of one that ships.
         candidate: the graph that is judged.
         frames: folder of recorded frames.
         listener: is called with progress and warnings.
@@ -109,11 +109,9 @@ def compare(
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
     for path in dict.fromkeys(paths):
-        model = graph.load(path)
+        model = load_interface(path)
         recording.check(model)
-        try_first(
-            model, path.name, listener, file=path, frames=recording, provider=provider
-        )
+        try_model(model, path, recording, listener, provider)
     total = len(recording)
 
     def reported(frame: Frame) -> Frame:
@@ -121,7 +119,9 @@ def compare(
         return frame
 
     left, right = (
-        Session(paths[0], optimize=not as_it_stands, release=True, provider=provider),
-        Session(paths[1], stock=as_it_stands, release=True, provider=provider),
+        open_session(
+            paths[0], optimize=not as_it_stands, release=True, provider=provider
+        ),
+        open_session(paths[1], stock=as_it_stands, release=True, provider=provider),
     )
     return CompareResult(*paths, measure(left, right, map(reported, recording)))

@@ -4,12 +4,12 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-from me2e_compress import graph
 from me2e_compress.calibration.logs import LOGS, DriveLog
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.stack.split_stack import digest_of_files
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
@@ -153,7 +153,7 @@ def _recorded(
     elif Path(source).is_file() or find(str(source)).trained:
         model = model_path(source)
         try_file(model, listener, options.provider)
-        make, of = _driven(model, options), graph.sha256_of(model)
+        make, of = _driven(model, options), digest_of_files(model)
     else:
         make, of = _synthetic(str(source), options), str(source)
 
@@ -176,7 +176,7 @@ def _logged(
     if Path(source).is_file():
         model, of = (
             inputs_of_model(Path(source), log.size),
-            graph.sha256_of(Path(source)),
+            digest_of_files(Path(source)),
         )
     else:
         model, of = inputs_of_stack(find(str(source))), str(source)

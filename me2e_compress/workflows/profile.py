@@ -6,7 +6,6 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.metrics.deadlines import BUDGET_MS
@@ -24,6 +23,7 @@ from me2e_compress.runtime.others_load import OthersLoad
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     check_count,
@@ -32,7 +32,7 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.deadlines_table import check_budget
-from me2e_compress.workflows.first_try import try_first
+from me2e_compress.workflows.first_try import load_interface, try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.profile_result import ProfileResult
 
@@ -118,11 +118,16 @@ def profile(
     source, written = model_path(model), None if output is None else Path(output)
     figure = None if options.figure is None else figure_path(options.figure)
     joules = _energy_path(options, written)
+    if is_stack(source) and (options.by_module or figure is not None):
+        raise EvaluationError(
+            f"{source}: nodes are timed in one graph at a time: profile one of its"
+            " files by module"
+        )
     if options.energy is not None:
         check_counter(options.energy)
     inputs = (source, frames, options.module_map)
     with writing([written, figure, joules], inputs, force=options.force):
-        loaded, recording = graph.load(source), CalibrationSet(Path(frames))
+        loaded, recording = load_interface(source), CalibrationSet(Path(frames))
         trace, load = _measured(source, loaded, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
@@ -226,14 +231,7 @@ def _measured(
     options: ProfileOptions,
     listener: Listener,
 ) -> tuple[LatencyTrace, OthersLoad]:
-    try_first(
-        loaded,
-        source.name,
-        listener,
-        file=source,
-        frames=recording,
-        provider=options.provider,
-    )
+    try_model(loaded, source, recording, listener, options.provider)
     with OthersLoad() as load:
         trace = measure(
             source,

@@ -22,8 +22,9 @@ from me2e_compress.driving.ego_track import EgoTrack
 from me2e_compress.driving.input_sources import INPUT_SOURCES, Observed
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, Shape, fed, fits
 from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.session import DTYPES, Session, SessionPort
+from me2e_compress.runtime.session import DTYPES, SessionPort
 
 IMAGES: Literal["img"] = "img"
 CONTRACT: Mapping[str, str] = {
@@ -58,7 +59,7 @@ class ModelInputs:
 
     @classmethod
     def of(
-        cls, session: Session, adapter: Adapter, recurrent: Mapping[str, str]
+        cls, session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
     ) -> Self:
         """Check the inputs of a graph against the contract.
 
@@ -171,7 +172,7 @@ def _given(adapter: Adapter, ports: Mapping[str, SessionPort]) -> dict[str, Feed
 
 
 def _images(
-    session: Session, adapter: Adapter, tables: Mapping[str, ImageInput]
+    session: AnySession, adapter: Adapter, tables: Mapping[str, ImageInput]
 ) -> tuple[dict[str, InputImages], tuple[int, int]]:
     """Return the image inputs, and the size in which the cameras are rendered."""
     ports = {
@@ -194,7 +195,7 @@ def _images(
 
 
 def _check_names(
-    session: Session, adapter: Adapter, recurrent: Mapping[str, str]
+    session: AnySession, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> None:
     """Check that what the adapter names is there, and named once."""
     for name, answer in recurrent.items():

@@ -9,9 +9,9 @@ import numpy as np
 from me2e_compress.driving.adapter.adapter import Adapter
 from me2e_compress.driving.contract import Observation, Trajectory
 from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
-from me2e_compress.runtime.session import Session
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ModelOutputs:
     plan: PlanAdapter
 
     @classmethod
-    def of(cls, session: Session, adapter: Adapter) -> Self:
+    def of(cls, session: AnySession, adapter: Adapter) -> Self:
         """Find what is read of a graph's outputs.
 
         Raises:

@@ -13,7 +13,7 @@ from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
 from me2e_compress.errors import EvaluationError
-from me2e_compress.graph import sha256_of
+from me2e_compress.runtime.stack.split_stack import digest_of_files
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class BlindDriver(Driver):
 
 @dataclass(frozen=True)
 class OnnxDriver(Driver):
-    """An ONNX file that keeps the policy contract.
+    """An ONNX file, or a stack of several, that keeps the policy contract.
 
     Attributes:
-        path: The file.
+        path: The file, or the TOML of the stack.
         adapter: TOML file that adapts the model to the contract; None where it keeps
             it as it is.
         provider: What runs it, as a text: ``cpu``, ``tensorrt{cache=engines}``.
@@ -102,7 +102,7 @@ class OnnxDriver(Driver):
 
     def fingerprint(self) -> str:
         """Return digests of its files, wherever they lie, provider and stage."""
-        digests = [sha256_of(self.path)]
+        digests = [digest_of_files(self.path)]
         if self.adapter is not None:
             digests.append(hashlib.sha256(self.adapter.read_bytes()).hexdigest())
         if self.provider != "cpu":

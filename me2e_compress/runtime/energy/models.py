@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping
 from itertools import chain, repeat
 from pathlib import Path
 
-from me2e_compress import graph
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import open_counter
 from me2e_compress.runtime.energy.energy_recording import EnergyRecording
@@ -15,7 +14,9 @@ from me2e_compress.runtime.energy.reader import Absent, Reader
 from me2e_compress.runtime.energy.schedule import EnergySchedule
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import replay
+from me2e_compress.runtime.stack.split_stack import digest_of_files
+from me2e_compress.runtime.stack.stack_session import open_session
 
 MOST_BYTES = 500_000_000
 """Frames are held in memory up to here: reading them from disk takes energy too."""
@@ -38,7 +39,7 @@ def measure_energy(
     the device.
 
     Args:
-        models: ONNX files by name.
+        models: ONNX files, or TOMLs of stacks, by name.
         frames: What they see.
         counter: ``auto``, or a name and options; see ``open_counter``.
         schedule: How long, and how often; None takes the defaults.
@@ -55,7 +56,7 @@ def measure_energy(
         GraphError: A model cannot be run.
         FramesError: A frame does not fit, or there is none.
     """
-    digests = {name: graph.sha256_of(path) for name, path in models.items()}
+    digests = {name: digest_of_files(path) for name, path in models.items()}
     opened = open_counter(counter)
     if isinstance(opened, Absent):
         found = dict.fromkeys(models, EnergyResult(reason=opened.reason))
@@ -86,7 +87,7 @@ def _metered(
     try:
         held = _held(frames)
         sessions = {
-            name: Session(path, threads=threads, provider=provider)
+            name: open_session(path, threads=threads, provider=provider)
             for name, path in models.items()
         }
         work = {

@@ -1,0 +1,1 @@
+"""A stack of several ONNX files as one model."""

@@ -1,0 +1,55 @@
+"""First values of recurrent inputs, from files."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from me2e_compress.errors import GraphError
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.recurrence import SessionPort
+from me2e_compress.runtime.stack.part_graph import misfit, told
+
+
+def read_value(path: Path, name: str, where: str) -> Array:
+    """Read a first value; of an ``.npz`` the array called like the input.
+
+    Args:
+        path: the file.
+        name: of the input.
+        where: what the message begins with.
+
+    Raises:
+        GraphError: it cannot be read, or has no such array.
+    """
+    try:
+        held = np.load(path, allow_pickle=False)
+        if isinstance(held, np.ndarray):
+            return np.asarray(held)
+        with held:
+            return np.asarray(held[name])
+    except KeyError as error:
+        raise GraphError(f"{where} holds no array {name}") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        line = " ".join(str(error).split())
+        raise GraphError(f"{where} cannot be read: {line}") from error
+
+
+def fitted(value: Array, port: SessionPort, where: str) -> Array:
+    """Give an array leading dimensions of 1, and check it against its input.
+
+    Raises:
+        GraphError: it is of another type or shape.
+    """
+    missing = max(0, len(port.shape) - value.ndim)
+    value = value.reshape((1,) * missing + value.shape)
+    element = {"float32": "float", "float64": "double"}.get(
+        value.dtype.name, value.dtype.name
+    )
+    found = SessionPort(f"tensor({element})", value.shape)
+    if misfit(found, port):
+        raise GraphError(
+            f"{where} is {told(found)}, and the input takes {told(port)}: of another"
+            " stack?"
+        )
+    return value

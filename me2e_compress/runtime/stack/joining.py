@@ -1,0 +1,291 @@
+"""Join the files of a stack: edges, state, first values."""
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from me2e_compress import documents
+from me2e_compress.errors import GraphError
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.recurrence import RECURRENT, SessionPort, recurrence
+from me2e_compress.runtime.stack.first_values import fitted, read_value
+from me2e_compress.runtime.stack.joints import Joints, Names, Source, two_givers
+from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
+from me2e_compress.runtime.stack.stack_file import ZEROS, StackFile, StateEntry
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Joined:
+    """What is known of a stack once its files are joined; see ``SplitStack``."""
+
+    inputs: Mapping[str, SessionPort]
+    outputs: Mapping[str, SessionPort]
+    answers: Mapping[str, tuple[str, str]]
+    recurrent: Mapping[str, str]
+    first_values: Mapping[str, Array]
+    at_first: Joints
+    at_next: Joints
+    metadata: Mapping[str, str]
+
+
+def join(content: StackFile, files: Sequence[PartGraph], folder: Path) -> Joined:
+    """Join files.
+
+    Args:
+        content: what the TOML says.
+        files: that it names.
+        folder: that first values are relative to.
+
+    Raises:
+        GraphError: they do not fit each other.
+    """
+    joiner = _Joiner(content, files, folder)
+    at_next = joiner.joints(first=False)
+    at_first = joiner.joints(first=True)
+    inputs = _inputs((at_next, at_first))
+    answers = dict(joiner.answers())
+    ports = {each.label: each.outputs for each in files}
+    outputs = {
+        name: ports[joiner.kept(part).label][output]
+        for name, (part, output) in answers.items()
+    }
+    recurrent = joiner.recurrent(inputs, outputs)
+    _check_joined(joiner.names.parts(), (at_next, at_first), recurrent, answers)
+    first_values = joiner.first_values(inputs, at_first)
+    metadata = _merged(files) | content.said()
+    return Joined(
+        *(inputs, outputs, answers, recurrent, first_values),
+        *(at_first, at_next, metadata),
+    )
+
+
+class _Joiner:
+    """The rules by which an input finds what feeds it."""
+
+    def __init__(
+        self, content: StackFile, files: Sequence[PartGraph], folder: Path
+    ) -> None:
+        self.content = content
+        self.folder = folder
+        self.names = Names(files)
+        self.files = {each.label: each for each in files}
+        self.edges = {
+            taker: self.names.output(output, f"[edges] {text}")
+            for text, output in content.edges.items()
+            for taker in self.names.inputs(text, f"[edges] {text}")
+        }
+        self.state = {
+            taker: entry
+            for text, entry in content.state.items()
+            for taker in self.names.inputs(text, f"[state] {text}")
+        }
+        if both := [each for each in self.state if each in self.edges]:
+            part, name = both[0]
+            raise GraphError(f"{part}.{name} is fed by [edges] and by [state]")
+
+    def joints(self, *, first: bool) -> Joints:
+        """Find what feeds every input at one kind of frame."""
+        graphs = dict(self._running(first=first))
+        sources = {
+            part: {
+                name: self._source(graphs, each, name, first=first)
+                for name in each.inputs
+            }
+            for part, each in graphs.items()
+        }
+        return Joints.of(graphs, sources)
+
+    def kept(self, part: str) -> PartGraph:
+        """Return the file of a part that runs at most frames."""
+        return self.files[part]
+
+    def answers(self) -> Iterator[tuple[str, tuple[str, str]]]:
+        """Yield the outputs that come at every frame: their names, part and output."""
+        for part, each in self._running(first=False):
+            at_first = dict(self._running(first=True))[part]
+            for output in each.outputs:
+                if output in at_first.outputs:
+                    yield self.names.public(part, output), (part, output)
+
+    def recurrent(
+        self, inputs: Mapping[str, SessionPort], outputs: Mapping[str, SessionPort]
+    ) -> dict[str, str]:
+        """Pair recurrent inputs with the outputs that answer them."""
+        pairs = dict[str, str | None]()
+        for each in self.files.values():
+            for name, output in each.recurrent().items():
+                if output is None:
+                    pairs.setdefault(name, None)
+                else:
+                    pairs[name] = self.names.public(each.part, output)
+        for (_, name), entry in self.state.items():
+            if entry.answer is not None:
+                given = self.names.output(entry.answer, f"[state] {name}")
+                pairs[name] = answer = self.names.public(*given)
+                _check_answer(name, answer, inputs, outputs)
+            elif pairs.get(name) is None:
+                pairs.pop(name, None)
+        known = {name: to for name, to in pairs.items() if name in inputs}
+        metadata = {RECURRENT: json.dumps(known)} if known else {}
+        found = recurrence(metadata, inputs, outputs)
+        for _, name in self.state:
+            if name not in found:
+                raise GraphError(
+                    f"[state] {name}: no output answers it by its name; say from ="
+                    f" one of {', '.join(outputs)}"
+                )
+        return found
+
+    def first_values(
+        self, inputs: Mapping[str, SessionPort], at_first: Joints
+    ) -> dict[str, Array]:
+        """Read the first values that are not zeros."""
+        read = {name for _, _, name in at_first.outside()}
+        found = dict[str, Array]()
+        for (part, name), entry in self.state.items():
+            if entry.first == ZEROS or self._given_first(entry) is not None:
+                continue
+            where = f"[state] {name}: first value {entry.first}"
+            if name not in read:
+                raise GraphError(
+                    f"{where} is read by nobody: {part}'s first_frame takes none"
+                )
+            value = self._array(entry.first, name, where)
+            found[name] = fitted(value, inputs[name], where)
+        return found
+
+    def _running(self, *, first: bool) -> Iterator[tuple[str, PartGraph]]:
+        for entry in self.content.part:
+            labels = [label for label, _ in entry.files()]
+            if first:
+                yield entry.name, self.files[labels[-1]]
+            elif entry.file is not None:
+                yield entry.name, self.files[labels[0]]
+
+    def _source(
+        self,
+        graphs: Mapping[str, PartGraph],
+        taker: PartGraph,
+        name: str,
+        *,
+        first: bool,
+    ) -> Source:
+        key = taker.part, name
+        if key in self.edges:
+            return self.edges[key]
+        if key in self.state:
+            given = self._given_first(self.state[key]) if first else None
+            return given or Source("", name)
+        if taker.recurrent().get(name) is not None:
+            return Source("", name)
+        givers = [
+            part
+            for part, each in graphs.items()
+            if part != taker.part and name in each.outputs
+        ]
+        if len(givers) > 1:
+            raise two_givers(f"{taker.label}.{name}", name, givers)
+        return Source(givers[0] if givers else "", name)
+
+    def _given_first(self, entry: StateEntry) -> Source | None:
+        """Return the output that is a first value; None where it is something else."""
+        part, _, name = entry.first.partition(".")
+        return Source(part, name) if part in self.names.givers(name) else None
+
+    def _array(self, text: str, name: str, where: str) -> Array:
+        path = self.folder / text
+        if path.suffix in (".npy", ".npz"):
+            return read_value(path, name, where)
+        part, _, initializer = text.partition(".")
+        for each in self.files.values():
+            value = each.initializer(initializer) if each.part == part else None
+            if value is not None:
+                return value
+        raise GraphError(
+            f"{where} is none of {ZEROS}, a file .npy or .npz, and PART.NAME of an"
+            " initializer or an output"
+        )
+
+
+def _inputs(joints: Sequence[Joints]) -> dict[str, SessionPort]:
+    """Gather what comes from outside; parts that share a name share the input."""
+    found = dict[str, tuple[PartGraph, SessionPort]]()
+    for each in joints:
+        for taker, name, public in each.outside():
+            port = taker.inputs[name]
+            other, known = found.setdefault(public, (taker, port))
+            if misfit(known, port):
+                raise GraphError(
+                    f"{other.label} takes {public} as {told(known)}, {taker.label} as"
+                    f" {told(port)}; one that another part gives belongs into [edges]"
+                )
+    return {name: port for name, (_, port) in found.items()}
+
+
+def _check_answer(
+    name: str,
+    answer: str,
+    inputs: Mapping[str, SessionPort],
+    outputs: Mapping[str, SessionPort],
+) -> None:
+    if answer not in outputs:
+        raise GraphError(f"[state] {name}: {answer} does not come at every frame")
+    if name in inputs and misfit(outputs[answer], inputs[name]):
+        raise GraphError(
+            f"[state] {name} takes {told(inputs[name])}, and {answer}, which is fed"
+            f" back to it, is {told(outputs[answer])}"
+        )
+
+
+def _check_joined(
+    parts: Sequence[str],
+    joints: Sequence[Joints],
+    recurrent: Mapping[str, str],
+    answers: Mapping[str, tuple[str, str]],
+) -> None:
+    """Refuse parts that nothing joins to the first: an edge is missing."""
+    pairs = {
+        (part, source.part)
+        for each in joints
+        for part, fed in each.sources.items()
+        for source in fed.values()
+        if source.part
+    }
+    for each in joints:
+        for taker, _, public in each.outside():
+            if public in recurrent:
+                pairs.add((taker.part, answers[recurrent[public]][0]))
+    reached = {parts[0]}
+    for _ in parts:
+        reached |= {b for a, b in pairs if a in reached}
+        reached |= {a for a, b in pairs if b in reached}
+    if alone := [each for each in parts if each not in reached]:
+        graphs = joints[1].graphs
+        there, here = graphs[alone[0]], graphs[parts[0]]
+        raise GraphError(
+            f"nothing joins {alone[0]} to {parts[0]}: [edges] must say which of"
+            f" {', '.join(here.outputs)} (of {here.part}) feeds which of"
+            f" {', '.join(there.inputs)} (of {there.part})"
+        )
+
+
+def _merged(files: Sequence[PartGraph]) -> dict[str, str]:
+    """Put metadata together: objects that agree are joined, else a later file wins."""
+    found = dict[str, str]()
+    for each in files:
+        for key, text in each.metadata.items():
+            before, now = _object(found.get(key, "")), _object(text)
+            agree = all(now.get(name, value) == value for name, value in before.items())
+            found[key] = json.dumps(before | now) if before and now and agree else text
+    found.pop(RECURRENT, None)
+    return found
+
+
+def _object(text: str) -> dict[str, object]:
+    """Read a JSON object; what is none is an empty one."""
+    try:
+        value = documents.from_json(text)
+    except documents.MalformedError:
+        return {}
+    return value if isinstance(value, dict) else {}

@@ -1,0 +1,102 @@
+"""The inputs and outputs of one file of a stack."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.errors import GraphError
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.recurrence import SessionPort, declared_pairs
+
+
+@dataclasses.dataclass(frozen=True)
+class PartGraph:
+    """One ONNX file of a stack, as far as the others see it.
+
+    Attributes:
+        label: ``head``, or ``head.first_frame``.
+        part: whose file it is.
+        path: the file.
+        inputs: by name; the shape is empty where nobody knows it.
+        outputs: by name.
+        metadata: of the file.
+    """
+
+    label: str
+    part: str
+    path: Path
+    inputs: Mapping[str, SessionPort]
+    outputs: Mapping[str, SessionPort]
+    metadata: Mapping[str, str]
+
+    @classmethod
+    def load(cls, label: str, part: str, path: Path) -> Self:
+        """Read a file.
+
+        Raises:
+            GraphError: no such file, or not a graph.
+        """
+        model = graph.load(path)
+        sides = _ports(model.graph.inputs), _ports(model.graph.outputs)
+        return cls(label, part, path, *sides, dict(model.metadata_props))
+
+    def recurrent(self) -> dict[str, str | None]:
+        """Return what its metadata feeds back: None for an input that is not.
+
+        Raises:
+            GraphError: the metadata is not such a mapping.
+        """
+        try:
+            named = declared_pairs(self.metadata)
+        except GraphError as error:
+            raise GraphError(f"{self.path}: {error}") from error
+        if named == {}:
+            return dict.fromkeys(self.inputs)
+        return named or {}
+
+    def initializer(self, name: str) -> Array | None:
+        """Read an initializer; None if there is none of that name."""
+        found = graph.load(self.path).graph.initializers.get(name)
+        tensor = None if found is None else found.const_value
+        return None if tensor is None else tensor.numpy()
+
+
+def misfit(given: SessionPort, taken: SessionPort) -> bool:
+    """Return whether what one gives can never be what the other takes."""
+    if given.type != taken.type:
+        return True
+    if not given.shape or not taken.shape:  # not known
+        return False
+    return len(given.shape) != len(taken.shape) or any(
+        isinstance(one, int) and isinstance(other, int) and one != other
+        for one, other in zip(given.shape, taken.shape, strict=True)
+    )
+
+
+def told(port: SessionPort) -> str:
+    """Say type and shape: ``float [1, 6, 2]``."""
+    element = port.type.removeprefix("tensor(").removesuffix(")")
+    return f"{element} {list(port.shape)}"
+
+
+def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
+    """Describe values as onnxruntime does."""
+    return {
+        str(value.name): SessionPort(_type(value), _shape(value)) for value in values
+    }
+
+
+def _type(value: ir.Value) -> str:
+    if isinstance(value.type, ir.TensorType) and value.dtype is not None:
+        return f"tensor({value.dtype.name.lower()})"
+    return str(value.type)
+
+
+def _shape(value: ir.Value) -> tuple[int | str | None, ...]:
+    if value.shape is None:
+        return ()
+    return tuple(each if isinstance(each, int) else each.value for each in value.shape)

@@ -1,0 +1,164 @@
+"""What the TOML file of a stack of several ONNX files says."""
+
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import pydantic
+
+from me2e_compress import documents
+from me2e_compress.errors import GraphError
+
+SUFFIX = ".toml"
+"""Ending of a file that describes a stack: wherever a model is asked for."""
+ZEROS = "zeros"
+"""The first value of a state that says nothing else."""
+
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
+_STRICT = pydantic.ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+
+class PartEntry(pydantic.BaseModel):
+    """One ``[[part]]``.
+
+    Attributes:
+        name: letters, digits, ``_`` and ``-``.
+        file: the ONNX file, relative to the TOML; without one, the part runs at first
+            frames alone.
+        first_frame: the ONNX file that runs instead where a scene begins.
+        recipe: how ``compress`` makes it smaller, where no recipe is given for all: a
+            recipe's name, or its TOML file, relative to this one.
+    """
+
+    model_config = _STRICT
+
+    name: str
+    file: Path | None = None
+    first_frame: Path | None = None
+    recipe: str | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _named(self) -> Self:
+        if not _NAME.fullmatch(self.name):
+            raise ValueError(f"name {self.name!r}: letters, digits, _ and - alone")
+        if self.file is None and self.first_frame is None:
+            raise ValueError(f"{self.name} has neither file nor first_frame")
+        return self
+
+    def files(self) -> tuple[tuple[str, Path], ...]:
+        """Return its files by label: ``head`` and ``head.first_frame``."""
+        named = ((self.name, self.file), (first_label(self.name), self.first_frame))
+        return tuple((label, path) for label, path in named if path is not None)
+
+
+class StateEntry(pydantic.BaseModel):
+    """One entry of ``[state]``.
+
+    Attributes:
+        answer: the output that is fed back; in the file ``from``. None leaves it to
+            the naming rules: ``X`` is answered by ``X_out``, ``prev_X`` by ``next_X``.
+        first: the value where a scene begins: ``zeros``, a file ``.npy`` or ``.npz``
+            relative to the TOML, or ``PART.NAME``: an initializer of that part, or an
+            output of it at that very frame.
+    """
+
+    model_config = _STRICT
+
+    answer: str | None = pydantic.Field(default=None, alias="from")
+    first: str = ZEROS
+
+
+def _entry(value: object) -> object:
+    return {"from": value} if isinstance(value, str) else value
+
+
+class StackFile(pydantic.BaseModel):
+    """The content of the file.
+
+    Attributes:
+        part: the parts, in any order.
+        edges: ``{input: output}``, each ``PART.NAME`` or a name that one part alone
+            has; equal names are joined without.
+        state: by input, what is fed back to it; a text alone is the output.
+        metadata: what the ONNX files should say and do not, such as ``me2e.plan``;
+            what is no text is written as JSON.
+    """
+
+    model_config = _STRICT
+
+    part: tuple[PartEntry, ...] = pydantic.Field(min_length=1)
+    edges: dict[str, str] = pydantic.Field(default_factory=dict)
+    state: dict[str, Annotated[StateEntry, pydantic.BeforeValidator(_entry)]] = (
+        pydantic.Field(default_factory=dict)
+    )
+    metadata: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+    @pydantic.model_validator(mode="after")
+    def _once(self) -> Self:
+        names = [each.name for each in self.part]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"two parts are called {twice[0]}")
+        return self
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file.
+
+        Raises:
+            GraphError: it cannot be read, or says what no stack has.
+        """
+        with documents.reading(path, GraphError, "not a stack of several files"):
+            return cls.model_validate(documents.from_toml(documents.content(path)))
+
+    def text(self) -> str:
+        """Write it as TOML."""
+        lines = list[str]()
+        for each in self.part:
+            lines += ["[[part]]", *_lines(each.model_dump(mode="json")), ""]
+        for title, entries in (
+            ("edges", self.edges),
+            ("state", {name: _inline(each) for name, each in self.state.items()}),
+            ("metadata", self.said()),
+        ):
+            if entries:
+                lines += [f"[{title}]", *_lines(entries), ""]
+        return "\n".join(lines)
+
+    def said(self) -> dict[str, str]:
+        """Return the metadata as texts."""
+        return {
+            key: value if isinstance(value, str) else json.dumps(value)
+            for key, value in self.metadata.items()
+        }
+
+
+def first_label(part: str) -> str:
+    """Return how the file is called that runs where a scene begins."""
+    return f"{part}.first_frame"
+
+
+class _Inline(str):
+    """TOML that stands as it is."""
+
+    __slots__ = ()
+
+
+def _inline(entry: StateEntry) -> _Inline:
+    said = {"from": entry.answer, "first": entry.first}
+    return _Inline(f"{{{', '.join(_lines(said))}}}")
+
+
+def _lines(entries: dict[str, Any]) -> list[str]:
+    return [
+        f"{_quoted(key)} = {value if isinstance(value, _Inline) else _quoted(value)}"
+        if not _NAME.fullmatch(key)
+        else f"{key} = {value if isinstance(value, _Inline) else _quoted(value)}"
+        for key, value in entries.items()
+        if value is not None
+    ]
+
+
+def _quoted(text: str) -> str:
+    """Write a TOML string: JSON's escapes are TOML's, but for delete."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

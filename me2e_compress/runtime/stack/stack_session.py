@@ -1,0 +1,219 @@
+"""A stack of several files, ready to run."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.runtime.any_session import AnySession
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.recurrence import SessionPort, not_fed_back
+from me2e_compress.runtime.session import Session, zeros
+from me2e_compress.runtime.stack.joints import Joints, Source
+from me2e_compress.runtime.stack.split_stack import SplitStack, is_stack
+
+
+@dataclasses.dataclass(frozen=True)
+class PartRun:
+    """One file of a stack at one frame.
+
+    Attributes:
+        label: of the file: ``head``, ``head.first_frame``.
+        feeds: what it was given, by its own names.
+        values: what it answered, by its own names.
+    """
+
+    label: str
+    feeds: Mapping[str, Array]
+    values: Mapping[str, Array]
+
+
+class StackSession:
+    """The sessions of a stack's files as one.
+
+    Args:
+        stack: the files, joined.
+        sessions: one a file, by label.
+        provider: what runs them.
+    """
+
+    def __init__(
+        self,
+        stack: SplitStack,
+        sessions: Mapping[str, AnySession],
+        provider: Provider = CPU,
+    ) -> None:
+        self.stack = stack
+        self.sessions = sessions
+        self.provider = provider
+
+    @classmethod
+    def open(
+        cls,
+        stack: SplitStack,
+        *,
+        threads: int = 0,
+        optimize: bool = True,
+        stock: bool = False,
+        release: bool = False,
+        provider: Provider = CPU,
+    ) -> Self:
+        """Open every file; the options are those of :class:`Session`.
+
+        Raises:
+            GraphError: onnxruntime cannot run one of them; the message names it.
+            ProviderError: the provider is not there.
+        """
+        sessions = dict[str, Session]()
+        for label, each in stack.files.items():
+            try:
+                sessions[label] = Session(
+                    each.path,
+                    threads=threads,
+                    optimize=optimize,
+                    stock=stock,
+                    release=release,
+                    provider=provider,
+                )
+            except GraphError as error:
+                raise GraphError(f"{each.path}: {error}") from error
+        return cls(stack, sessions, provider)
+
+    @property
+    def inputs(self) -> Mapping[str, SessionPort]:
+        """By name, what must be fed, in order."""
+        return self.stack.inputs
+
+    @property
+    def outputs(self) -> Mapping[str, SessionPort]:
+        """By name, what comes out at every frame, in order."""
+        return self.stack.outputs
+
+    @property
+    def metadata(self) -> Mapping[str, str]:
+        """The metadata of the stack."""
+        return self.stack.metadata
+
+    @property
+    def recurrent(self) -> Mapping[str, str]:
+        """``{input: output}`` of the state that is fed forward."""
+        return self.stack.recurrent
+
+    def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the first values of those recurrent inputs that a first frame reads.
+
+        What is held wins, then what the stack says, then zeros.
+
+        Raises:
+            GraphError: an input of unknown shape has no first value.
+        """
+        known = {**self.stack.first_values, **held}
+        read = {name for _, _, name in self.stack.at_first.outside()}
+        return {
+            name: known[name] if name in known else zeros(name, self.inputs[name])
+            for name in self.recurrent
+            if name in read
+        }
+
+    def run(
+        self,
+        feeds: Mapping[str, Array],
+        outputs: Sequence[str] | None = None,
+        *,
+        first: bool = False,
+    ) -> dict[str, Array]:
+        """Run every file once, each behind those that feed it.
+
+        Args:
+            feeds: one array for every input; other names are ignored.
+            outputs: which to return; None for all.
+            first: whether a scene begins here.
+
+        Raises:
+            FramesError: an input is missing, or has not the type or shape it must.
+            GraphError: a node failed on these inputs.
+        """
+        wanted = self.outputs if outputs is None else outputs
+        runs = {each.label: each.values for each in self.runs(feeds, first=first)}
+        graphs = self._joints(first=first).graphs
+        found = dict[str, Array]()
+        for name in wanted:
+            part, output = self.stack.answers[name]
+            found[name] = runs[graphs[part].label][output]
+        return found
+
+    def runs(
+        self, feeds: Mapping[str, Array], *, first: bool = False
+    ) -> Iterator[PartRun]:
+        """Run file after file; whoever stops asking leaves the rest unrun.
+
+        Raises:
+            FramesError: an input is missing, or has not the type or shape it must.
+            GraphError: a node failed on these inputs.
+        """
+        joints = self._joints(first=first)
+        values = dict[Source, Array]()
+        for part in joints.order:
+            label = joints.graphs[part].label
+            session = self.sessions[label]
+            fed = {
+                name: values[source] if source.part else self._fed(source.name, feeds)
+                for name, source in joints.sources[part].items()
+                if name in session.inputs
+            }
+            try:
+                found = session.run(fed)
+            except (FramesError, GraphError) as error:
+                raise type(error)(f"{label}: {error}") from error
+            values |= {Source(part, name): value for name, value in found.items()}
+            yield PartRun(label, fed, found)
+
+    def _joints(self, *, first: bool) -> Joints:
+        return self.stack.at_first if first else self.stack.at_next
+
+    def _fed(self, name: str, feeds: Mapping[str, Array]) -> Array:
+        if name in feeds:
+            return feeds[name]
+        reason = not_fed_back(name, self.inputs, self.outputs)
+        raise FramesError(
+            f"input {name} is missing; there is {', '.join(feeds) or 'none'}{reason}"
+        )
+
+
+def open_session(
+    path: Path,
+    *,
+    threads: int = 0,
+    optimize: bool = True,
+    stock: bool = False,
+    release: bool = False,
+    provider: Provider = CPU,
+) -> AnySession:
+    """Open an ONNX file, or the stack that a TOML file describes.
+
+    The options are those of :class:`Session`.
+
+    Raises:
+        GraphError: no such file, files that do not fit each other, or onnxruntime
+            cannot run one.
+        ProviderError: the provider is not there.
+    """
+    if is_stack(path):
+        return StackSession.open(
+            SplitStack.load(path),
+            threads=threads,
+            optimize=optimize,
+            stock=stock,
+            release=release,
+            provider=provider,
+        )
+    return Session(
+        path,
+        threads=threads,
+        optimize=optimize,
+        stock=stock,
+        release=release,
+        provider=provider,
+    )
