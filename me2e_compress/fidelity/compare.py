@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Self, TypeAlias
 
 import numpy as np
@@ -17,6 +17,7 @@ from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.session import detached, replay
 
 Float64: TypeAlias = npt.NDArray[np.float64]
+Watch: TypeAlias = Callable[[dict[str, Array], dict[str, Array], Frame], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +108,9 @@ class Reference:
         return _compare(self.session, iter(self.answers), other, shown)
 
 
-def compare(a: AnySession, b: AnySession, frames: Iterable[Frame]) -> Fidelity:
+def compare(
+    a: AnySession, b: AnySession, frames: Iterable[Frame], watch: Watch | None = None
+) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
 
     All arithmetic is float64. One frame is in memory at a time.
@@ -116,6 +119,7 @@ def compare(a: AnySession, b: AnySession, frames: Iterable[Frame]) -> Fidelity:
         a: the reference.
         b: what was made of it.
         frames: the recording.
+        watch: is shown the outputs of both on every frame.
 
     Raises:
         EvaluationError: no common output, no frame, an output changes its shape, or
@@ -123,7 +127,7 @@ def compare(a: AnySession, b: AnySession, frames: Iterable[Frame]) -> Fidelity:
         FramesError: a frame does not fit one of the models.
     """
     here, there = itertools.tee(frames)
-    return _compare(a, replay(a, here), b, there)
+    return _compare(a, replay(a, here), b, there, watch)
 
 
 def _compare(
@@ -131,6 +135,7 @@ def _compare(
     answers: Iterator[dict[str, Array]],
     b: AnySession,
     frames: Iterable[Frame],
+    watch: Watch | None = None,
 ) -> Fidelity:
     shared = [name for name in a.outputs if name in b.outputs]
     if not shared:
@@ -138,7 +143,7 @@ def _compare(
             f"no output in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
         )
     tallies = {name: _Tally(name) for name in shared}
-    adapter, reason = _common_adapter(a, b)
+    adapter, reason = common_adapter(a, b)
     named = SetOutputs.of(a.metadata, {name: a.outputs[name].shape for name in shared})
     sets = None if named is None else SetTally(named)
     moved, chosen = list[Float64](), list[bool]()
@@ -153,6 +158,8 @@ def _compare(
             moved.append(np.linalg.norm(gap, axis=1))
             if adapter.scores is not None:
                 chosen.append(adapter.choice(left) == adapter.choice(right))
+        if watch is not None:
+            watch(left, right, frame)
         if sets is not None:
             sets.add(left, right)
         count += 1
@@ -170,7 +177,8 @@ def _compare(
     )
 
 
-def _common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, str]:
+def common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, str]:
+    """Return how the plan of both is read; else None and the reason."""
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"

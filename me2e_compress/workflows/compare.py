@@ -4,15 +4,17 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.matched_sets import SetFidelity
+from me2e_compress.fidelity.open_loop import OpenLoopTally
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.stack_session import open_session
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.first_try import load_interface, try_model
 from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.plan_quality import OpenLoop
 from me2e_compress.workflows.result import Result, Table, table
 
 
@@ -24,11 +26,16 @@ class CompareResult(Result):
         reference: the graph to be true to.
         candidate: the graph that is judged.
         fidelity: output by output, and of the plan.
+        open_loop: both plans against what was really driven; None where it was not
+            measured.
+        open_loop_reason: why not; empty where it was.
     """
 
     reference: Path
     candidate: Path
     fidelity: Fidelity
+    open_loop: OpenLoop | None = None
+    open_loop_reason: str = ""
 
     @property
     def headline(self) -> str:
@@ -45,7 +52,7 @@ class CompareResult(Result):
         return f"{said}; the same candidate on {found.same_choice:.1%} of them"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return signal to noise and largest error of every output."""
+        """Return signal to noise of every output, then sets, then plans as driven."""
         found = self.fidelity
         rows = [
             *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in found.outputs),
@@ -53,15 +60,22 @@ class CompareResult(Result):
         ]
         title = f"Fidelity over {found.frames} frames"
         outputs = table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows)
-        return (outputs, *(() if found.agents is None else (_agents(found.agents),)))
+        agents = () if found.agents is None else (_agents(found.agents),)
+        driven = () if self.open_loop is None else (self.open_loop.table(),)
+        return (outputs, *agents, *driven)
 
     def records(self) -> list[dict[str, object]]:
         """Return a row an output."""
         return [dataclasses.asdict(each) for each in self.fidelity.outputs]
 
     def to_json(self) -> object:
-        """Return outputs, missing outputs, plan and number of frames."""
-        return self.fidelity
+        """Return outputs, missing outputs, plan, number of frames, plans as driven."""
+        driven = None if self.open_loop is None else dataclasses.asdict(self.open_loop)
+        return {
+            **dataclasses.asdict(self.fidelity),
+            "open_loop": driven,
+            "open_loop_reason": self.open_loop_reason,
+        }
 
 
 def _agents(found: SetFidelity) -> Table:
@@ -89,6 +103,8 @@ def compare(
     provider: Provider = CPU,
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
+
+    Where the frames tell what was really driven, also L2 and collisions of both plans.
 
     Args:
         reference: the graph to be true to: a file, the TOML of a stack of several, or
@@ -124,4 +140,11 @@ def compare(
         ),
         open_session(paths[1], stock=as_it_stands, release=True, provider=provider),
     )
-    return CompareResult(*paths, measure(left, right, map(reported, recording)))
+    adapter, reason = common_adapter(left, right)
+    tally = None if adapter is None else OpenLoopTally(adapter)
+    watch = None if tally is None else tally.add
+    fidelity = measure(left, right, map(reported, recording), watch)
+    driven = reason if tally is None else OpenLoop.of(tally)
+    if isinstance(driven, str):
+        return CompareResult(*paths, fidelity, None, driven)
+    return CompareResult(*paths, fidelity, driven)

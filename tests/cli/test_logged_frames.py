@@ -108,3 +108,43 @@ def test_what_does_not_fit_is_one_line(
     shown = " ".join(capsys.readouterr().err.split())
     assert message in shown
     assert not (tmp_path / "out").exists()
+
+
+PLANNER = """
+<ir_version: 9, opset_import: ["" : 17]>
+planner (float[18] can_bus) => (float[1,6,2] plan)
+<float[1,6,2] way = {0,3, 0,6, 0,9, 0,12, 0,15, 0,18}, float speed = {%s},
+ int64[1] one = {1}, int64[1] two = {2}> {
+    moved = Slice(can_bus, one, two)
+    nothing = Sub(moved, moved)
+    faster = Mul(way, speed)
+    plan = Add(faster, nothing)
+}
+"""
+
+
+def test_plans_are_held_against_what_was_driven(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A plan straight on at the car's speed, and one that stands still."""
+    root = write_nuscenes(tmp_path / "log", 8)
+    for name, speed in (("go", 1), ("stand", 0)):
+        model = ir.from_onnx_text(PLANNER % speed)
+        model.metadata_props["me2e.stack"] = "vad-tiny"
+        graph.save(model, tmp_path / f"{name}.onnx")
+    frames, log = tmp_path / "frames", f"nuscenes:{root}"
+    models = tmp_path / "go.onnx", tmp_path / "stand.onnx"
+    assert command("frames", models[0], "--from", log, "-o", frames) == 0
+    capsys.readouterr()
+
+    assert command("compare", *models, frames, "--json") == 0
+
+    found = strict(capsys.readouterr().out)
+    assert faults("compare", found) == []
+    seen = found["open_loop"]
+    assert (seen["frames"], seen["scenes"], seen["left_out"]) == (2, 1, 6)
+    at = {(q["measure"], q["horizon_s"]): q for q in seen["qualities"][::-1]}
+    assert at["l2", 1]["candidate"] == pytest.approx(6.0, abs=0.1)
+    # the lidar, 0.94 m ahead of the car, is 0.707 m to the left and 0.047 m behind
+    assert at["l2", 1]["reference"] == pytest.approx(0.7084, abs=1e-4)
+    assert at["collision", 3]["reference"] == 0
