@@ -30,6 +30,7 @@ from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.answer import checked
 from me2e_compress.driving.contract import PedalsAndWheel
 from me2e_compress.driving.onnx_policy import OnnxPolicy
+from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.providers import PROVIDERS
@@ -45,7 +46,8 @@ class GraphAgentOptions(AgentOptions):
 
     Attributes:
         model: The ONNX file.
-        adapter: TOML file that adapts it to the contract; None where it keeps it.
+        adapter: TOML file that adapts it to the contract, or the name of one that
+            ships; None where it keeps it.
         provider: What runs it, as a text.
         folder: Where each route's folder with ``metric_info.json`` is made: what the
             leaderboard is given as SAVE_PATH; None writes none.
@@ -81,7 +83,8 @@ class GraphAgentOptions(AgentOptions):
         """
         if not self.model.is_file():
             raise EvaluationError(f"model {self.model}: no such file")
-        adapter = None if self.adapter is None else Adapter.load(self.adapter)
+        named = self.adapter
+        adapter = None if named is None else Adapter.load(adapter_file(named))
         policy = OnnxPolicy.open(self.model, adapter, PROVIDERS.parse(self.provider))
         policy.reset(None)
         return policy

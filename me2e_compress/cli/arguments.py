@@ -48,7 +48,9 @@ Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; 0 takes all")
 Workers = Annotated[int, typer.Option(min=1, help="processes: as many at a time")]
 Engine = Annotated[str, typer.Option(help="local or ray")]
 Address = Annotated[str | None, typer.Option(help="of a Ray cluster")]
-Adapter = Annotated[Path | None, typer.Option(help="TOML: adapts the model")]
+Adapter = Annotated[
+    Path | None, typer.Option(help="adapts the model: A.toml, or see list")
+]
 SetDim = Annotated[
     list[str] | None,
     typer.Option(help="size of an open dimension: batch=1; once for each"),

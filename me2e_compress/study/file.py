@@ -8,6 +8,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress import documents, recipe
 from me2e_compress.driving.policies import driver_named
+from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.passes import Pass
@@ -228,10 +229,15 @@ class _Reader:
             policy,
             self._passes(table),
             self._map(table.map),
-            self._file(adapter),
+            self._adapter(adapter),
             self._file(table.trace),
             stage,
         )
+
+    def _adapter(self, name: str | None) -> Path | None:
+        if name in shipped_adapters() and not self._beside(name).is_file():
+            return adapter_file(Path(name))
+        return self._file(name)
 
     def _passes(self, table: _Variant) -> tuple[Pass, ...]:
         if table.recipe is not None and table.passes is not None:

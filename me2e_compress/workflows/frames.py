@@ -7,6 +7,9 @@ from pathlib import Path
 from me2e_compress.calibration.logs import LOGS, DriveLog
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import Begin, Source, write_recording
+from me2e_compress.driving.shipped_adapters import adapter_file
+from me2e_compress.errors import EvaluationError
+from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import digest_of_files
@@ -39,9 +42,12 @@ class FramesOptions:
         force: replace outputs that are not as we left them, too.
         provider: what opens the model whose frames they are.
         log: recorded driving that they are made from; None makes them up.
+        adapter: TOML file that adapts an ONNX file to the policy contract, or the name
+            of one that ships: the frames are in the model's own form.
 
     Raises:
         RecipeError: a seed below 0.
+        EvaluationError: an adapter for frames of a log.
     """
 
     count: int = 256
@@ -50,10 +56,16 @@ class FramesOptions:
     force: bool = False
     provider: Provider = CPU
     log: DriveLog | None = None
+    adapter: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the seed."""
+        """Check the seed, and that the adapter adapts something."""
         check_count("--seed", self.seed)
+        if self.adapter is not None and self.log is not None:
+            raise EvaluationError(
+                f"adapter {self.adapter}: --from lays frames out by the model's inputs;"
+                " leave one out"
+            )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -132,12 +144,13 @@ def record_frames(
             is the input.
         FramesError: a count below 1, the folder holds something else, or the log
             lacks something or cannot feed the model.
-        EvaluationError: the file does not keep the policy contract.
+        EvaluationError: the file does not keep the policy contract, or the adapter
+            adapts nothing.
         ProviderError: the provider is not there.
         MissingExtraError: driving needs the extra ``highway``, a log ``logs``.
     """
     options, folder = options or FramesOptions(), Path(folder)
-    check_folder(folder, (source,))
+    check_folder(folder, (source, options.adapter))
     with writing(trees=[folder], force=options.force):
         return _recorded(source, folder, options, listener)
 
@@ -154,6 +167,13 @@ def _recorded(
         model = model_path(source)
         try_file(model, listener, options.provider)
         make, of = _driven(model, options), digest_of_files(model)
+        if options.adapter is not None:
+            of += f" {sha256_of(adapter_file(options.adapter))}"
+    elif options.adapter is not None:
+        raise EvaluationError(
+            f"adapter {options.adapter}: {source} is drawn from a synthetic world; name"
+            " the ONNX file that it adapts"
+        )
     else:
         make, of = _synthetic(str(source), options), str(source)
 
@@ -192,10 +212,14 @@ def _logged(
 
 def _driven(model: Path, options: FramesOptions) -> Source:
     need_closed_loop("what frames of a driver need")
+    from me2e_compress.driving.adapter import Adapter
     from me2e_compress.driving.onnx_policy import OnnxPolicy
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 
-    policy = OnnxPolicy.open(model, provider=options.provider)
+    adapter = None
+    if options.adapter is not None:
+        adapter = Adapter.load(adapter_file(options.adapter))
+    policy = OnnxPolicy.open(model, adapter, options.provider)
     length = options.scene_length
     return lambda begin: driven_frames(
         policy,

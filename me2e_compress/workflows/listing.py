@@ -6,14 +6,17 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import resources
 from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 from me2e_compress import modules, recipe
 from me2e_compress.calibration.logs import LOGS
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.driving.host_stage import HOST_STAGES
+from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.latency import LATENCY_SOURCES
 from me2e_compress.driving.policies import POLICIES
+from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import RecipeError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.operators import OPERATORS
@@ -93,6 +96,10 @@ def _studies() -> tuple[Entry, ...]:
     return tuple(_file(path) for path in files if path.name.endswith(".toml"))
 
 
+def _adapters() -> tuple[Entry, ...]:
+    return tuple(_file(adapter_file(Path(name))) for name in shipped_adapters())
+
+
 def _module_maps() -> tuple[Entry, ...]:
     """Describe the presets: a map by its modules."""
     maps = [modules.ModuleMap.load(name) for name in (*modules.presets(), "whole")]
@@ -127,6 +134,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "latency-sources": LATENCY_SOURCES,
     "energy-counters": ENERGY_COUNTERS,
     "host-stages": HOST_STAGES,
+    "input-sources": INPUT_SOURCES,
     "evaluators": EVALUATORS,
     "providers": PROVIDERS,
     "operators": OPERATORS,
@@ -136,6 +144,7 @@ KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     **{kind: partial(_registered, kind) for kind in REGISTRIES},
     "recipes": _recipes,
     "studies": _studies,
+    "adapters": _adapters,
     "module-maps": _module_maps,
     "stacks": _stacks,
 }

@@ -20,11 +20,15 @@ def motion(x: float, y: float, heading: float, speed: float = 6.0) -> EgoKinemat
     return EgoKinematics(x, y, heading, speed, (1.0, 2.0, 9.0), (0.0, 0.0, 0.5))
 
 
-def observation(now: EgoKinematics, time_us: int = 1_000_000) -> Observation:
+def observation(
+    now: EgoKinematics,
+    time_us: int = 1_000_000,
+    images: npt.NDArray[np.uint8] | None = None,
+) -> Observation:
     before = motion(now.x - 3.0, now.y, now.heading - 0.1)
     return Observation(
         time_us,
-        None,
+        images,
         RIG.lidar2img,
         can_bus_between(now, before),
         3,

@@ -80,10 +80,8 @@ def test_cameras_come_one_by_one_and_are_rendered_in_the_largest_size(
     ports = "float[1, 3, 90, 160] wide, uint8[1, 45, 80, 3] behind"
     inputs = inputs_of(tmp_path, f"{ports}, float[1, 3, 3] k", text)
     pictures = np.full((6, 90, 160, 3), 7, np.uint8)
-    seen = observation(NOW)
-    object.__setattr__(seen, "images", pictures)
 
-    found = inputs.feeds(seen)
+    found = inputs.feeds(observation(NOW, images=pictures))
 
     assert inputs.image_size == (90, 160)
     assert found["behind"].dtype == np.uint8

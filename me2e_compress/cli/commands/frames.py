@@ -30,6 +30,7 @@ def frames(
     count: given.Count = 256,
     scene_length: Length = None,
     log: Log = None,
+    adapter: given.Adapter = None,
     seed: given.Seed = 0,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
@@ -39,7 +40,7 @@ def frames(
     """Write calibration frames, coherent in time, seen by six cameras.
 
     For vad-tiny and tcp a synthetic world is drawn; for highway, or any ONNX file that
-    keeps the policy contract, the expert drives fresh routes of highway-env. With
+    keeps the policy contract (--adapter), the expert drives fresh routes. With
     --from, recorded driving of nuScenes or Bench2Drive is laid out as either takes it.
     """
     options = workflow.FramesOptions(
@@ -49,6 +50,7 @@ def frames(
         force,
         provider_named(provider, plugins or ()),
         None if log is None else LOGS.parse(log),
+        adapter,
     )
     with listening() as listener:
         workflow.record_frames(stack, output, options, listener)

@@ -12,6 +12,7 @@ from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE
+from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.stack.split_stack import digest_of_files
 
@@ -61,8 +62,8 @@ class OnnxDriver(Driver):
 
     Attributes:
         path: The file, or the TOML of the stack.
-        adapter: TOML file that adapts the model to the contract; None where it keeps
-            it as it is.
+        adapter: TOML file that adapts the model to the contract, or the name of one
+            that ships; None where the model keeps it as it is.
         provider: What runs it, as a text: ``cpu``, ``tensorrt{cache=engines}``.
         host_stage: Changes the plan on the host, as a text: ``collision-optimizer``;
             empty leaves it as the network has it.
@@ -73,6 +74,11 @@ class OnnxDriver(Driver):
     adapter: Path | None = None
     provider: str = "cpu"
     host_stage: str = ""
+
+    def __post_init__(self) -> None:
+        """Find the adapter that ships, where its name is given."""
+        if self.adapter is not None and str(self.adapter) in shipped_adapters():
+            object.__setattr__(self, "adapter", adapter_file(self.adapter))
 
     def open(self) -> Policy:
         """Return the policy.

@@ -1,0 +1,75 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.onnx_policy import OnnxPolicy
+from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.zoo.stacks import TCP
+from tests.evaluators.highway.drivers import straight_on
+
+
+@pytest.fixture
+def tcp(tmp_path: Path) -> Path:
+    """TCP's inputs, and its waypoints straight ahead."""
+    ports = ", ".join(f"float{list(at)} {name}" for name, at in TCP.inputs.items())
+    return straight_on(
+        tmp_path / "tcp.onnx",
+        inputs=ports,
+        body="pred_wp = Identity (ways)",
+        outputs="float[1, 4, 2] pred_wp",
+        initializers=", float[1, 4, 2] ways = {2, 0, 4, 1, 6, 2, 8, 3}",
+    )
+
+
+def test_tcp_sees_its_strip_and_its_state(tcp: Path, tmp_path: Path) -> None:
+    options = FramesOptions(2, seed=1, adapter=Path("tcp"), scene_length=2)
+
+    folder = record_frames(tcp, tmp_path / "frames", options)
+
+    first, second = (frame.arrays for frame in CalibrationSet(folder))
+    assert {name: array.shape for name, array in second.items()} == TCP.inputs
+    state, target = second["state"][0], second["target_point"][0]
+    assert state[1:3].tolist() == target.tolist()
+    assert 4.0 <= np.hypot(*target) <= 60.0
+    assert sorted(state[3:]) == [0, 0, 0, 0, 0, 1]
+    assert 0.0 <= state[0] <= 2.0
+    assert not np.array_equal(first["img"], second["img"])
+
+
+def test_tcps_waypoints_are_turned_to_ours(tcp: Path) -> None:
+    policy = OnnxDriver(tcp, Path("tcp")).open()
+
+    assert isinstance(policy, OnnxPolicy)
+    assert policy.image_size == (288, 512)
+    assert policy.adapter.to_ego(np.array([[8.0, 3.0]])).tolist() == [[8.0, -3.0]]
+
+
+@pytest.mark.parametrize("name", shipped_adapters())
+def test_what_ships_can_be_read(name: str) -> None:
+    assert Adapter.load(adapter_file(Path(name))) != Adapter()
+
+
+def test_a_file_of_that_name_wins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert adapter_file(Path("tcp")).name == "tcp.toml"
+    Path("tcp").write_text("axes = 'forward-left'")
+
+    assert adapter_file(Path("tcp")) == Path("tcp")
+
+
+def test_no_such_adapter_names_those_that_ship() -> None:
+    with pytest.raises(EvaluationError, match="adapter tpc: no such file; we ship"):
+        adapter_file(Path("tpc"))
+
+
+def test_a_synthetic_world_takes_no_adapter(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="tcp is drawn from a synthetic world"):
+        record_frames("tcp", tmp_path / "f", FramesOptions(1, adapter=Path("tcp")))
