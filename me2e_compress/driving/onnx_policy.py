@@ -74,28 +74,32 @@ class OnnxPolicy:
         """
         try:
             session = open_session(path, threads=1, provider=provider)
-            policy = cls._of(session, adapter or Adapter(), stage)
-            policy._dry_run()
+            return cls.of(session, adapter or Adapter(), stage)
         except (GraphError, FramesError, EvaluationError) as error:
             words = str(error).removeprefix(f"{path}: ")
             raise EvaluationError(f"{path}: {words}") from error
-        return policy
 
     @classmethod
-    def _of(
-        cls, session: AnySession, adapter: Adapter, stage: HostStage | None
+    def of(
+        cls, session: AnySession, adapter: Adapter, stage: HostStage | None = None
     ) -> Self:
-        recurrent = dict(
-            session.recurrent if adapter.recurrent is None else adapter.recurrent
-        )
-        return cls(
-            session,
-            adapter,
-            ModelInputs.of(session, adapter, recurrent),
-            ModelOutputs.of(session, adapter),
-            recurrent,
-            stage,
-        )
+        """Drive a graph that is open, and run it once on zeros; see :meth:`open`.
+
+        Raises:
+            EvaluationError: It does not keep the contract.
+            FramesError: It cannot be fed.
+            GraphError: A node of the model failed.
+        """
+        recurrent = recurrent_of(session, adapter)
+        inputs = ModelInputs.of(session, adapter, recurrent)
+        outputs = ModelOutputs.of(session, adapter)
+        if stage is not None and outputs.plan is None:
+            raise EvaluationError(
+                f"{stage.name} changes a plan, and this model answers controls alone"
+            )
+        policy = cls(session, adapter, inputs, outputs, recurrent, stage)
+        policy._dry_run()
+        return policy
 
     @property
     def needs_images(self) -> bool:
@@ -117,6 +121,7 @@ class OnnxPolicy:
         self._begins = True
         known = self.session.first_state({})
         self.inputs.reset()
+        self.outputs.reset()
         self._state = {
             name: zeros(name, self.session.inputs[name])
             for name in self.recurrent
@@ -136,9 +141,14 @@ class OnnxPolicy:
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
         plan = self.outputs.trajectory(outputs, feeds, observation)
-        if self.stage is None:
-            return plan
-        work = self.stage.work(np.asarray(plan.points, np.float64), outputs)
+        if plan is not None and self.stage is not None:
+            plan = self._changed(plan, self.stage, outputs)
+        return self.outputs.answer(plan, outputs, observation)
+
+    def _changed(
+        self, plan: Trajectory, stage: HostStage, outputs: dict[str, Array]
+    ) -> Trajectory:
+        work = stage.work(np.asarray(plan.points, np.float64), outputs)
         self.host_iterations, self.host_cells = work.iterations, work.cells
         return Trajectory(work.plan, plan.times_s)
 
@@ -161,3 +171,9 @@ class OnnxPolicy:
                     f"output {answer} has shape {list(given)}, the recurrent input "
                     f"{name} takes {list(wanted)}"
                 )
+
+
+def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
+    """Return each recurrent input with the output that answers it."""
+    told = session.recurrent if adapter.recurrent is None else adapter.recurrent
+    return dict(told)

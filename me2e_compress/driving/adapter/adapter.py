@@ -5,13 +5,15 @@ from typing import Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from me2e_compress import documents
+from me2e_compress.driving.adapter.controls import ControlAdapter
 from me2e_compress.driving.adapter.feeds import Feed
 from me2e_compress.driving.adapter.image_inputs import ImageInput
 from me2e_compress.driving.adapter.images import ImageNormalization
 from me2e_compress.driving.axes import Axes
+from me2e_compress.driving.head_fusion import FusionOptions
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 
@@ -27,8 +29,11 @@ class Adapter(BaseModel):
         feeds: What each other input of the graph is made of, by its name.
         images: What each image input shows, by its name.
         recurrent: Recurrent input to the output that answers it.
-        plan: Which output is the plan, whether it holds steps, which mode is taken;
-            ``command_input = "command"`` lets the navigator's command pick it.
+        plan: Which output is the plan, when its waypoints are to be reached, whether it
+            holds steps, which mode is taken; ``command_input = "command"`` lets the
+            navigator's command pick it.
+        control: Which outputs are the controls, which drive in place of the plan.
+        fusion: Both drive, fused.
         image: Normalisation of image inputs that have none of their own.
         axes: Ground frame of the model.
     """
@@ -40,8 +45,18 @@ class Adapter(BaseModel):
     images: dict[str, ImageInput] = {}
     recurrent: dict[str, str] | None = None
     plan: PlanAdapter | None = None
+    control: ControlAdapter | None = None
+    fusion: FusionOptions | None = None
     image: ImageNormalization | None = None
     axes: Axes = Axes.FORWARD_LEFT
+
+    @model_validator(mode="after")
+    def _one_driver(self) -> Self:
+        if self.fusion is not None and self.control is None:
+            raise ValueError("fusion fuses a plan with a control: name [control] too")
+        if self.plan is not None and self.control is not None and self.fusion is None:
+            raise ValueError("plan and control both drive: leave one out, or [fusion]")
+        return self
 
     @classmethod
     def load(cls, path: Path) -> Self:

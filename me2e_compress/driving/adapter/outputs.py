@@ -7,7 +7,9 @@ from typing import Self
 import numpy as np
 
 from me2e_compress.driving.adapter.adapter import Adapter
-from me2e_compress.driving.contract import Observation, Trajectory
+from me2e_compress.driving.adapter.controls import ControlAdapter, output_named
+from me2e_compress.driving.contract import Answer, Observation, Trajectory
+from me2e_compress.driving.head_fusion import HeadFusion
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
@@ -20,30 +22,45 @@ class ModelOutputs:
 
     Attributes:
         adapter: How its outputs relate to the contract.
-        plan: How its plan is read.
+        plan: How its plan is read; None where controls alone drive.
+        control: How its controls are read; None where the plan alone drives.
+        fusion: Fuses both, and remembers; None where one drives.
     """
 
     adapter: Adapter
-    plan: PlanAdapter
+    plan: PlanAdapter | None
+    control: ControlAdapter | None
+    fusion: HeadFusion | None
 
     @classmethod
     def of(cls, session: AnySession, adapter: Adapter) -> Self:
         """Find what is read of a graph's outputs.
 
         Raises:
-            EvaluationError: Nothing names the plan, or the graph has no such output.
+            EvaluationError: Nothing names the plan or the controls, or the graph has no
+                such output.
         """
-        return cls(
-            adapter, plan_of(adapter.plan, session.metadata, list(session.outputs))
-        )
+        outputs, control = list(session.outputs), adapter.control
+        fusion = None if adapter.fusion is None else HeadFusion(adapter.fusion)
+        if control is not None:
+            check_control(control, outputs)
+            if fusion is None:
+                return cls(adapter, None, control, None)
+        plan = plan_of(adapter.plan, session.metadata, outputs)
+        return cls(adapter, plan, control, fusion)
+
+    def reset(self) -> None:
+        """Begin a route."""
+        if self.fusion is not None:
+            self.fusion.reset()
 
     def trajectory(
         self,
         outputs: Mapping[str, Array],
         feeds: Mapping[str, Array],
         observation: Observation,
-    ) -> Trajectory:
-        """Return the plan in the ego frame.
+    ) -> Trajectory | None:
+        """Return the plan in the ego frame; None where controls alone drive.
 
         Args:
             outputs: Of the graph.
@@ -53,9 +70,56 @@ class ModelOutputs:
         Raises:
             GraphError: See `PlanAdapter.plan`.
         """
+        if self.plan is None:
+            return None
         command = np.array([observation.command])
         points = self.plan.plan(outputs, {**feeds, "command": command})
         return self.plan.trajectory(self.adapter.to_ego(points))
+
+    def answer(
+        self,
+        plan: Trajectory | None,
+        outputs: Mapping[str, Array],
+        observation: Observation,
+    ) -> Answer:
+        """Return what drives: the plan, the controls, or both fused.
+
+        Args:
+            plan: From :meth:`trajectory`, as the host left it.
+            outputs: Of the graph.
+            observation: What the graph was fed is made of.
+
+        Raises:
+            EvaluationError: An output has not as many numbers, or fusion lacks the
+                target point.
+        """
+        if self.control is None:
+            assert plan is not None
+            return plan
+        control = self.control.read(outputs)
+        if self.fusion is None or plan is None:
+            return control
+        speed_mps, points = observation.speed_mps, observation.target_points
+        if points is None:
+            raise EvaluationError("fusion aims at a target point, and there is none")
+        forward, left = points[0].tolist()
+        return self.fusion.fuse(plan, control, speed_mps, (-left, forward))
+
+
+def check_control(control: ControlAdapter, outputs: Sequence[str]) -> None:
+    """Check that a graph has the outputs that are read as controls.
+
+    Raises:
+        EvaluationError: One is not there.
+    """
+    there = dict.fromkeys(outputs)
+    for text, what in control.outputs.items():
+        name, _ = output_named(text, there)
+        if name not in there:
+            raise EvaluationError(
+                f"no output {name}, which the adapter names as {what}; there are "
+                f"{', '.join(outputs)}"
+            )
 
 
 def plan_of(
