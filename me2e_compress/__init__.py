@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.build import BuildOptions, EngineResult, build
     from me2e_compress.workflows.calibrate import CalibrateOptions, calibrate
     from me2e_compress.workflows.calibrate_result import CalibrateResult
+    from me2e_compress.workflows.check_model import ModelCheck, check_model
     from me2e_compress.workflows.compare import CompareResult, compare
     from me2e_compress.workflows.compress import CompressOptions, compress
     from me2e_compress.workflows.compress_result import CompressResult
@@ -71,6 +72,7 @@ __all__ = [
     "LintResult",
     "Listener",
     "Me2eError",
+    "ModelCheck",
     "ModuleMap",
     "Pass",
     "PassManager",
@@ -91,6 +93,7 @@ __all__ = [
     "__version__",
     "build",
     "calibrate",
+    "check_model",
     "compare",
     "compress",
     "evaluate",
@@ -134,6 +137,7 @@ _ROOMS = {
     "workflows.build": ("BuildOptions", "EngineResult", "build"),
     "workflows.calibrate": ("CalibrateOptions", "calibrate"),
     "workflows.calibrate_result": ("CalibrateResult",),
+    "workflows.check_model": ("ModelCheck", "check_model"),
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),

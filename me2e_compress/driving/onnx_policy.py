@@ -173,7 +173,7 @@ class OnnxPolicy:
                 )
 
 
-def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
+def recurrent_of(session: AnySession, adapter: Adapter) -> dict[str, str]:
     """Return each recurrent input with the output that answers it."""
     told = session.recurrent if adapter.recurrent is None else adapter.recurrent
     return dict(told)

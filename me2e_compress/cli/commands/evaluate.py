@@ -8,8 +8,9 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show, tell
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S
-from me2e_compress.runtime.providers import provider_named
+from me2e_compress.runtime.providers import Provider, provider_named
 from me2e_compress.workflows import evaluate as workflow
+from me2e_compress.workflows.check_model import check_model
 
 Policy = Annotated[
     str | None,
@@ -18,7 +19,13 @@ Policy = Annotated[
 Evaluator = Annotated[
     str, typer.Option(help="who drives it: highway, NAME{option=value}, or see list")
 ]
-Output = Annotated[Path, typer.Option("-o", "--output", help="the results folder")]
+Output = Annotated[
+    Path | None, typer.Option("-o", "--output", help="the results folder")
+]
+Check = Annotated[
+    bool,
+    typer.Option("--check", help="say what fits and what is missing, drive nothing"),
+]
 Latency = Annotated[
     str, typer.Option(help="none, fps:F, trace:FILE, measured, or see list")
 ]
@@ -39,8 +46,9 @@ Render = Annotated[str | None, typer.Option(help="draw this route as GIF and PNG
 
 
 def evaluate(
-    output: Output,
     policy: Policy = None,
+    output: Output = None,
+    check: Check = False,
     routes: given.Routes = "all",
     latency: Latency = "none",
     latency_scale: Scale = 1.0,
@@ -65,14 +73,21 @@ def evaluate(
     """Drive a policy over routes of highway-env; run it again to go on.
 
     Another evaluator takes options of its own; --evaluator and --force alone are
-    for all.
+    for all. --check looks at POLICY, --adapter and --provider alone; 1 if it could
+    not drive.
     """
+    runs = provider_named(provider, plugins or ())
+    if check:
+        _check(policy, adapter, runs, as_json)
+        return
+    if output is None:
+        raise typer.BadParameter("driving needs -o RESULTS/", param_hint="-o")
     options = workflow.EvaluateOptions(
         routes=routes, latency=latency, latency_scale=latency_scale,
         latency_model=latency_model, in_order=in_order, seed=seed, workers=workers,
         dt_ms=dt_ms, adapter=adapter, host_stage=host_stage, weather=weather,
         frame_limit_s=frame_limit, engine=engine, address=address, render=render,
-        provider=provider_named(provider, plugins or ()), force=force,
+        provider=runs, force=force,
         evaluator=evaluator,
     )  # fmt: skip
     with listening() as listener:
@@ -80,3 +95,14 @@ def evaluate(
     show(found, as_json)
     for file in found.pictures:
         tell(f"wrote {file}")
+
+
+def _check(
+    policy: str | None, adapter: Path | None, runs: Provider, as_json: bool
+) -> None:
+    if policy is None:
+        raise typer.BadParameter("--check needs a policy", param_hint="POLICY")
+    with listening() as listener:
+        found = check_model(policy, adapter, runs, listener)
+    show(found, as_json)
+    found.check()

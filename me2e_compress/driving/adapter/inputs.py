@@ -74,13 +74,14 @@ class ModelInputs:
         """
         ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
         _check_names(session, adapter, recurrent)
-        tables, given = _tables(adapter, ports), _given(adapter, ports)
+        tables, given = image_tables(adapter, ports), feeds_by_input(adapter, ports)
         for name in ports:
             if name not in tables and name not in given:
-                raise EvaluationError(_unfed(name))
-        images, size = _images(session, adapter, tables)
+                raise EvaluationError(unfed(name))
+        images, size = images_by_input(session, adapter, tables)
         found = cls(session.inputs, adapter, images, given, size)
-        found._check()
+        for fault in found.faults().values():
+            raise EvaluationError(fault)
         return found
 
     @property
@@ -136,21 +137,25 @@ class ModelInputs:
             projections or {"": lidar2img},
         )
 
-    def _check(self) -> None:
-        """Hold what every input is fed against its port."""
+    def faults(self) -> dict[str, str]:
+        """Say of every input that cannot be fed so why, in the order of the feeds."""
         nothing = self.nothing(0)
         self._track.note(0, nothing.motion)
-        seen = self._seen(nothing)
+        seen, found = self._seen(nothing), dict[str, str]()
         for name, feed in self.given.items():
             try:
                 array, sizes = feed.value(seen), feed.sizes(seen)
             except EvaluationError as error:
-                raise EvaluationError(f"input {name}: {error}") from error
-            _check_fed(name, self.ports[name], array, sizes if feed.joined else "")
+                found[name] = f"input {name}: {error}"
+                continue
+            sizes = sizes if feed.joined else ""
+            if fault := _fault(name, self.ports[name], array, sizes):
+                found[name] = fault
         self._track.clear()
+        return found
 
 
-def _tables(
+def image_tables(
     adapter: Adapter, ports: Mapping[str, SessionPort]
 ) -> dict[str, ImageInput]:
     """Return what each image input shows: as the adapter says, and the contract's."""
@@ -160,7 +165,9 @@ def _tables(
     return dict(adapter.images)
 
 
-def _given(adapter: Adapter, ports: Mapping[str, SessionPort]) -> dict[str, Feed]:
+def feeds_by_input(
+    adapter: Adapter, ports: Mapping[str, SessionPort]
+) -> dict[str, Feed]:
     """Return how each other input is fed: as the adapter says, and the contract's."""
     named = {**adapter.images, **adapter.feeds}
     usual = {ours: ours for ours in CONTRACT} | {**adapter.inputs}
@@ -171,7 +178,7 @@ def _given(adapter: Adapter, ports: Mapping[str, SessionPort]) -> dict[str, Feed
     } | adapter.feeds
 
 
-def _images(
+def images_by_input(
     session: AnySession, adapter: Adapter, tables: Mapping[str, ImageInput]
 ) -> tuple[dict[str, InputImages], tuple[int, int]]:
     """Return the image inputs, and the size in which the cameras are rendered."""
@@ -220,7 +227,7 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
         )
 
 
-def _unfed(name: str) -> str:
+def unfed(name: str) -> str:
     """Say what could feed an input."""
     return (
         f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output is known"
@@ -229,20 +236,15 @@ def _unfed(name: str) -> str:
     )
 
 
-def _check_fed(name: str, port: SessionPort, array: Array, sizes: str) -> None:
-    """Check that an array fits a port, which may have a batch of one before it."""
+def _fault(name: str, port: SessionPort, array: Array, sizes: str) -> str:
+    """Say how an array does not fit a port, which may have a batch of one before it."""
     found: Shape = port.shape
     batch = found[: max(0, len(found) - array.ndim)]
     if any(isinstance(side, int) and side != 1 for side in batch) or not fits(
         found[len(batch) :], array.shape
     ):
-        must = [1, *array.shape]
-        raise EvaluationError(
-            f"input {name} has shape {list(found)}, it must be {must}"
-            + (f": it is {sizes}" if sizes else "")
-        )
-    wanted = DTYPES[port.type]
-    if not np.can_cast(array.dtype, wanted, "same_kind"):
-        raise EvaluationError(
-            f"input {name} is {port.type}, and what feeds it {array.dtype}"
-        )
+        said = f"input {name} has shape {list(found)}, it must be {[1, *array.shape]}"
+        return f"{said}: it is {sizes}" if sizes else said
+    if not np.can_cast(array.dtype, DTYPES[port.type], "same_kind"):
+        return f"input {name} is {port.type}, and what feeds it {array.dtype}"
+    return ""

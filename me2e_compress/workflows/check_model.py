@@ -1,0 +1,149 @@
+"""Whether a model could drive, port by port, before anything does."""
+
+import dataclasses
+from pathlib import Path
+
+from me2e_compress.driving.adapter.adapter import Adapter
+from me2e_compress.driving.adapter.input_uses import input_uses
+from me2e_compress.driving.adapter.output_uses import OutputUses
+from me2e_compress.driving.adapter.port_use import PortUse
+from me2e_compress.driving.onnx_policy import OnnxPolicy, recurrent_of
+from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.runtime.any_session import AnySession, open_session
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
+from me2e_compress.workflows.evaluate import driver_of
+from me2e_compress.workflows.first_try import try_file
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.result import Result, Status, Table, table
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ModelCheck(Result):
+    """What of a policy fits, and what is missing.
+
+    Attributes:
+        policy: as it was named.
+        drives_by: what its answer is, in words; empty where nothing names one.
+        inputs: of the graph, in its order; none of a policy that is no graph.
+        outputs: the same.
+        problems: why it could not drive, a line each; empty where it could.
+    """
+
+    policy: str
+    drives_by: str
+    inputs: tuple[PortUse, ...]
+    outputs: tuple[PortUse, ...]
+    problems: tuple[str, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether it could drive."""
+        return not self.problems
+
+    @property
+    def status(self) -> Status:
+        """Whether it could drive."""
+        return "ok" if self.fits else "refused"
+
+    def check(self) -> None:
+        """Go on if it could drive.
+
+        Raises:
+            EvaluationError: it could not.
+        """
+        if not self.fits:
+            raise EvaluationError(f"{self.policy} could not drive: {self.problems[0]}")
+
+    @property
+    def headline(self) -> str:
+        """Say what it drives by, or how much is in the way."""
+        if not self.fits:
+            return f"{self.policy} could not drive"
+        return f"{self.policy} could drive, by {self.drives_by}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the headline."""
+        return (self.headline,)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what is in the way."""
+        return self.problems
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return every port of the graph."""
+        kinds = [("input", each) for each in self.inputs]
+        kinds += [("output", each) for each in self.outputs]
+        if not kinds:
+            return ()
+        rows = [
+            (kind, each.name, _shape(each), each.type, each.problem or each.use or "-")
+            for kind, each in kinds
+        ]
+        columns = ("", "name", "shape", "type", "fed by, or used as")
+        return (table(self.policy, columns, rows, words=5),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a port."""
+        return [dataclasses.asdict(each) for each in (*self.inputs, *self.outputs)]
+
+    def to_json(self) -> object:
+        """Return everything."""
+        return {"fits": self.fits, **{f.name: getattr(self, f.name) for f in _FIELDS}}
+
+
+_FIELDS = dataclasses.fields(ModelCheck)
+
+
+def check_model(
+    policy: str | Path,
+    adapter: str | Path | None = None,
+    provider: Provider = CPU,
+    listener: Listener = SILENT,
+) -> ModelCheck:
+    """Look whether a policy could drive: open it, hold its ports, run it on zeros.
+
+    Args:
+        policy: an ONNX file, or what else :func:`evaluate` drives.
+        adapter: TOML file that adapts the model to the policy contract.
+        provider: what runs the model.
+        listener: is called with progress.
+
+    Raises:
+        EvaluationError: no such policy or adapter, or the file is no model.
+        GraphError: onnxruntime dies of the graph.
+        ProviderError: the provider is not there.
+    """
+    named = str(policy)
+    driver = driver_of(named, adapter, provider)
+    if not isinstance(driver, OnnxDriver):
+        driver.open()
+        return ModelCheck(named, "what its code answers", (), (), ())
+    try_file(driver.path, listener, provider)
+    read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
+    try:
+        runs = PROVIDERS.parse(driver.provider)
+        session = open_session(driver.path, threads=1, provider=runs)
+    except (GraphError, FramesError) as error:
+        raise EvaluationError(str(error)) from error
+    recurrent = recurrent_of(session, read)
+    fed, used = input_uses(session, read, recurrent), OutputUses.of(session, read)
+    outputs = used.ports(session, recurrent)
+    found = [each.problem for each in (*fed, *outputs) if each.problem]
+    problems = dict.fromkeys([*found, *used.problems])
+    if not problems and (said := _at_work(session, read)):
+        problems[said] = None
+    return ModelCheck(named, used.drives_by, fed, outputs, tuple(problems))
+
+
+def _at_work(session: AnySession, adapter: Adapter) -> str:
+    """Return what a run on zeros says against it; empty where nothing does."""
+    try:
+        OnnxPolicy.of(session, adapter)
+    except (GraphError, FramesError, EvaluationError) as error:
+        return str(error)
+    return ""
+
+
+def _shape(port: PortUse) -> str:
+    return str([side or "?" for side in port.shape]).replace("'", "")
