@@ -116,9 +116,10 @@ def write_item(name: str, options: Mapping[str, object], *, short: bool = False)
 def write_value(value: object) -> str:
     """Write the value of an option: a number, a list, or else a string.
 
-    A dataclass is a mapping of its fields; those at their default are left out.
+    A dataclass is a mapping of its fields, those at their default left out, unless it
+    has a text of its own.
     """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    if dataclasses.is_dataclass(value) and type(value).__str__ is object.__str__:
         return write_value(chosen_fields(value))
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
