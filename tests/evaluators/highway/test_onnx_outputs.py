@@ -1,0 +1,124 @@
+"""What a graph answers, read by an adapter: other waypoints, controls, both fused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.evaluators.highway.runner import drive
+from me2e_compress.metrics.episode import Ending
+from tests.evaluators.highway.drivers import EXIT, straight_on
+from tests.evaluators.highway.test_onnx_policy import observation
+
+
+def adapted(model: Path, toml: str, stage: str = "") -> OnnxDriver:
+    adapter = model.with_suffix(".toml")
+    adapter.write_text(toml)
+    return OnnxDriver(model, adapter, host_stage=stage)
+
+
+def controlled(tmp_path: Path, values: str = "0.5, 0.25, 0.0") -> Path:
+    """Write a graph that plans straight on, and asks for these controls beside it."""
+    return straight_on(
+        tmp_path / "m.onnx",
+        outputs="float[1, 6, 2] plan, float[1, 3] gas",
+        body="plan = Identity (ahead) gas = Identity (asked)",
+        initializers=f", float[1, 3] asked = {{{values}}}",
+    )
+
+
+def test_waypoints_of_any_number_in_the_models_axes(tmp_path: Path) -> None:
+    """Ten of x, y and heading, flat, every 0.2 s from now on, x forward, y right."""
+    flat = ", ".join(f"{k}, {0.5 * k}, 9.0" for k in range(10))
+    model = straight_on(
+        tmp_path / "m.onnx",
+        outputs="float[1, 30] way",
+        body="way = Identity (flat)",
+        initializers=f", float[1, 30] flat = {{{flat}}}",
+    )
+    plan = (
+        "output = 'way'\nshape = [10, 3]\ncolumns = [0, 1]\nstep_s = 0.2\nfirst_s = 0"
+    )
+    policy = adapted(model, f"axes = 'forward-right'\n[plan]\n{plan}").open()
+    policy.reset(EXIT)
+
+    found = policy.plan(observation())
+
+    assert isinstance(found, Trajectory)
+    assert found.points[[0, 8]].tolist() == [[1.0, -0.5], [9.0, -4.5]]
+    assert found.times_s[[0, 8]].tolist() == [0.2, 1.8]
+
+
+VECTOR = "[control]\nthrottle = 'gas[0]'\nsteer = 'gas[1]'\nbrake = 'gas[2]'\n"
+
+
+def test_controls_drive_in_place_of_the_plan(tmp_path: Path) -> None:
+    policy = adapted(controlled(tmp_path), VECTOR).open()
+    policy.reset(EXIT)
+
+    assert policy.plan(observation()) == PedalsAndWheel(0.5, 0.25, 0.0)
+
+
+def test_both_are_fused(tmp_path: Path) -> None:
+    """At 3 m/s towards 4 m/s the throttle is the most, and the plan goes straight."""
+    policy = adapted(controlled(tmp_path), f"{VECTOR}\n[fusion]\nshare = 0.4").open()
+    policy.reset(EXIT)
+    ahead = np.array([[30.0, 0.0], [60.0, 0.0]], np.float32)
+
+    found = policy.plan(replace(observation(), target_points=ahead))
+
+    assert found == pytest.approx((0.6 * 0.75 + 0.4 * 0.5, 0.4 * 0.25, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ("0.5, -1.5, 0.0", "steer is -1.5, it must be from -1 to 1"),
+        ("1.5, 0.0, 0.0", "throttle is 1.5, it must be from 0 to 1"),
+    ],
+)
+def test_a_control_out_of_its_range_ends_the_route(
+    tmp_path: Path, values: str, reason: str
+) -> None:
+    policy = adapted(controlled(tmp_path, values), VECTOR).open()
+
+    episode = drive(EXIT, policy, Conditions())
+
+    assert (episode.ending, episode.failure) == (Ending.POLICY_FAILED, reason)
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        (
+            "[control]\nthrottle = 'pedal'\nsteer = 'gas[1]'",
+            "no output pedal, which the adapter names as throttle; there are plan, gas",
+        ),
+        ("[control]\nsteer = 'gas[1]'", "control: either throttle, steer and brake"),
+        ("[control]\nthrottle = 'gas'\nsteer = 'gas[1]'", "gas has 3 numbers: say"),
+        (f"{VECTOR}\n[plan]\noutput = 'plan'", "plan and control both drive"),
+        ("[fusion]\nshare = 0.3", "fusion fuses a plan with a control"),
+        (f"{VECTOR}\n[fusion]\nshare = 2", "fusion.share: Input should be less"),
+        ("[plan]\noutput = 'gas'\nstep_s = 0.5", "gas has shape [1, 3], a plan is"),
+        ("[plan]\noutput = 'plan'\nstep_s = 0", "plan.step_s: Input should be greater"),
+        ("[plan]\noutput = 'plan'\nshape = [6, 0]", "every side is 1 or more"),
+        ("[plan]\noutput = 'plan'\ncommand_modes = [0]", "without command_input"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(tmp_path: Path, toml: str, message: str) -> None:
+    with pytest.raises(EvaluationError) as caught:
+        adapted(controlled(tmp_path), toml).open()
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_host_stage_needs_a_plan(tmp_path: Path) -> None:
+    driver = adapted(controlled(tmp_path), VECTOR, "collision-optimizer")
+
+    with pytest.raises(EvaluationError, match="changes a plan, and this model answers"):
+        driver.open()
