@@ -119,7 +119,8 @@ def write_value(value: object) -> str:
     A dataclass is a mapping of its fields, those at their default left out, unless it
     has a text of its own.
     """
-    if dataclasses.is_dataclass(value) and type(value).__str__ is object.__str__:
+    told = type(value).__str__ is not object.__str__
+    if dataclasses.is_dataclass(value) and not isinstance(value, type) and not told:
         return write_value(chosen_fields(value))
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"

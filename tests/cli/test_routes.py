@@ -42,7 +42,7 @@ def test_a_set_is_put_through_the_gate_again(tmp_path: Path) -> None:
     file = tmp_path / "routes.json"
     save_routes([route_of(STOP, 1)], file)
 
-    code, out, _ = run("--check", file)
+    code, out, _ = run("--examine", file)
 
     assert code == 0
     assert "1 of 1 routes admitted" in out
@@ -53,7 +53,7 @@ def test_a_route_that_is_too_easy_is_named(tmp_path: Path) -> None:
     easy = route_of("VehicleOpensDoorTwoWays", 1, door_m=1000.0)
     save_routes([easy], file)
 
-    code, out, error = run("--check", file, "--json")
+    code, out, error = run("--examine", file, "--json")
 
     assert code != 0
     assert isinstance(error, EvaluationError)

@@ -121,7 +121,7 @@ def _json_words(good: Path) -> dict[str, tuple[str, tuple[str, ...]]]:
         ),
         "routes": (
             "routes.json",
-            ("routes", "--check", "bad.json", "--routes", "no-such-route"),
+            ("routes", "--examine", "bad.json", "--routes", "no-such-route"),
         ),
     }  # fmt: skip
 

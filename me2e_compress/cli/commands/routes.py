@@ -12,12 +12,12 @@ from me2e_compress.simulator.scenarios.catalogue import VARIANTS
 Output = Annotated[
     Path | None, typer.Option("-o", "--output", help="the manifest to write")
 ]
-Check = Annotated[
+Examine = Annotated[
     Path | None, typer.Option(help="examine this manifest instead of making one")
 ]
 Scenarios = Annotated[str, typer.Option(help="scenario types: all, or NAME,NAME")]
 Picked = Annotated[
-    str, typer.Option("--routes", "--pick", help=f"{given.ROUTES}; with --check")
+    str, typer.Option("--routes", "--pick", help=f"{given.ROUTES}; with --examine")
 ]
 
 
@@ -27,7 +27,7 @@ def routes(
     variants: Annotated[int, typer.Option(min=1, help="of each type")] = VARIANTS,
     scenarios: Scenarios = "all",
     workers: given.Workers = 1,
-    check: Check = None,
+    examine: Examine = None,
     picked: Picked = "all",
     force: given.Force = False,
     as_json: given.Json = False,
@@ -36,9 +36,9 @@ def routes(
     # takes highway-env a second to import
     from me2e_compress.workflows import routes as workflow
 
-    if check is not None:
+    if examine is not None:
         with listening() as listener:
-            examined = workflow.examine_routes(check, picked, listener)
+            examined = workflow.examine_routes(examine, picked, listener)
         show(examined, as_json)
         examined.check()
         return

@@ -18,6 +18,11 @@ Outputs: TypeAlias = Mapping[str, Array]
 _ELEMENT = re.compile(r"(?P<output>.+)\[(?P<index>\d+)\]")
 _PEDALS = ("throttle", "brake", "acceleration")
 _NUMBERS = ("steer", *_PEDALS)
+_FORMS = (
+    {"throttle", "steer"},
+    {"throttle", "steer", "brake"},
+    {"acceleration", "steer"},
+)
 
 
 class _Table(BaseModel):
@@ -128,9 +133,7 @@ class ControlAdapter(_Table):
     def _one_form(self) -> Self:
         named = {name for name in _NUMBERS if getattr(self, name) is not None}
         tables = sum(table is not None for table in (self.beta, self.scored))
-        forms = {"throttle", "steer"}, {"throttle", "steer", "brake"}
-        forms = *forms, {"acceleration", "steer"}
-        if tables + (named in forms) != 1 or (tables and named):
+        if tables + (named in _FORMS) != 1 or (tables and named):
             raise ValueError(
                 "either throttle, steer and brake, or acceleration and steer, or beta,"
                 " or scored"
@@ -173,7 +176,7 @@ class ControlAdapter(_Table):
         said = element(outputs, getattr(self, name))
         begin, end = getattr(self, f"{name}_range")
         share = (said - begin) / (end - begin)
-        value = least + (1.0 - least) * share
+        value: float = least + (1.0 - least) * share
         return min(max(value, least), 1.0) if self.clip else value
 
 

@@ -37,7 +37,9 @@ def input_uses(
     images, problems = _images(session, adapter, tables)
     size = next((each.rendered for each in images.values()), DEFAULT_IMAGE_SIZE)
     problems |= ModelInputs(session.inputs, adapter, images, given, size).faults()
-    words = {name: f"{answer}, zeros at first" for name, answer in recurrent.items()}
+    words = {
+        name: f"{answer} of the frame before" for name, answer in recurrent.items()
+    }
     words |= {name: image_words(table) for name, table in tables.items()}
     words |= {name: feed_words(feed) for name, feed in given.items()}
     for name, port in session.inputs.items():
