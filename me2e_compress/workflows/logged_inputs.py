@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.calibration.logs.log_frames import InputForm, LoggedInputs
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.driving.adapter import ImageNormalization
+from me2e_compress.driving.adapter.images import Triple
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.runtime.recurrence import recurrent_inputs
+from me2e_compress.workflows.first_try import load_interface
 from me2e_compress.zoo.stacks import STACKS, Stack
 
 STACK = "me2e.stack"
@@ -36,7 +37,7 @@ def inputs_of_stack(stack: Stack) -> LoggedInputs:
 
 
 def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
-    """Return how an ONNX file is fed from a log.
+    """Return how an ONNX file, or a stack of several, is fed from a log.
 
     What was exported from UniAD or VAD sees the ground as nuScenes' lidar does, every
     other file as the policy contract.
@@ -50,7 +51,7 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
         FramesError: its image input is not normalised as its metadata says, or its
             size is open and not given.
     """
-    model = graph.load(path)
+    model = load_interface(path)
     fed_back = recurrent_inputs(model)
     forms = {
         str(each.name): _form(each, path)
@@ -73,9 +74,19 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
             " nuscenes{root=..., size=[384, 640]}"
         )
     image = PixelInput(
-        mean=found.mean, std=found.std, order=found.order, rows=rows, columns=columns
+        mean=_unscaled(found.mean, found.scale),
+        std=_unscaled(found.std, found.scale),
+        order=found.order,
+        rows=rows,
+        columns=columns,
     )
     return LoggedInputs(forms, image, forward_left)
+
+
+def _unscaled(levels: Triple, scale: float) -> Triple:
+    """Return grey levels of whole pixels: (s * p - m) / d is (p - m / s) / (d / s)."""
+    red, green, blue = levels
+    return red / scale, green / scale, blue / scale
 
 
 def _form(value: ir.Value, path: Path) -> InputForm:

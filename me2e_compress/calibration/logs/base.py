@@ -95,6 +95,8 @@ class DriveLog(ABC):
             Bench2Drive's order, front first.
         every: takes every n-th moment.
         size: rows and columns of the image input, where the model leaves them open.
+        width: columns of the image input that a picture takes, the others are zeros;
+            None as its stack has it, else all.
     """
 
     name: ClassVar[str]
@@ -107,11 +109,16 @@ class DriveLog(ABC):
     cameras: tuple[str, ...] = ()
     every: int = 1
     size: tuple[int, int] | None = None
+    width: int | None = None
 
     def __post_init__(self) -> None:
-        """Check the step."""
+        """Check the numbers."""
         if self.every < 1:
             raise ValueError(f"every {self.every}: must be at least 1")
+        if self.width is not None and self.width < 1:
+            raise ValueError(f"width {self.width}: must be at least 1")
+        if self.size is not None and min(self.size) < 1:
+            raise ValueError(f"size {list(self.size)}: must be at least 1")
 
     @abstractmethod
     def names(self) -> Sequence[str]:

@@ -55,6 +55,8 @@ class Bench2DriveLog(DriveLog):
         cameras: in the order of the image input; none means front first.
         every: takes every n-th of 10 pictures a second; 5 is what UniAD and VAD see.
         size: rows and columns of the image input, where the model leaves them open.
+        width: columns of the image input that a picture takes, the others are zeros;
+            None as its stack has it, else all.
     """
 
     name: ClassVar[str] = "bench2drive"

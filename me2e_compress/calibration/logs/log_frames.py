@@ -48,11 +48,13 @@ class LoggedInputs:
         image: normalisation and size of the input img; None without one.
         forward_left: whether the model's ground frame is the ego's (x forward, y left)
             and not the lidar's (x right, y forward).
+        width: columns of the image that a picture takes; None means all.
     """
 
     forms: Mapping[str, InputForm]
     image: PixelInput | None
     forward_left: bool = False
+    width: int | None = None
 
     def check(self, log: DriveLog) -> None:
         """Check that a log can feed the model.
@@ -66,8 +68,13 @@ class LoggedInputs:
                     f"input {name} is not made from a log; there are {', '.join(MADE)}"
                 )
         image = self.forms.get("img")
-        if image is None:
+        if image is None or self.image is None:
             return
+        if self.columns(log, self.image) > self.image.columns:
+            raise FramesError(
+                f"a picture of {self.columns(log, self.image)} columns (width) is wider"
+                f" than the input img: {self.image.columns}"
+            )
         if image.dtype != np.float32 or len(image.shape) < 4:
             raise FramesError(
                 f"input img is {image.dtype} {list(image.shape)}; from a log it is"
@@ -78,6 +85,10 @@ class LoggedInputs:
                 f"input img takes {image.shape[-4]} cameras, the log gives"
                 f" {len(log.seen)}: name them (cameras=[CAM_FRONT, ...])"
             )
+
+    def columns(self, log: DriveLog, image: PixelInput) -> int:
+        """Return how many columns of the image a picture takes."""
+        return log.width or self.width or image.columns
 
 
 def log_frames(
@@ -146,7 +157,11 @@ def _arrays(
     }
     projections = [now.lidar_to_image[camera] @ back for camera in log.seen]
     if model.image is not None:
-        pictures = [read_picture(now.pictures[c], model.image) for c in log.seen]
+        columns = model.columns(log, model.image)
+        pictures = [
+            read_picture(now.pictures[camera], model.image, columns)
+            for camera in log.seen
+        ]
         if len({each.planes.shape for each in pictures}) > 1:
             sizes = [list(each.planes.shape) for each in pictures]
             raise FramesError(

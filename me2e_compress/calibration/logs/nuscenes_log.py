@@ -46,6 +46,8 @@ class NuScenesLog(DriveLog):
         cameras: in the order of the image input; none means front first.
         every: takes every n-th key frame.
         size: rows and columns of the image input, where the model leaves them open.
+        width: columns of the image input that a picture takes, the others are zeros;
+            None as its stack has it, else all.
     """
 
     name: ClassVar[str] = "nuscenes"

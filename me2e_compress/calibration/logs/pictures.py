@@ -1,9 +1,9 @@
 """Pictures of a log as bytes of an image input, and where points of space land there.
 
-Sizes as the published stacks have them: a picture is scaled to the columns of the
-input; what is then too tall loses its upper rows (Lift-Splat, BEVDet, SparseDrive),
-what is too short is padded below when it is fed (mmdetection, UniAD, VAD: 1600 x 900
-at 0.4 is 640 x 360, padded to 384).
+Sizes as the published stacks have them: a picture is scaled to so many columns; what is
+then too tall loses its upper rows (Lift-Splat, BEVDet, SparseDrive), what is too small
+is padded below and to the right when it is fed (mmdetection, UniAD, VAD: 1600 x 900 at
+0.4 is 640 x 360, padded to 384 rows).
 """
 
 from dataclasses import dataclass
@@ -33,8 +33,13 @@ class Picture:
     place: Floats
 
 
-def read_picture(path: Path, pixels: PixelInput) -> Picture:
+def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
     """Read a JPEG or PNG and lay it out as an input takes it.
+
+    Args:
+        path: of the file.
+        pixels: the input.
+        columns: of the input that the picture takes.
 
     Raises:
         FramesError: it is missing, half-written, or no picture.
@@ -51,14 +56,13 @@ def read_picture(path: Path, pixels: PixelInput) -> Picture:
     if found is None:
         raise FramesError(f"{path}: not a readable picture")
     height, width = found.shape[:2]
-    scale = pixels.columns / width
-    rows = round(height * scale)
-    if (rows, pixels.columns) != (height, width):
-        found = cv2.resize(found, (pixels.columns, rows))
+    rows = round(height * columns / width)
+    if (rows, columns) != (height, width):
+        found = cv2.resize(found, (columns, rows))
     above = max(0, rows - pixels.rows)
     order = slice(None, None, -1) if pixels.order == "rgb" else slice(None)
     planes = np.moveaxis(found[above:, :, order], -1, 0)
-    place = np.diag([scale, rows / height, 1.0, 1.0])
+    place = np.diag([columns / width, rows / height, 1.0, 1.0])
     place[1, 2] = -above
     return Picture(np.ascontiguousarray(planes, np.uint8), place)
 

@@ -174,6 +174,7 @@ def test_what_is_wrong_in_bench2drive_is_named(
         ),
         ("nuscenes{{root={root}, scenes=[x]}}", "no scene 'x'; there are scene-0001"),
         ("nuscenes{{root={root}, every=0}}", "nuscenes: every 0: must be at least 1"),
+        ("nuscenes{{root={root}, width=0}}", "nuscenes: width 0: must be at least 1"),
         ("bench2drive:{root}/empty", "empty: holds no clip: a folder with anno/ in it"),
         ("navsim:{root}", "no driving log 'navsim'; there are nuscenes, bench2drive"),
     ],
@@ -204,7 +205,7 @@ def test_a_half_written_jpeg_is_no_picture(tmp_path: Path, share: float) -> None
     (tmp_path / "a.jpg").write_bytes(content[: int(len(content) * share)])
 
     with pytest.raises(FramesError, match=r"a\.jpg: the picture breaks off"):
-        read_picture(tmp_path / "a.jpg", PIXELS)
+        read_picture(tmp_path / "a.jpg", PIXELS, 64)
 
 
 def test_a_table_is_read_piece_by_piece(

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +22,13 @@ from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.testing import check_form
 from tests.calibration.logs.small_logs import (
     BEND,
     CLIP,
     LIDAR_M,
     SPEED,
+    WIDTH,
     YAWS,
     car_at,
     pixel,
@@ -113,6 +116,23 @@ def test_what_is_too_tall_loses_its_upper_rows(log: DriveLog) -> None:
     point = to_lidar(seen_point("CAM_FRONT"))
     before, after = (each["lidar2img"][0, 0] @ point for each in (whole, cut))
     assert before[1] / before[2] - after[1] / after[2] == pytest.approx(13, abs=1e-3)
+
+
+@pytest.mark.parametrize("by_log", [False, True])
+def test_a_picture_may_take_a_part_of_the_columns(
+    roots: dict[str, Path], by_log: bool
+) -> None:
+    """As 416 columns of DL4AGX's UniAD hold pictures of 400."""
+    width = {"width": 60} if by_log else {}
+    log = LOGS.build("nuscenes", {"root": roots["nuscenes"], **width})
+    model = LoggedInputs(FORMS, PIXELS, width=60 if not by_log else None)
+
+    arrays = frames(log, model, 1)[0].arrays
+
+    assert arrays["img"].shape == (1, 6, 3, 34, 60)
+    u, v, depth, _ = arrays["lidar2img"][0, 0] @ to_lidar(seen_point("CAM_FRONT"))
+    assert bright(arrays["img"][0, 0]) == pytest.approx((u / depth, v / depth), abs=1)
+    assert u / depth * WIDTH / 60 == pytest.approx(pixel("CAM_FRONT")[0], abs=1e-3)
 
 
 def test_frames_are_half_a_second_apart_and_one_scene(log: DriveLog) -> None:
@@ -255,9 +275,9 @@ def test_pictures_are_read_when_their_frame_is_asked_for(
 ) -> None:
     asked = list[Path]()
 
-    def read(path: Path, pixels: PixelInput) -> Picture:
+    def read(path: Path, pixels: PixelInput, columns: int) -> Picture:
         asked.append(path)
-        return read_picture(path, pixels)
+        return read_picture(path, pixels, columns)
 
     monkeypatch.setattr(f"{log_frames.__module__}.read_picture", read)
 
@@ -287,15 +307,24 @@ def test_it_goes_on_with_a_scene(tmp_path: Path) -> None:
             r"img takes 1 cameras, the log gives 6: name them \(cameras=\[CAM_FRONT",
         ),
         ({"img": InputForm((1, 6, 3, 64, 80), np.dtype(np.uint8))}, "img is uint8"),
+        ({"img": InputForm((6, 3, 64, 80), F32), "width": 99}, "99 columns .* img: 80"),
         ({"l2g_t": InputForm((1, 4), F32)}, r"l2g_t takes \[1, 4\], a log gives \[3\]"),
     ],
 )
 def test_what_a_log_cannot_feed_is_named(
-    roots: dict[str, Path], form: dict[str, InputForm], message: str
+    roots: dict[str, Path], form: dict[str, Any], message: str
 ) -> None:
     log = LOGS.parse(f"nuscenes:{roots['nuscenes']}")
+    forms = {name: each for name, each in form.items() if name != "width"}
+    image = PIXELS if "img" in form else None
+    model = LoggedInputs(forms, image, width=form.get("width"))
     with pytest.raises(FramesError, match=message):
-        frames(log, LoggedInputs(form, PIXELS if "img" in form else None), 1)
+        frames(log, model, 1)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_the_text_of_a_log_makes_it_again(name: str) -> None:
+    check_form(LOGS.build(name, {"root": "x", "size": [2, 3], "width": 1}), LOGS)
 
 
 def test_a_future_is_written_and_read_again(log: DriveLog, tmp_path: Path) -> None:
