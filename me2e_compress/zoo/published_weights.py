@@ -99,7 +99,7 @@ def taken(match: NameMatch) -> PublishedWeights:
         epoch=state.epoch,
         iteration=state.iteration,
         averaged=match.ema,
-        converted=converted,
+        converted=dict(converted),
         unread=match.unread(),
         averages=0 if match.ema else len(match.averages()),
     )

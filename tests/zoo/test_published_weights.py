@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from me2e_compress.errors import GraphError, RecipeError
-from me2e_compress.workflows.export import ExportOptions, export_stack
+from me2e_compress.workflows.export import ExportOptions, ExportResult, export_stack
 from me2e_compress.zoo import export as exporting
 from me2e_compress.zoo.export import build, trace
 from me2e_compress.zoo.name_match import NameMatch
@@ -145,6 +145,18 @@ def test_other_precisions_become_float32_and_are_said(
     kind = str(type_).removeprefix("torch.")
     said = f"{count} tensors of {kind} converted to float32"
     assert said in found.record.lines()
+
+
+def test_the_record_of_converted_weights_is_plain_json(
+    tmp_path: Path, tensors: Tensors
+) -> None:
+    half = {name: each.half() for name, each in tensors.items()}
+    record = published_weights("tcp", saved(tmp_path / "a.pth", half)).record
+
+    found = ExportResult("tcp", tmp_path / "a.pth", 17, record).to_json()
+    assert json.loads(json.dumps(found, default=str))["weights"]["converted"] == {
+        "float16": 230
+    }
 
 
 def test_counters_may_be_missing(tmp_path: Path, tensors: Tensors) -> None:
