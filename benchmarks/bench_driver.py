@@ -7,8 +7,9 @@
 
 Studies, one after the other: baselines (expert, blind, the driver), ablation (each
 module away), pairs (two away), schemes (float to int8, at no latency and at each
-model's own under one device scale), latency (fewer decisions a second), determinism
-(the driver twice, compared byte by byte). They share OUT, so what one has driven the
+model's own under one device scale), scales (float and int8 on devices that are faster
+and slower), latency (fewer decisions a second), determinism (the driver twice, compared
+byte by byte). They share OUT, so what one has driven the
 next does not drive again, and a run that was stopped goes on: every route is written
 when it is driven (OUT/results/). Each study writes OUT/<study>/tables.md, scores.csv,
 routes.csv, study.json and report.html; the tables of all are in OUT/tables.md.
@@ -55,6 +56,8 @@ SCHEMES = ("exact", "feature-ext", "prediction", "full")
 FPS = (20, 10, 5, 2, 1)
 FLOAT_MEDIAN_S = 0.43
 """Median latency of the float driver on the device imagined."""
+MEDIANS_S = (0.15, 0.2, 0.25, 0.3, 0.35, 0.43, 0.5, 0.6)
+"""The same on devices of other speeds, some on each side of a multiple of 50 ms."""
 CALIBRATION = (256, 0)
 """Frames that passes calibrate on, and their seed."""
 HELD_OUT = (64, 1)
@@ -142,6 +145,18 @@ def schemes(bench: Bench) -> Study:
     return bench.study("Schemes", (bench.float, *made), (IDEAL, DEVICE))
 
 
+def scales(bench: Bench) -> Study:
+    """Drive on faster and slower devices: each model's own latencies, stretched."""
+    devices = tuple(
+        Condition(
+            f"median-{1000 * median:.0f}ms",
+            f"trace{{scale={median / FLOAT_MEDIAN_S:.6g}}}",
+        )
+        for median in MEDIANS_S
+    )
+    return bench.study("Scales", (bench.float, bench.compressed("full")), devices)
+
+
 def latency(bench: Bench) -> Study:
     return bench.untimed(bench.study("Latency", (bench.float,), (IDEAL, *SLOWER)))
 
@@ -156,6 +171,7 @@ STUDIES: Mapping[str, Callable[[Bench], Study]] = {
     "ablation": ablation,
     "pairs": pairs,
     "schemes": schemes,
+    "scales": scales,
     "latency": latency,
     "determinism": determinism,
 }
