@@ -60,7 +60,7 @@ def where_the_time_goes(result: "PaperResult") -> Figure | None:
         right.yaxis.set_major_formatter(PercentFormatter(1.0))
         right.set_xlabel("milliseconds on the device")
         right.set_title("how many decisions take longer", color=MUTED)
-        right.legend(frameon=False, fontsize=7.5)
+        right.legend(frameon=False, fontsize=7.5, loc="upper right")
         return figure
 
 
