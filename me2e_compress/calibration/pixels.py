@@ -1,6 +1,6 @@
 """Images in recordings: bytes on disk, normalised when they are fed.
 
-A frame of six 1600 x 928 images has 107 MB as float32 and 26 MB as bytes. A recording
+A frame of six 1600 x 928 images has 107 MB as float32 and 27 MB as bytes. A recording
 says in ``scenes.json`` which inputs are kept so, in how it is fed:
 ``{"pixels": {"version": 1, "inputs": {"img": {"mean": ..., "std": ..., ...}}}}``. What
 is not named there is fed as it stands. A reader that does not know the key refuses the

@@ -18,6 +18,8 @@ Row: TypeAlias = Mapping[str, Any]
 
 ROAD_USERS = ("vehicle.", "human.")
 """Categories that a plan collides with, as UniAD and VAD take them."""
+NAMES = ("token", "name", "next", "channel")
+TIMES = ("timestamp", "utime")
 PIECE = 1 << 22
 """Characters that are read at once; no row is larger."""
 _SPACE = " \t\r\n,"
@@ -35,10 +37,18 @@ def rows(path: Path, *fields: str) -> Iterator[Row]:
     """
     with documents.reading(path, FramesError, "not a table of nuScenes"):
         for index, row in enumerate(_objects(path)):
-            lacks = [name for name in fields if name not in row]
-            if lacks:
-                raise documents.MalformedError(f"row {index} has no {lacks[0]}")
+            for name in fields:
+                _check(row, name, index)
             yield row
+
+
+def _check(row: Row, name: str, index: int) -> None:
+    """Check a field: what names another row is text, a time a whole number."""
+    if name not in row:
+        raise documents.MalformedError(f"row {index} has no {name}")
+    kind = int if name in TIMES else str if name.endswith(NAMES) else object
+    if not isinstance(row[name], kind):
+        raise documents.MalformedError(f"row {index}: {name} is {row[name]!r:.40}")
 
 
 def by_token(path: Path, keep: Callable[[Row], bool], *fields: str) -> dict[str, Row]:

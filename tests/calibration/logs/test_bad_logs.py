@@ -5,10 +5,13 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from me2e_compress.calibration.logs import LOGS
 from me2e_compress.calibration.logs.log_frames import (
@@ -78,6 +81,14 @@ NAN = float("nan")
         (
             table("sample", lambda found: found[0].pop("timestamp")),
             "sample.json: not a table of nuScenes: row 0 has no timestamp",
+        ),
+        (
+            table("sample", lambda found: found[0].update(timestamp="now")),
+            "row 0: timestamp is 'now'",
+        ),
+        (
+            table("sample", lambda found: found[0].update(scene_token=[1])),
+            r"row 0: scene_token is \[1\]",
         ),
         (
             table("sample_data", lambda found: found.pop(3)),
@@ -208,13 +219,22 @@ def test_a_half_written_jpeg_is_no_picture(tmp_path: Path, share: float) -> None
         read_picture(tmp_path / "a.jpg", PIXELS, 64)
 
 
+WORDS = st.text('"\\[]{},é\n ', max_size=6)
+
+
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    found=st.lists(st.fixed_dictionaries({"token": WORDS, "a": WORDS}), max_size=6),
+    more=st.integers(1, 40),
+    indent=st.sampled_from([None, 0, 2]),
+)
 def test_a_table_is_read_piece_by_piece(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, found: list[dict[str, Any]], more: int, indent: int | None
 ) -> None:
     """Whatever lies where two pieces meet."""
-    found = [{"token": f"é{i}", "next": {"a": [i, "},{"]}} for i in range(40)]
     path = tmp_path / "sample.json"
-    path.write_text(json.dumps(found, indent=1, ensure_ascii=False), encoding="utf-8")
-    monkeypatch.setattr("me2e_compress.calibration.logs.nuscenes_tables.PIECE", 97)
-
-    assert list(rows(path, "token")) == found
+    text = json.dumps(found, indent=indent, ensure_ascii=False)
+    path.write_text(text, encoding="utf-8")
+    longest = max((len(json.dumps(each, indent=2)) for each in found), default=0)
+    with patch(f"{rows.__module__}.PIECE", longest + more):
+        assert list(rows(path, "token")) == found
