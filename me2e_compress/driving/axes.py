@@ -15,6 +15,8 @@ class Axes(StrEnum):
     """x right, y forward: the lidar of nuScenes, of UniAD and of VAD."""
     FORWARD_RIGHT = "forward-right"
     """x forward, y right, left-handed: CARLA's, and Bench2DriveZoo's TCP's."""
+    RIGHT_BACKWARD = "right-backward"
+    """x right, y backward, left-handed: OpenDriveLab's TCP's."""
 
     @property
     def to_ego(self) -> npt.NDArray[np.float64]:
@@ -30,11 +32,12 @@ class Axes(StrEnum):
     @property
     def is_left_handed(self) -> bool:
         """Whether angles grow clockwise."""
-        return self is Axes.FORWARD_RIGHT
+        return self in (Axes.FORWARD_RIGHT, Axes.RIGHT_BACKWARD)
 
 
 _TO_EGO = {
     Axes.FORWARD_LEFT: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     Axes.RIGHT_FORWARD: ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
     Axes.FORWARD_RIGHT: ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    Axes.RIGHT_BACKWARD: ((0, -1, 0), (-1, 0, 0), (0, 0, 1)),
 }

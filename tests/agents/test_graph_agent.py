@@ -78,6 +78,37 @@ def test_the_route_turns_the_wheel(board: Leaderboard, tmp_path: Path) -> None:
     assert board.seen[-1][1] > 0.0
 
 
+CONTROLS = """
+[control]
+throttle = "gas[0]"
+steer = "gas[1]"
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "throttle"), [("", 0.25), ("[fusion]\n", 0.7 * 0.75 + 0.3 * 0.25)]
+)
+def test_a_graph_of_controls_presses_as_it_says(
+    board: Leaderboard, tmp_path: Path, more: str, throttle: float
+) -> None:
+    """As they are, or fused with the plan, whose throttle is 0.75."""
+    model = straight_on(
+        tmp_path / "m.onnx",
+        outputs="float[1, 6, 2] plan, float[2] gas",
+        body="plan = Identity (ahead) gas = Identity (asked)",
+        initializers=", float[2] asked = {0.25, 0.5}",
+    )
+    adapter = written(tmp_path / "a.toml", CONTROLS + more)
+    conf = f'model = "{model}"\nadapter = "{adapter}"'
+    board.noise = 0.0
+
+    board.drive(graph_agent, str(written(tmp_path / "g.toml", conf)), 1)
+
+    (control,) = board.returned
+    assert (control.throttle, control.brake) == pytest.approx((throttle, 0.0))
+    assert (control.steer == 0.5) is (not more)
+
+
 def test_a_model_is_told_what_the_contract_says(board: Leaderboard, echo: Path) -> None:
     agent = board.make(graph_agent, f"{echo}+{SAVE_NAME}")
     found, worlds = heard(agent), list[World]()
