@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.compare import CompareResult, compare
     from me2e_compress.workflows.compress import CompressOptions, compress
     from me2e_compress.workflows.compress_result import CompressResult
+    from me2e_compress.workflows.compress_stack import compress_stack
+    from me2e_compress.workflows.compress_stack_result import StackCompressResult
     from me2e_compress.workflows.evaluate import EvaluateOptions, evaluate
     from me2e_compress.workflows.evaluate_result import EvaluateResult
     from me2e_compress.workflows.frames import FramesOptions, record_frames
@@ -87,6 +89,7 @@ __all__ = [
     "SearchResult",
     "SensitivityOptions",
     "SensitivityResult",
+    "StackCompressResult",
     "Step",
     "StudyResult",
     "Verification",
@@ -96,6 +99,7 @@ __all__ = [
     "check_model",
     "compare",
     "compress",
+    "compress_stack",
     "evaluate",
     "graph",
     "inspect",
@@ -141,6 +145,8 @@ _ROOMS = {
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),
+    "workflows.compress_stack": ("compress_stack",),
+    "workflows.compress_stack_result": ("StackCompressResult",),
     "workflows.evaluate": ("EvaluateOptions", "evaluate"),
     "workflows.evaluate_result": ("EvaluateResult",),
     "workflows.frames": ("FramesOptions", "record_frames"),

@@ -8,8 +8,9 @@ import numpy.typing as npt
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress import graph
+from me2e_compress import graph, rewrite
 from me2e_compress.runtime.frames import Frame
+from tests.frames import record
 
 BACKBONE = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -60,6 +61,57 @@ def write_stack(folder: Path, toml: str = TWO_PARTS, **texts: str) -> Path:
     path = folder / "stack.toml"
     path.write_text(toml)
     return path
+
+
+DENSE = {
+    "backbone": """
+<ir_version: 9, opset_import: ["" : 17]>
+backbone (float[4,16] img) => (float[4,32] feats)
+{ ["/backbone/MatMul"] a = MatMul(img, w) ["/backbone/Relu"] feats = Relu(a) }
+""",
+    "head": """
+<ir_version: 9, opset_import: ["" : 17]>
+head (float[4,32] feats, float[4,32] prev_bev)
+    => (float[4,32] next_bev, float[1,64,2] plan) <int64[3] points = {1, 64, 2}> {
+    ["/head/Add"] next_bev = Add(feats, prev_bev)
+    ["/head/MatMul"] far = MatMul(next_bev, w)
+    ["/head/Reshape"] plan = Reshape(far, points)
+}
+""",
+    "head_first": """
+<ir_version: 9, opset_import: ["" : 17]>
+head_first (float[4,32] feats) => (float[4,32] next_bev, float[1,64,2] plan)
+<int64[3] points = {1, 64, 2}> {
+    ["/head/Identity"] next_bev = Identity(feats)
+    ["/head/MatMul"] far = MatMul(next_bev, w)
+    ["/head/Reshape"] plan = Reshape(far, points)
+}
+""",
+}
+"""Parts with a layer to quantize each; ``w`` is drawn."""
+
+
+def write_dense(folder: Path, toml: str = TWO_PARTS) -> Path:
+    """Write parts that have a layer to quantize; return the TOML."""
+    random = np.random.default_rng(0)
+    for name, text in DENSE.items():
+        model = ir.from_onnx_text(text)
+        draws = random.normal(size=(16 if name == "backbone" else 32, 32))
+        weight = rewrite.add_constant(model.graph, draws.astype(np.float32), "w")
+        (layer,) = (node for node in model.graph if node.op_type == "MatMul")
+        layer.replace_input_with(1, weight)
+        graph.save(model, folder / f"{name}.onnx")
+    path = folder / "stack.toml"
+    path.write_text(toml)
+    return path
+
+
+def dense_frames(folder: Path, count: int = 8) -> Path:
+    """Record frames for it: scenes of two."""
+    random = np.random.default_rng(1)
+    images = random.normal(size=(count, 4, 16)).astype(np.float32)
+    frames = [{"img": each} for each in images]
+    return record(folder / "frames", frames, tuple(range(0, count, 2)))
 
 
 def ones(*starts: bool) -> list[Frame]:

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from typing import TypeAlias
 
 import numpy as np
 
@@ -32,6 +31,14 @@ class Part:
         """That of the whole recording, against which later frames are checked."""
         return self.whole.fingerprint
 
+    @property
+    def scenes(self) -> tuple[int, ...]:
+        """Indices of those of these frames that begin a scene."""
+        starts = {0, *self.whole.scenes}
+        return tuple(
+            at for at, place in enumerate(self.places) if not at or place in starts
+        )
+
     def __len__(self) -> int:
         """Count the frames."""
         return len(self.places)
@@ -44,10 +51,6 @@ class Part:
     def __iter__(self) -> Iterator[Frame]:
         """Read the frames in order, one in memory at a time."""
         return (self[index] for index in range(len(self)))
-
-
-Recording: TypeAlias = CalibrationSet | Part
-"""Recorded frames: all of a folder, or some of them."""
 
 
 def draw(whole: CalibrationSet, count: int, seed: int) -> Part:

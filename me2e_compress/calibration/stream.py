@@ -45,6 +45,19 @@ class FrameSource(Protocol):
         ...
 
 
+class Recording(FrameSource, Protocol):
+    """Recorded frames: all of a folder, some of them, or what a part is fed."""
+
+    @property
+    def scenes(self) -> Sequence[int]:
+        """Indices of those of these frames that begin a scene."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Read the frames in order, one in memory at a time."""
+        ...
+
+
 def stream(
     session: Session,
     frames: FrameSource,

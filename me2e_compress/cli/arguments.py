@@ -7,6 +7,9 @@ import typer
 
 Model = Annotated[str, typer.Argument(help="the ONNX file, or highway; not changed")]
 FloatModel = Annotated[str, typer.Argument(help="the ONNX file, or highway; float")]
+AnyModel = Annotated[
+    str, typer.Argument(help="the ONNX file, a stack's TOML, or highway; not changed")
+]
 Recording = Annotated[Path, typer.Argument(help="the recorded FRAMES")]
 ModuleMap = Annotated[
     str | None, typer.Option("--map", help="vad, uniad, tcp, highway, or a TOML file")

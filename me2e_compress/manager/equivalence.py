@@ -8,7 +8,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import synthetic
-from me2e_compress.calibration.sample import Recording
+from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.shapes import is_static
 from me2e_compress.manager.report import Verification

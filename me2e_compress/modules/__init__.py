@@ -2,7 +2,7 @@
 
 from me2e_compress.modules.assign import assign
 from me2e_compress.modules.assignment import Assignment, Placement
-from me2e_compress.modules.detect import detect, map_of
+from me2e_compress.modules.detect import detect, map_of, map_of_files
 from me2e_compress.modules.inventory import (
     Inventory,
     Item,
@@ -36,6 +36,7 @@ __all__ = [
     "inventory",
     "itemise",
     "map_of",
+    "map_of_files",
     "presets",
     "scope_of",
 ]

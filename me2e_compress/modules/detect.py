@@ -1,5 +1,7 @@
 """Find the preset that fits a graph."""
 
+from collections.abc import Sequence
+
 import onnx_ir as ir
 
 from me2e_compress.errors import ModuleMapError
@@ -21,11 +23,13 @@ def detect(model: ir.Model) -> ModuleMap:
     Raises:
         ModuleMapError: no preset fits.
     """
-    stack = model.metadata_props.get(STACK)
+    return _detect(model.metadata_props.get(STACK), _paths(model))
+
+
+def _detect(stack: str | None, paths: list[str]) -> ModuleMap:
     for name in presets():
         if stack is not None and (stack == name or stack.startswith(f"{name}-")):
             return ModuleMap.load(name)
-    paths = _paths(model)
     ranked = sorted(
         ((*_fit(ModuleMap.load(name), paths), name) for name in presets()),
         key=lambda entry: (-entry[0], -entry[1], entry[2]),
@@ -58,6 +62,38 @@ def map_of(model: ir.Model, name: str | None) -> ModuleMap:
         return detect(model)
     except ModuleMapError:
         return ModuleMap.whole()
+
+
+def map_of_files(
+    models: Sequence[ir.Model], stack: str | None, name: str | None
+) -> ModuleMap:
+    """Load the map of a stack of several files, or find the preset that fits them all.
+
+    What each file must match, another may: none of its patterns is required any more.
+
+    Args:
+        models: The files.
+        stack: What the metadata calls the stack; None where it does not.
+        name: A preset or a TOML file; None to look for a preset.
+
+    Raises:
+        ModuleMapError: No such map, or a required pattern matches nothing in any file.
+    """
+    paths = [path for model in models for path in _paths(model)]
+    if name is None:
+        try:
+            return _detect(stack, paths).lenient()
+        except ModuleMapError:
+            return ModuleMap.whole()
+    found = ModuleMap.load(name)
+    claimed = {claim for path in paths for claim in found.claims(path)}
+    for module, pattern in found.required():
+        if (module, pattern) not in claimed:
+            raise ModuleMapError(
+                f"map {found.name}: pattern {pattern!r} of module {module} matches no"
+                " parameter and no scope in any of the files"
+            )
+    return found.lenient()
 
 
 def _fit(modules: ModuleMap, paths: list[str]) -> tuple[float, int]:

@@ -11,7 +11,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.sample import Recording
+from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.modules import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider

@@ -9,20 +9,17 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress import recipe as recipes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
-from me2e_compress.manager import PassManager, Report
+from me2e_compress.manager import PassManager
 from me2e_compress.manager.pass_manager import collector_paused
+from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
-from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import plan_of, save_plan
 from me2e_compress.quantization.rules import RuleSet
-from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import (
     check_count,
@@ -34,11 +31,14 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.compress_fidelity import (
-    MeasuredLoss,
     SplitFrames,
     measure_loss,
 )
-from me2e_compress.workflows.compress_result import CompressResult, beside, loss_record
+from me2e_compress.workflows.compress_result import (
+    CompressResult,
+    write_result,
+    written_files,
+)
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -190,31 +190,48 @@ def compress(
     named = recipe if isinstance(recipe, str | Path) else None
     inputs = (source, named, frames, options.module_map, *read)
     with (
-        writing(_written(output), inputs, force=options.force),
+        writing(written_files(output), inputs, force=options.force),
         collector_paused(),
     ):
-        return _compress(source, output, passes, frames, options, listener)
+        loaded = read_graph(source, listener)
+        modules = load_map(options.module_map, loaded)
+        split = _split(source, loaded, frames, passes, options)
+        files = source, output, output.parent
+        return compress_graph(loaded, files, passes, modules, split, options, listener)
 
 
-def _compress(
-    source: Path,
-    output: Path,
+def compress_graph(
+    loaded: ir.Model,
+    files: tuple[Path, Path, Path],
     passes: tuple[Pass, ...],
-    frames: str | Path | None,
+    modules: ModuleMap,
+    frames_of: SplitFrames,
     options: CompressOptions,
     listener: Listener,
 ) -> CompressResult:
-    """Read, try, apply, measure, and write."""
+    """Try, apply, measure, and write one graph, whose outputs are claimed already.
+
+    Args:
+        loaded: the graph.
+        files: that holds it, that is written, and the folder that a failing pass
+            leaves its reproducer in.
+        passes: of :meth:`CompressOptions.passes`.
+        modules: its module map.
+        frames_of: what it is calibrated, checked and measured on.
+        options: the rest.
+        listener: is called with progress and warnings.
+
+    Raises:
+        Me2eError: as :func:`compress`.
+    """
     start = process_time()
-    loaded = read_graph(source, listener)
-    modules = load_map(options.module_map, loaded)
-    frames_of = _split(source, loaded, frames, passes, options)
+    source, output, reproducers = files
     seen = frames_of.calibration or frames_of.samples
     first = partial(try_first, listener=listener, provider=options.provider)
     first(loaded, source.name, file=source, frames=seen)
     context = Context(modules, frames_of.calibration, options.seed, options.provider)
     manager = PassManager(
-        passes, options.verify_frames, output.parent, frames_of.samples, first
+        passes, options.verify_frames, reproducers, frames_of.samples, first
     )
     report = manager.run(loaded, context, partial(listener.on_progress, "passes"))
     int8 = Int8Outcome.of(report, context)
@@ -223,7 +240,7 @@ def _compress(
         first(report.model, output.name)
     loss = measure_loss(report, context, frames_of, Floor(options.floor), listener)
     seconds = process_time() - start
-    return _write(report, source, output, int8, loss, seconds)
+    return write_result(report, source, output, int8, loss, seconds)
 
 
 def _split(
@@ -257,31 +274,3 @@ def _refuse_empty(
             f"{int8.empty}; nothing is written, --allow-empty writes it nevertheless"
         )
     listener.on_warning(int8.empty)
-
-
-def _written(output: Path) -> tuple[Path, ...]:
-    return (
-        output,
-        *graph.data_names(output),
-        beside(output, "plan"),
-        beside(output, "report"),
-    )
-
-
-def _write(
-    report: Report,
-    source: Path,
-    output: Path,
-    int8: Int8Outcome | None,
-    loss: MeasuredLoss | None,
-    seconds: float,
-) -> CompressResult:
-    """Write the graph and its plan; the report last, it vouches for the others."""
-    plan = plan_of(report.model)  # first: what the file brought may be none
-    graph.save(with_own_domains(report.model), output)
-    if plan is not None:
-        save_plan(plan, beside(output, "plan"))
-    record = report.record(source, output) | loss_record(report, int8, loss)
-    write_json(beside(output, "report"), record, indent=2)
-    sizes = graph.file_bytes(source), graph.file_bytes(output)
-    return CompressResult(source, output, report, record, *sizes, int8, loss, seconds)

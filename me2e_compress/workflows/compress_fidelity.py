@@ -11,7 +11,8 @@ from time import process_time
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.sample import Recording, hold_out
+from me2e_compress.calibration.sample import hold_out
+from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import EvaluationError, FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.fidelity.floor import Floor, Shortfall, unsteady_outputs
@@ -19,6 +20,7 @@ from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.quantization.plan import QuantPlan, plan_of
+from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.session import Session
 from me2e_compress.sensitivity.remedy import Remedy, find_remedy, int8_nodes
 from me2e_compress.workflows.listener import Listener
@@ -43,7 +45,7 @@ class SplitFrames:
     """
 
     calibration: Recording | None
-    measured: Recording | None
+    measured: Frames | None
     kind: str
     samples: CalibrationSet | None = None
 
@@ -143,7 +145,7 @@ class _Measurement:
 
     report: Report
     context: Context
-    frames: Recording
+    frames: Frames
     floor: Floor
     listener: Listener
 

@@ -5,7 +5,11 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+from me2e_compress import graph
 from me2e_compress.manager import Report
+from me2e_compress.passes.import_normalize import with_own_domains
+from me2e_compress.quantization.plan import plan_of, save_plan
+from me2e_compress.runtime.atomic import write_json
 from me2e_compress.workflows.compress_fidelity import MeasuredLoss
 from me2e_compress.workflows.compress_verdict import (
     alerts,
@@ -117,12 +121,13 @@ def loss_record(
     """
     return {
         "int8": None if int8 is None else dataclasses.asdict(int8),
-        "fidelity": None if loss is None else _fidelity_record(loss),
+        "fidelity": None if loss is None else fidelity_record(loss),
         "verdict": [*verdict(report, int8, loss), *alerts(int8, loss)],
     }
 
 
-def _fidelity_record(loss: MeasuredLoss) -> dict[str, object]:
+def fidelity_record(loss: MeasuredLoss) -> dict[str, object]:
+    """Return what a report file says of fidelity; null where it is not finite."""
     remedy = loss.remedy
     found = dataclasses.asdict(dataclasses.replace(loss, remedy=None))
     del found["seconds"]
@@ -140,3 +145,32 @@ def _finite(value: object) -> object:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def written_files(output: Path) -> tuple[Path, ...]:
+    """Name every file that may be written beside a compressed graph, and that."""
+    return (
+        output,
+        *graph.data_names(output),
+        beside(output, "plan"),
+        beside(output, "report"),
+    )
+
+
+def write_result(
+    report: Report,
+    source: Path,
+    output: Path,
+    int8: Int8Outcome | None,
+    loss: MeasuredLoss | None,
+    seconds: float,
+) -> CompressResult:
+    """Write the graph and its plan; the report last, it vouches for the others."""
+    plan = plan_of(report.model)  # first: what the file brought may be none
+    graph.save(with_own_domains(report.model), output)
+    if plan is not None:
+        save_plan(plan, beside(output, "plan"))
+    record = report.record(source, output) | loss_record(report, int8, loss)
+    write_json(beside(output, "report"), record, indent=2)
+    sizes = graph.file_bytes(source), graph.file_bytes(output)
+    return CompressResult(source, output, report, record, *sizes, int8, loss, seconds)

@@ -29,7 +29,7 @@ def verdict(
     elif loss.fidelity is None:
         yield f"fidelity: not measured ({loss.on})"
     else:
-        yield _fidelity_line(loss.fidelity, loss)
+        yield fidelity_line(loss.fidelity, loss)
     if loss is not None and loss.unsteady:
         yield (
             f"not judged: {', '.join(loss.unsteady)}: the graph itself, uncompressed,"
@@ -102,7 +102,8 @@ def _exact_line(report: Report) -> Iterator[str]:
         yield f"every output is the same within {worst:.1e} of its largest ({inputs})"
 
 
-def _fidelity_line(found: Fidelity, loss: MeasuredLoss) -> str:
+def fidelity_line(found: Fidelity, loss: MeasuredLoss) -> str:
+    """Say how far the plan moved, and which output is the noisiest."""
     where = f"on {_frames(found)} {loss.on}"
     said = []
     if found.plan is not None:

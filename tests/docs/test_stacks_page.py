@@ -8,6 +8,7 @@ from me2e_compress.runtime.stack.stack_file import StackFile
 from me2e_compress.zoo.shipped import sample_frames, shipped
 from tests.cli.conftest import Command, command
 from tests.docs.pages import ROOT, blocks
+from tests.stacks import dense_frames, write_dense
 
 __all__ = ["command"]
 
@@ -27,13 +28,25 @@ def test_the_example_of_the_page_runs(
     recorded = sample_frames(shipped("highway"))
     assert recorded is not None
     Path("frames").symlink_to(recorded)
-    for shell in blocks(PAGE, "sh"):
-        for line in shell.text.splitlines():
-            assert command(*line.split()[1:]) == 0, line
+    first, *_ = blocks(PAGE, "sh")
+    for line in first.text.splitlines():
+        assert command(*line.split()[1:]) == 0, line
 
     assert (
         "plan displacement: mean 0.0000 m, largest 0.0000 m" in capsys.readouterr().out
     )
+
+
+def test_the_other_commands_of_the_page_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_dense(tmp_path)
+    dense_frames(tmp_path)
+    _, *others = blocks(PAGE, "sh")
+
+    for line in "".join(each.text for each in others).splitlines():
+        assert command(*line.split()[1:]) == 0, line
 
 
 def test_the_state_of_the_page_is_read(tmp_path: Path) -> None:

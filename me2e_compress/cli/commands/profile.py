@@ -16,7 +16,7 @@ from me2e_compress.workflows.import_profile import import_profile, refuse_both
 
 
 def profile(
-    model: given.Model,
+    model: given.AnyModel,
     output: Annotated[Path, typer.Option("-o", "--output", help="the trace")],
     frames: Annotated[
         Path | None, typer.Argument(help="the recorded FRAMES; none for --import")

@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.sample import Recording
+from me2e_compress.calibration.stream import Recording
 from me2e_compress.graph import is_standard, provenance, static_shape
 from me2e_compress.graph.nodes import Numbers, constant_values, numbers_of
 from me2e_compress.passes.convert_float16.element_types import ElementTypes

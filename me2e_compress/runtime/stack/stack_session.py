@@ -1,7 +1,7 @@
 """A stack of several files, ready to run."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -145,9 +145,18 @@ class StackSession:
         return found
 
     def runs(
-        self, feeds: Mapping[str, Array], *, first: bool = False
+        self,
+        feeds: Mapping[str, Array],
+        *,
+        first: bool = False,
+        parts: Collection[str] | None = None,
     ) -> Iterator[PartRun]:
         """Run file after file; whoever stops asking leaves the rest unrun.
+
+        Args:
+            feeds: one array for every input that they read.
+            first: whether a scene begins here.
+            parts: those that run; None for all.
 
         Raises:
             FramesError: an input is missing, or has not the type or shape it must.
@@ -156,6 +165,8 @@ class StackSession:
         joints = self._joints(first=first)
         values = dict[Source, Array]()
         for part in joints.order:
+            if parts is not None and part not in parts:
+                continue
             label = joints.graphs[part].label
             session = self.sessions[label]
             fed = {

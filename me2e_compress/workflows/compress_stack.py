@@ -1,0 +1,299 @@
+"""One compression of a stack of several files: file by file, measured as one model."""
+
+import dataclasses
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+
+import numpy as np
+
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.part_frames import PartFrames
+from me2e_compress.calibration.sample import Part
+from me2e_compress.calibration.stream import Recording
+from me2e_compress.errors import (
+    EvaluationError,
+    FramesError,
+    GraphError,
+    PreconditionError,
+    RecipeError,
+)
+from me2e_compress.fidelity.compare import compare
+from me2e_compress.fidelity.floor import Floor
+from me2e_compress.manager.pass_manager import collector_paused
+from me2e_compress.passes import Pass
+from me2e_compress.runtime.atomic import write_bytes, write_json
+from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.stack.split_stack import SplitStack
+from me2e_compress.runtime.stack.stack_file import PartEntry
+from me2e_compress.runtime.stack.stack_session import StackSession
+from me2e_compress.workflows.checks import check_folder, model_path, read_graph
+from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.compress import (
+    CompressOptions,
+    Recipe,
+    compress_graph,
+)
+from me2e_compress.workflows.compress_fidelity import MeasuredLoss, SplitFrames
+from me2e_compress.workflows.compress_result import CompressResult
+from me2e_compress.workflows.compress_stack_result import (
+    REPORT,
+    StackCompressResult,
+    stack_record,
+)
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.stack_maps import map_of_stack
+
+Pipelines = Mapping[str, tuple[Pass, ...]]
+"""The passes of every file, by label."""
+
+
+def compress_stack(
+    stack: str | Path,
+    output: str | Path,
+    recipe: Recipe | None = None,
+    frames: str | Path | None = None,
+    options: CompressOptions | None = None,
+    listener: Listener = SILENT,
+) -> StackCompressResult:
+    """Compress every file of a stack, and write a folder with the smaller stack.
+
+    Each file is calibrated and checked on what it is fed while the float stack runs
+    over the frames; then the whole is measured against the whole.
+
+    Args:
+        stack: the TOML; its files are not changed.
+        output: the folder; it holds a TOML of the same name, the files, their plans
+            and reports, and ``report.json``.
+        recipe: for every file; None takes what the TOML says of each.
+        frames: folder of recorded frames of the stack.
+        options: None takes the defaults; ``ranges`` is a folder of
+            :func:`calibrate_stack`.
+        listener: is called with progress and warnings.
+
+    Raises:
+        GraphError: files that do not fit each other, before or after; or the folder
+            would harm an input.
+        RecipeError: nothing to do for a file, or options that do not fit the passes.
+        FramesError: frames that do not fit the stack.
+        PreconditionError: nothing became int8 in any file although passes quantize.
+        Me2eError: a pass refused a graph or broke.
+    """
+    options, output = options or CompressOptions(), Path(output)
+    if output.suffix in (".onnx", ".toml"):
+        raise GraphError(f"{output}: a stack is written as a folder: name one")
+    whole = SplitStack.load(model_path(stack))
+    pipelines = _pipelines(whole, recipe, options)
+    check_folder(output, (*whole.paths(), frames))
+    with (
+        writing(trees=[output], force=options.force),
+        collector_paused(),
+        _drafted(output) as draft,
+    ):
+        return _compress(whole, draft, output, pipelines, frames, options, listener)
+
+
+@contextmanager
+def _drafted(output: Path) -> Iterator[Path]:
+    """Make a folder beside the output, which takes its place at the end."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.") as scratch:
+        draft = Path(scratch) / output.name
+        draft.mkdir()
+        try:
+            yield draft
+        except GraphError as error:
+            raise GraphError(str(error).replace(str(draft), str(output))) from error
+        if output.exists():
+            os.replace(output, Path(scratch) / "before")
+        os.replace(draft, output)
+
+
+def _compress(
+    whole: SplitStack,
+    draft: Path,
+    output: Path,
+    pipelines: Pipelines,
+    frames: str | Path | None,
+    options: CompressOptions,
+    listener: Listener,
+) -> StackCompressResult:
+    start = process_time()
+    split = _split(whole, frames, pipelines, options)
+    modules = map_of_stack(whole, options.module_map)
+    found = {
+        label: compress_graph(
+            read_graph(each.path, listener),
+            (each.path, draft / f"{label}.onnx", output.parent),
+            pipelines[label],
+            modules,
+            _of_part(whole, label, split, options),
+            _options_of(label, options),
+            _told_of(label, listener),
+        )
+        for label, each in whole.files.items()
+    }
+    _refuse_empty(found, options)
+    small = SplitStack.load(_write_toml(whole, draft))
+    loss = _measured(whole, small, split, found, options)
+    record = stack_record(whole, small, found, loss)
+    write_json(draft / REPORT, record, indent=2)
+    seconds = process_time() - start
+    moved = {
+        label: dataclasses.replace(each, output=output / each.output.name)
+        for label, each in found.items()
+    }
+    source, target = whole.path, output / whole.path.name
+    return StackCompressResult(source, target, moved, record, loss, seconds)
+
+
+def _pipelines(
+    whole: SplitStack, recipe: Recipe | None, options: CompressOptions
+) -> Pipelines:
+    """Build the passes of every file, before anything is done."""
+    entries = {each.name: each for each in whole.content.part}
+    found = dict[str, tuple[Pass, ...]]()
+    for label, file in whole.files.items():
+        wanted = recipe or _named(entries[file.part], whole.path.parent)
+        try:
+            passes = _options_of(label, options).passes(wanted)
+        except RecipeError as error:
+            raise RecipeError(f"{label}: {error}") from error
+        found[label] = passes
+    return found
+
+
+def _named(entry: PartEntry, folder: Path) -> str | Path | None:
+    """Return the recipe of a part: a file beside the TOML, else one that ships."""
+    if entry.recipe is None:
+        return None
+    beside = folder / entry.recipe
+    return beside if beside.is_file() else entry.recipe
+
+
+def _options_of(label: str, options: CompressOptions) -> CompressOptions:
+    """Return the options of one file: its ranges; it may stay float, the whole not."""
+    ranges = None if options.ranges is None else Path(options.ranges) / f"{label}.json"
+    return dataclasses.replace(options, ranges=ranges, allow_empty=True)
+
+
+def _split(
+    whole: SplitStack,
+    folder: str | Path | None,
+    pipelines: Pipelines,
+    options: CompressOptions,
+) -> SplitFrames:
+    """Read and check the frames of the stack, and keep some for the measurement."""
+    recording = None
+    if folder is not None:
+        recording = CalibrationSet(Path(folder))
+        recording.check(whole.interface())
+    passes = [each for every in pipelines.values() for each in every]
+    lossy = not all(each.exact for each in passes)
+    saved = any(each.reads_ranges and not each.needs_frames for each in passes)
+    most = options.measure_frames if lossy else 0
+    return SplitFrames.of(recording, None, most, saved=saved)
+
+
+def _of_part(
+    whole: SplitStack, label: str, split: SplitFrames, options: CompressOptions
+) -> SplitFrames:
+    """Return what one file is fed on the frames of the stack."""
+
+    def fed(frames: Recording) -> PartFrames:
+        return PartFrames(whole, label, frames, options.provider)
+
+    calibration = None if split.calibration is None else fed(split.calibration)
+    if not isinstance(split.measured, Part):
+        return SplitFrames(calibration, None, split.kind)
+    try:
+        measured: Frames = tuple(fed(split.measured))
+    except FramesError as error:
+        return SplitFrames(calibration, None, str(error))
+    return SplitFrames(calibration, measured, split.kind)
+
+
+def _told_of(label: str, listener: Listener) -> Listener:
+    """Say of which file progress and warnings are."""
+    return Listener(
+        lambda stage, done, total, words: listener.on_progress(
+            f"{label}: {stage}", done, total, words
+        ),
+        lambda line: listener.on_warning(f"{label}: {line}"),
+    )
+
+
+def _refuse_empty(
+    found: Mapping[str, CompressResult], options: CompressOptions
+) -> None:
+    """Refuse a stack in which nothing became int8; one of its files may have none."""
+    outcomes = [each.int8 for each in found.values() if each.int8 is not None]
+    if outcomes and not options.allow_empty and all(each.empty for each in outcomes):
+        raise PreconditionError(
+            f"{outcomes[0].empty}; nothing is written, --allow-empty writes it"
+            " nevertheless"
+        )
+
+
+def _write_toml(whole: SplitStack, draft: Path) -> Path:
+    """Write the TOML of the smaller stack, and first values as files beside it."""
+    said = whole.content
+    parts = tuple(
+        each.model_copy(
+            update={
+                "file": each.file and Path(f"{each.name}.onnx"),
+                "first_frame": each.first_frame
+                and Path(f"{each.name}.first_frame.onnx"),
+                "recipe": None,
+            }
+        )
+        for each in said.part
+    )
+    state = dict(said.state)
+    for at, (name, entry) in enumerate(said.state.items()):
+        value = whole.first_values.get(name.removeprefix(f"{name.split('.')[0]}."))
+        value = whole.first_values.get(name, value)
+        if value is not None:
+            file = draft / f"first_value_{at}.npy"
+            np.save(file, value, allow_pickle=False)
+            state[name] = entry.model_copy(update={"first": file.name})
+    path = draft / whole.path.name
+    small = said.model_copy(update={"part": parts, "state": state})
+    write_bytes(path, small.text().encode())
+    return path
+
+
+def _measured(
+    whole: SplitStack,
+    small: SplitStack,
+    split: SplitFrames,
+    found: Mapping[str, CompressResult],
+    options: CompressOptions,
+) -> MeasuredLoss | None:
+    """Compare the whole with what it was, if a file was changed by a lossy pass."""
+    if not any(each.report.lossy for each in found.values()):
+        return None
+    floor = Floor(options.floor)
+    if split.measured is None:
+        return MeasuredLoss(None, split.kind, floor)
+    before, after = (
+        StackSession.open(each, release=True, provider=options.provider)
+        for each in (whole, small)
+    )
+    unsteady = {
+        name: value
+        for each in found.values()
+        if each.loss is not None
+        for name, value in each.loss.unsteady.items()
+    }
+    try:
+        fidelity = compare(before, after, split.measured)
+    except EvaluationError as error:
+        return MeasuredLoss(None, str(error), floor, incomparable=True)
+    below = floor.shortfalls(fidelity, unsteady)
+    guilty = tuple(name for name, each in found.items() if each.report.lossy)
+    unsteady = {name: unsteady[name] for name in unsteady if name in whole.outputs}
+    return MeasuredLoss(fidelity, split.kind, floor, unsteady, tuple(below), guilty)
