@@ -56,6 +56,13 @@ class PlanQuality:
     anew_low: float | None
     anew_high: float | None
 
+    @property
+    def title(self) -> str:
+        """What it is, in a few words."""
+        what = "L2" if self.measure == "l2" else "collisions"
+        when = "at" if self.convention == "at" else "to"
+        return f"{what} {when} {self.horizon_s} s, {self.unit}"
+
 
 @dataclasses.dataclass(frozen=True)
 class OpenLoop:
@@ -87,26 +94,24 @@ class OpenLoop:
         )
 
     def table(self) -> Table:
-        """Return a row a quality."""
+        """Return a row a number."""
         rows = [
             (
-                f"{'L2' if each.measure == 'l2' else 'collisions'},"
-                f" {'at' if each.convention == 'at' else 'up to'} {each.horizon_s} s",
+                each.title,
                 f"{each.reference:.2f}",
                 f"{each.candidate:.2f}",
-                f"{each.difference:+.3f}",
+                f"{each.difference:+.2f}",
                 _between(each.low, each.high),
                 _between(each.anew_low, each.anew_high),
-                each.unit,
             )
             for each in self.qualities
         ]
-        names = ("plan", "first", "second", "difference", "95 %", "scenes anew", "unit")
+        plural = "" if self.scenes == 1 else "s"
         return table(
             "Plans against what was really driven",
-            names,
+            ("mean", "first", "second", "differ", "95 %", "scenes anew"),
             rows,
-            f"Over {self.frames} frames of {self.scenes} scenes whose next three"
+            f"Over {self.frames} frames of {self.scenes} scene{plural} whose next three"
             f" seconds are known ({self.left_out} others are left out). At a horizon is"
             " UniAD's convention, the mean up to it that of ST-P3 and VAD.",
         )
@@ -160,4 +165,4 @@ def _quality(
 def _between(low: float | None, high: float | None) -> str:
     if low is None or high is None:
         return "-"
-    return f"{number(low, '+.3f')} to {number(high, '+.3f')}"
+    return f"{number(low, '+.2f')} to {number(high, '+.2f')}"

@@ -211,3 +211,12 @@ def test_a_command_without_a_mode_is_a_reason() -> None:
 
 def test_no_ground_truth_is_not_measured() -> None:
     assert judged(planner(1.0), planner(1.0), frame(0, None)) == NO_FUTURE
+
+
+def test_a_table_says_what_each_number_is() -> None:
+    shown = found(planner(0.5), frame(0, future())).table()
+
+    first = [str(cell.text) for cell in shown.rows[0]]
+    assert first == ["L2 at 1 s, m", "0.00", "2.00", "+2.00", "-", "-"]
+    assert len(shown.rows) == 12
+    assert "1 frames of 1 scene whose" in shown.note
