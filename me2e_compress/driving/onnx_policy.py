@@ -7,11 +7,12 @@ from typing import Self
 import numpy as np
 
 from me2e_compress.driving.adapter import Adapter, ImageNormalization
-from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import ModelOutputs
+from me2e_compress.driving.adapter.recurrent import FirstValues, answers_by_input
 from me2e_compress.driving.contract import Answer, Observation, RouteInfo, Trajectory
 from me2e_compress.driving.host_stage import HostStage
-from me2e_compress.driving.ports import fits, zeros
+from me2e_compress.driving.ports import fits
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
@@ -27,7 +28,7 @@ class OnnxPolicy:
     ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route began, of
     which a model may lack any; recurrent inputs ``X`` answered by ``X_out``, zeros at
     the start of a route; output ``plan`` [1, 6, 2]. An `Adapter` maps other names and
-    layouts, waypoints of any number and spacing, and controls.
+    layouts, first values, waypoints of any number and spacing, and controls.
 
     Attributes:
         session: The loaded graph.
@@ -35,6 +36,7 @@ class OnnxPolicy:
         inputs: How it is fed.
         outputs: How its answer is read.
         recurrent: Recurrent input to the output that answers it.
+        first: What these hold where a route begins.
         stage: Changes the plan on the host; None leaves it as the network has it.
         host_iterations: Of that stage, for the latest plan.
         host_cells: That the stage took into account, for the latest plan.
@@ -45,6 +47,7 @@ class OnnxPolicy:
     inputs: ModelInputs
     outputs: ModelOutputs
     recurrent: dict[str, str]
+    first: FirstValues
     stage: HostStage | None = None
     host_iterations: int = field(default=0, init=False)
     host_cells: int = field(default=0, init=False)
@@ -97,7 +100,8 @@ class OnnxPolicy:
             raise EvaluationError(
                 f"{stage.name} changes a plan, and this model answers controls alone"
             )
-        policy = cls(session, adapter, inputs, outputs, recurrent, stage)
+        first = FirstValues.of(session, adapter.recurrent, recurrent)
+        policy = cls(session, adapter, inputs, outputs, recurrent, first, stage)
         policy._dry_run()
         return policy
 
@@ -119,14 +123,11 @@ class OnnxPolicy:
     def reset(self, route: RouteInfo | None) -> None:
         """Begin a route: recurrent inputs hold their first values again."""
         self._begins = True
-        known = self.session.first_state({})
+        known = self.session.first_state(self.first.held)
         self.inputs.reset()
         self.outputs.reset()
-        self._state = {
-            name: zeros(name, self.session.inputs[name])
-            for name in self.recurrent
-            if name not in self.session.recurrent
-        } | {name: value for name, value in known.items() if name in self.recurrent}
+        own = {name: each for name, each in known.items() if name in self.recurrent}
+        self._state = {**self.first.zeros, **own}
 
     def plan(self, observation: Observation) -> Answer:
         """Run the model once.
@@ -137,6 +138,8 @@ class OnnxPolicy:
             GraphError: A node of the model failed.
         """
         feeds = self.feeds(observation)
+        if self._begins:
+            self._state |= self.first.at(feeds)
         outputs = self.session.run({**self._state, **feeds}, first=self._begins)
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
@@ -175,5 +178,7 @@ class OnnxPolicy:
 
 def recurrent_of(session: AnySession, adapter: Adapter) -> dict[str, str]:
     """Return each recurrent input with the output that answers it."""
-    told = session.recurrent if adapter.recurrent is None else adapter.recurrent
-    return dict(told)
+    fed_otherwise = {*adapter.feeds, *adapter.images}
+    if adapter.recurrent is not None:
+        fed_otherwise |= set(contract_names(adapter).values())
+    return answers_by_input(session, adapter.recurrent, fed_otherwise)

@@ -7,9 +7,9 @@ from pathlib import Path
 from me2e_compress.calibration.logs import LOGS, DriveLog
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import Begin, Source, write_recording
+from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError
-from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import digest_of_files
@@ -168,7 +168,7 @@ def _recorded(
         try_file(model, listener, options.provider)
         make, of = _driven(model, options), digest_of_files(model)
         if options.adapter is not None:
-            of += f" {sha256_of(adapter_file(options.adapter))}"
+            of += f" {Adapter.digest(adapter_file(options.adapter))}"
     elif options.adapter is not None:
         raise EvaluationError(
             f"adapter {options.adapter}: {source} is drawn from a synthetic world; name"
@@ -212,7 +212,6 @@ def _logged(
 
 def _driven(model: Path, options: FramesOptions) -> Source:
     need_closed_loop("what frames of a driver need")
-    from me2e_compress.driving.adapter import Adapter
     from me2e_compress.driving.onnx_policy import OnnxPolicy
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 

@@ -12,9 +12,11 @@ from me2e_compress.driving.adapter.controls import ControlAdapter
 from me2e_compress.driving.adapter.feeds import Feed
 from me2e_compress.driving.adapter.image_inputs import ImageInput
 from me2e_compress.driving.adapter.images import ImageNormalization
+from me2e_compress.driving.adapter.recurrent import RecurrentEntry
 from me2e_compress.driving.axes import Axes
 from me2e_compress.driving.head_fusion import FusionOptions
 from me2e_compress.errors import EvaluationError
+from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]
@@ -28,7 +30,8 @@ class Adapter(BaseModel):
             the graph's.
         feeds: What each other input of the graph is made of, by its name.
         images: What each image input shows, by its name.
-        recurrent: Recurrent input to the output that answers it.
+        recurrent: Recurrent input to the output that answers it, and to its first
+            value; inputs that the adapter feeds in another way are not recurrent.
         plan: Which output is the plan, when its waypoints are to be reached, whether it
             holds steps, which mode is taken; ``command_input = "command"`` lets the
             navigator's command pick it.
@@ -43,7 +46,7 @@ class Adapter(BaseModel):
     inputs: dict[Contract, str] = {}
     feeds: dict[str, Feed] = {}
     images: dict[str, ImageInput] = {}
-    recurrent: dict[str, str] | None = None
+    recurrent: dict[str, RecurrentEntry] | None = None
     plan: PlanAdapter | None = None
     control: ControlAdapter | None = None
     fusion: FusionOptions | None = None
@@ -66,7 +69,8 @@ class Adapter(BaseModel):
             EvaluationError: No such file, not TOML, or an unknown key or value.
         """
         try:
-            return cls.model_validate(documents.from_toml(documents.content(path)))
+            content = documents.from_toml(documents.content(path))
+            return cls.model_validate(content, context=path.parent)
         except OSError as error:
             raise EvaluationError(f"{path}: {error.strerror}") from error
         except documents.MalformedError as error:
@@ -76,6 +80,19 @@ class Adapter(BaseModel):
             where = ".".join(map(str, first["loc"]))
             words = first["msg"].removeprefix("Value error, ")
             raise EvaluationError(f"{path}: adapter {where}: {words}") from error
+
+    @classmethod
+    def digest(cls, path: Path) -> str:
+        """Return what identifies an adapter with the files that it names.
+
+        Raises:
+            EvaluationError: See `load`, or one of them is not there.
+        """
+        entries = (cls.load(path).recurrent or {}).values()
+        files = [path, *(each.file for each in entries if each.file is not None)]
+        if missing := [file for file in files if not file.is_file()]:
+            raise EvaluationError(f"{path}: adapter: no such file: {missing[0]}")
+        return "+".join(map(sha256_of, files))
 
     def to_ego(self, waypoints: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Turn [n, 2] waypoints of the model's frame into the ego frame."""

@@ -14,6 +14,7 @@ from me2e_compress.driving.adapter.inputs import (
     unfed,
 )
 from me2e_compress.driving.adapter.port_use import PortUse, element_type
+from me2e_compress.driving.adapter.recurrent import ZEROS
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.ports import DEFAULT_IMAGE_SIZE, zeros
 from me2e_compress.errors import EvaluationError
@@ -46,7 +47,9 @@ def input_uses(
         if port.type not in DTYPES:
             problems[name] = f"input {name} is {port.type}: it cannot be fed"
         elif name in recurrent:
-            problems |= _no_start(name, port)
+            entry = (adapter.recurrent or {}).get(name)
+            if entry is None or entry.first == ZEROS:
+                problems |= _no_start(name, port)
         elif name not in words:
             problems[name] = unfed(name)
     return tuple(

@@ -155,6 +155,11 @@ class ModelInputs:
         return found
 
 
+def contract_names(adapter: Adapter) -> dict[str, str]:
+    """Return the graph's name of each input of the contract."""
+    return {ours: ours for ours in (IMAGES, *CONTRACT)} | {**adapter.inputs}
+
+
 def image_tables(
     adapter: Adapter, ports: Mapping[str, SessionPort]
 ) -> dict[str, ImageInput]:
@@ -170,7 +175,7 @@ def feeds_by_input(
 ) -> dict[str, Feed]:
     """Return how each other input is fed: as the adapter says, and the contract's."""
     named = {**adapter.images, **adapter.feeds}
-    usual = {ours: ours for ours in CONTRACT} | {**adapter.inputs}
+    usual = contract_names(adapter)
     return {
         usual[ours]: Feed.by(INPUT_SOURCES.build(source, {}))
         for ours, source in CONTRACT.items()

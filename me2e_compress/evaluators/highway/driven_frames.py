@@ -107,11 +107,14 @@ def _look(
     driver = ObservationBuilder(world, expert, rig, None)
     passenger = ObservationBuilder(world, policy, rig, cameras)
     policy.reset(route)
+    wanted = count
     scene = world.scene()
     while count and rules.ending(world, scene.ego.speed_mps) is None:
         since_us = scene.time_us - begin_us
         if since_us >= 0 and since_us % STEP_US == 0:
-            yield policy.feeds(replace(passenger.observe(scene), time_us=since_us))
+            feeds = policy.feeds(replace(passenger.observe(scene), time_us=since_us))
+            first = policy.first.at(feeds) if count == wanted else {}
+            yield {**feeds, **first}
             count -= 1
         plan = expert.plan(driver.observe(scene))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)

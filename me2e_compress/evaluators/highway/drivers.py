@@ -3,7 +3,6 @@
 What drives is imported when it is opened: naming a driver takes no simulator.
 """
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -110,7 +109,9 @@ class OnnxDriver(Driver):
         """Return digests of its files, wherever they lie, provider and stage."""
         digests = [digest_of_files(self.path)]
         if self.adapter is not None:
-            digests.append(hashlib.sha256(self.adapter.read_bytes()).hexdigest())
+            from me2e_compress.driving.adapter import Adapter
+
+            digests.append(Adapter.digest(self.adapter))
         if self.provider != "cpu":
             digests.append(self.provider)
         if self.host_stage:

@@ -184,7 +184,9 @@ def test_an_adapter_names_the_recurrent_pair(tmp_path: Path) -> None:
 
     with pytest.raises(EvaluationError, match="input steps is none of img, lidar2img"):
         OnnxPolicy.open(path)
-    policy = OnnxPolicy.open(path, Adapter(recurrent={"steps": "state"}))
+    policy = OnnxPolicy.open(
+        path, Adapter.model_validate({"recurrent": {"steps": "state"}})
+    )
     policy.reset(EXIT)
 
     assert [planned(policy, observation())[5, 1] for _ in range(2)] == [1.0, 2.0]

@@ -1,0 +1,176 @@
+"""Which inputs are fed back, and what they hold where a route begins."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from me2e_compress.driving.ports import fed, fits, zeros
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.runtime.any_session import AnySession
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.session import DTYPES, SessionPort
+from me2e_compress.runtime.stack.first_values import read_value
+
+ZEROS = "zeros"
+_FILES = (".npy", ".npz")
+
+
+class RecurrentEntry(BaseModel):
+    """One entry of ``[recurrent]``; a text alone is the output.
+
+    Attributes:
+        answer: The output that is fed back; in the file ``from``. None leaves it to
+            the model's metadata and the naming rules.
+        first: The value where a route begins: ``zeros``; a file ``.npy``, or ``.npz``
+            with an array of the input's name, relative to the adapter; or an input of
+            the graph, whose value of that moment it is.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    answer: str | None = Field(default=None, alias="from")
+    first: str = ZEROS
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_text(cls, value: Any) -> Any:
+        return {"from": value} if isinstance(value, str) else value
+
+    @field_validator("first")
+    @classmethod
+    def _beside(cls, text: str, info: ValidationInfo) -> str:
+        """Find a file beside the adapter."""
+        if Path(text).suffix in _FILES and info.context is not None:
+            return str(info.context / text)
+        return text
+
+    @property
+    def file(self) -> Path | None:
+        """The file of the first value, if it is of one."""
+        path = Path(self.first)
+        return path if path.suffix in _FILES else None
+
+
+Entries = Mapping[str, RecurrentEntry] | None
+
+
+def answers_by_input(
+    session: AnySession, entries: Entries, fed_otherwise: set[str]
+) -> dict[str, str]:
+    """Return each recurrent input with the output that answers it.
+
+    The model's own stand beside those that are named, but for inputs that the adapter
+    feeds.
+
+    Args:
+        session: The model.
+        entries: Of the adapter; None names none.
+        fed_otherwise: Inputs that are not recurrent, whatever the model says.
+
+    Raises:
+        EvaluationError: No output answers one that is named.
+    """
+    own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
+    found: dict[str, str] = {}
+    for name, entry in (entries or {}).items():
+        answer = entry.answer or own.get(name)
+        if answer is None:
+            raise EvaluationError(
+                f"recurrent input {name}: no output answers it by its name; say from ="
+                f" one of {', '.join(session.outputs)}"
+            )
+        found[name] = answer
+    return {**own, **found}
+
+
+@dataclass(frozen=True)
+class FirstValues:
+    """What recurrent inputs hold at the first decision of a route.
+
+    Attributes:
+        held: Of files.
+        given: Recurrent input to the input of the graph whose value it takes.
+        zeros: Of the others that the model itself does not know as recurrent.
+    """
+
+    held: Mapping[str, Array]
+    given: Mapping[str, str]
+    zeros: Mapping[str, Array]
+
+    @classmethod
+    def of(
+        cls, session: AnySession, entries: Entries, recurrent: Mapping[str, str]
+    ) -> Self:
+        """Read the files, and hold every value against its input.
+
+        Raises:
+            EvaluationError: No such file or input, or a value of another shape or type.
+        """
+        held: dict[str, Array] = {}
+        given: dict[str, str] = {}
+        ports = session.inputs
+        for name, entry in (entries or {}).items():
+            where = f"first value of {name}: {entry.first}"
+            if entry.file is not None:
+                held[name] = _from_file(entry.file, name, ports[name], where)
+            elif entry.first != ZEROS:
+                given[name] = _input(entry.first, ports[name], ports, recurrent, where)
+        known = {*held, *given, *session.recurrent}
+        others = [name for name in recurrent if name not in known]
+        return cls(held, given, {name: zeros(name, ports[name]) for name in others})
+
+    def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
+        """Return those that are not zeros, at a decision of these feeds."""
+        return {**self.held, **{to: feeds[name] for to, name in self.given.items()}}
+
+
+def _from_file(path: Path, name: str, port: SessionPort, where: str) -> Array:
+    try:
+        value = read_value(path, name, where)
+    except GraphError as error:
+        raise EvaluationError(str(error)) from error
+    _check(value, port, where)
+    return fed(value, port)
+
+
+def _input(
+    source: str,
+    port: SessionPort,
+    ports: Mapping[str, SessionPort],
+    recurrent: Mapping[str, str],
+    where: str,
+) -> str:
+    if source not in ports or source in recurrent:
+        plain = ", ".join(name for name in ports if name not in recurrent)
+        raise EvaluationError(
+            f"{where} is none of {ZEROS}, a file .npy or .npz, and an input that is not"
+            f" recurrent; those are {plain or 'none'}"
+        )
+    other = ports[source]
+    if other.type != port.type or not fits(other.shape, port.shape):
+        raise EvaluationError(
+            f"{where} is {other.type} {list(other.shape)}, the input takes {port.type}"
+            f" {list(port.shape)}"
+        )
+    return source
+
+
+def _check(value: Array, port: SessionPort, where: str) -> None:
+    missing = max(0, len(port.shape) - value.ndim)
+    if not fits((1,) * missing + value.shape, port.shape):
+        raise EvaluationError(
+            f"{where} has shape {list(value.shape)}, the input takes {list(port.shape)}"
+        )
+    if not np.can_cast(value.dtype, DTYPES[port.type], "same_kind"):
+        raise EvaluationError(f"{where} is {value.dtype}, the input takes {port.type}")
