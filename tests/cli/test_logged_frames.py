@@ -14,6 +14,7 @@ from me2e_compress.zoo.stacks import VAD_TINY
 from tests.calibration.logs.small_logs import write_bench2drive, write_nuscenes
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
+from tests.stacks import write_stack
 
 FRONT = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -108,6 +109,33 @@ def test_what_does_not_fit_is_one_line(
     shown = " ".join(capsys.readouterr().err.split())
     assert message in shown
     assert not (tmp_path / "out").exists()
+
+
+BACKBONE = """
+<ir_version: 9, opset_import: ["" : 17]>
+backbone (float[1,6,3,48,80] img) => (float[1,6,3,48,80] feats)
+{ feats = Relu(img) }
+"""
+HEAD = """
+<ir_version: 9, opset_import: ["" : 17]>
+head (float[1,6,3,48,80] feats, float[18] can_bus, float[1,6,3,48,80] prev_bev)
+    => (float[1,6,3,48,80] next_bev, float[18] plan)
+{ next_bev = Add(feats, prev_bev) plan = Identity(can_bus) }
+"""
+
+
+def test_a_stack_of_several_files_is_fed_as_one_model(
+    command: Command, tmp_path: Path
+) -> None:
+    stack = write_stack(tmp_path, backbone=BACKBONE, head=HEAD)
+    backbone = graph.load(tmp_path / "backbone.onnx")
+    backbone.metadata_props["me2e.image"] = json.dumps(IMAGE)
+    graph.save(backbone, tmp_path / "backbone.onnx")
+    log = f"nuscenes:{write_nuscenes(tmp_path / 'log', 1)}"
+
+    assert command("frames", stack, "--from", log, "-o", tmp_path / "out") == 0
+
+    assert {*CalibrationSet(tmp_path / "out")[0].arrays} == {"img", "can_bus"}
 
 
 PLANNER = """
