@@ -1,13 +1,15 @@
-"""Recipe ``exact`` against onnxsim and onnxslim: time, nodes, bytes, error, latency.
+"""Recipe ``exact`` against its peers: time, memory, nodes, bytes, error, latency.
 
     python -m benchmarks.bench_exact_passes model.onnx frames/ --map vad
+    python -m benchmarks.bench_exact_passes model.onnx --map uniad --rounds 1
     python -m benchmarks.bench_exact_passes --scaling
 
 Each tool works in a started process of its own, from file to file, round by round in
 turn. Ours is what a user runs: the workflow ``compress``, the manager's checks, report
 and hashes included. Three numbers are kept apart: start-up (the CPU time until the
 imports are done), the work, and verification (what two frames add to it). Latencies
-are interleaved too: round by round every graph runs one frame.
+are interleaved too: round by round every graph runs one frame. Without frames nothing
+is verified and no graph is run: what is left are times, memory, nodes and bytes.
 """
 
 import argparse
@@ -80,25 +82,29 @@ def replay(
     return feeds, wanted
 
 
-def compare(source: Path, folder: Path, preset: str, rounds: int) -> None:
+def compare(source: Path, folder: Path | None, preset: str, rounds: int) -> None:
+    tools = [tool for tool in TOOLS if folder is not None or tool != "ours, verified"]
     with tempfile.TemporaryDirectory() as scratch:
         files = {"original": source}
-        files |= {tool: Path(scratch) / f"{tool}.onnx" for tool in TOOLS}
-        taken: dict[str, list[Taken]] = {tool: [] for tool in TOOLS}
+        files |= {tool: Path(scratch) / f"{tool}.onnx" for tool in tools}
+        taken: dict[str, list[Taken]] = {tool: [] for tool in tools}
         for _ in range(rounds):
             for tool, runs in taken.items():
                 runs.append(measure(tool, Job(source, files[tool], preset, folder)))
         show_times(taken)
-        show_graphs(files, frames(folder, 2))
+        if folder is None:
+            show_sizes(files)
+        else:
+            show_graphs(files, frames(folder, 2))
 
 
 def show_times(taken: Mapping[str, Sequence[Taken]]) -> None:
     """Print the least and the median CPU time of the rounds, start-up apart."""
-    print(f"\n{'':14}  start-up  CPU s min  median  wall s min  peak MB")
+    print(f"\n{'':17}  start-up  CPU s min  median  wall s min  peak MB")
     for tool, runs in taken.items():
         cpu = [each.cpu_s for each in runs]
         print(
-            f"{tool:14} {min(each.startup_s for each in runs):9.2f} {min(cpu):10.2f}"
+            f"{tool:17} {min(each.startup_s for each in runs):9.2f} {min(cpu):10.2f}"
             f" {np.median(cpu):7.2f} {min(each.wall_s for each in runs):11.2f}"
             f" {max(each.peak_mb for each in runs):8.0f}"
         )
@@ -107,6 +113,12 @@ def show_times(taken: Mapping[str, Sequence[Taken]]) -> None:
         for mine, theirs in zip(taken["ours"], taken["onnxsim"], strict=True)
     ]
     print(f"ours / onnxsim, round by round: {np.median(ratios):.2f} (median)")
+
+
+def show_sizes(files: Mapping[str, Path]) -> None:
+    print(f"\n{'':17}  nodes        bytes")
+    for name, path in files.items():
+        print(f"{name:17} {nodes(path):6} {os.path.getsize(path):12,}")
 
 
 def show_graphs(files: Mapping[str, Path], shown: Sequence[Frame]) -> None:
@@ -119,14 +131,14 @@ def show_graphs(files: Mapping[str, Path], shown: Sequence[Frame]) -> None:
             start = time.perf_counter()
             one.run(None, feeds[turn % len(feeds)])
             latency[name].append(time.perf_counter() - start)
-    print(f"\n{'':14}  nodes        bytes  max rel err  min s  med s")
+    print(f"\n{'':17}  nodes        bytes  max rel err  min s  med s")
     for name, path in files.items():
         off = max(
             error(want, sessions[name].run(None, feed))
             for want, feed in zip(wanted, feeds, strict=True)
         )
         print(
-            f"{name:14} {nodes(path):6} {os.path.getsize(path):12,} {off:12.2e}"
+            f"{name:17} {nodes(path):6} {os.path.getsize(path):12,} {off:12.2e}"
             f" {min(latency[name]):6.3f} {np.median(latency[name]):6.3f}"
         )
 
@@ -161,10 +173,10 @@ def main() -> None:
     given = parser.parse_args()
     if given.scaling:
         scaling()
-    elif given.model and given.frames:
+    elif given.model:
         compare(given.model, given.frames, given.map, given.rounds)
     else:
-        parser.error("name a model and its frames, or --scaling")
+        parser.error("name a model, or --scaling")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ SYNTHETIC_MAP = """
 role = "feature"
 optional = ["stage.*"]
 """
-TOOLS = ("ours", "ours, verified", "onnxsim", "onnxslim")
+TOOLS = ("ours", "ours, verified", "onnxsim", "onnxslim", "onnxruntime basic")
 Work = Callable[[], None]
 
 
@@ -106,9 +106,26 @@ def onnxslim(job: Job) -> Work:
     return work
 
 
+def onnxruntime_basic(job: Job) -> Work:
+    import onnxruntime
+
+    def work() -> None:
+        options = onnxruntime.SessionOptions()
+        options.graph_optimization_level = (
+            onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        )
+        options.optimized_model_filepath = str(job.target)
+        options.intra_op_num_threads = 1
+        options.log_severity_level = 4
+        onnxruntime.InferenceSession(job.source, options)
+
+    return work
+
+
 def work_alone(tool: str, job: Job) -> None:
     """Run one tool here and print what it took as the last line, in JSON."""
-    prepare = (ours, verified, onnxsim, onnxslim)[TOOLS.index(tool)]
+    tools = (ours, verified, onnxsim, onnxslim, onnxruntime_basic)
+    prepare = tools[TOOLS.index(tool)]
     work = prepare(job)
     startup, wall = time.process_time(), time.perf_counter()
     with contextlib.redirect_stderr(io.StringIO()):

@@ -37,11 +37,19 @@ class PathGlob:
         head, dot, _ = self.text.partition(".")
         return head == "**" or (head == "*" and bool(dot))
 
+    @functools.cached_property
+    def _is_plain(self) -> bool:
+        """Whether it is a beginning written out: most are, and many paths are asked."""
+        return not self.anywhere and not any(mark in self.text for mark in "*?[")
+
     def reach(self, path: tuple[str, ...]) -> int | None:
         """Count the components of a path up to the end of the deepest match.
 
         None if the pattern does not match the path.
         """
+        if self._is_plain:
+            count = len(self.components)
+            return count if path[:count] == self.components else None
         last = len(path) - len(self.components) if self.anywhere else 0
         for start in range(last, -1, -1):
             if self._matches_at(path, start):

@@ -12,7 +12,14 @@ import onnx_ir as ir
 
 from me2e_compress.graph import array_of, provenance, static_shape
 from me2e_compress.passes.eliminate_redundant.identities import moves_nothing
-from me2e_compress.rewrite import add_constant, bypass, is_standard, put, sole_reader
+from me2e_compress.rewrite import (
+    add_constant,
+    bypass,
+    is_standard,
+    put,
+    sole_reader,
+    value_names,
+)
 
 VIEWS = frozenset({"Flatten", "Reshape", "Squeeze", "Unsqueeze"})
 
@@ -58,6 +65,7 @@ class MergeSite:
     opsets: Mapping[str, int]
     by: str
     shapes: dict[tuple[int, ...], ir.Value] = dataclasses.field(default_factory=dict)
+    names: set[str] = dataclasses.field(default_factory=set)
 
     @property
     def opset(self) -> int:
@@ -72,8 +80,9 @@ class MergeSite:
         """
         value = self.shapes.get(sizes)
         if value is None or value.graph is not self.graph:
-            name = f"{reader.outputs[0].name}_shape"
-            value = add_constant(self.graph, np.array(sizes, np.int64), name)
+            name, array = f"{reader.outputs[0].name}_shape", np.array(sizes, np.int64)
+            self.names = self.names or value_names(self.graph)
+            value = add_constant(self.graph, array, name, self.names)
             self.shapes[sizes] = value
         return value
 
