@@ -1,10 +1,9 @@
 """Read and write ONNX files: weights mapped, outputs atomic, sources untouched."""
 
 import hashlib
-import mmap
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import onnx
@@ -15,11 +14,14 @@ from google.protobuf.message import DecodeError
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
 from me2e_compress.graph.external import data_file, external_tensors, settle
+from me2e_compress.graph.inline_file import write_inline
 from me2e_compress.graph.opset import lower
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
+
+_BLOCK_BYTES = 1 << 22
 
 _LOCATION = b"\n\x08location"
 """How a protobuf message begins that names a file of external data."""
@@ -112,7 +114,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         if external:
             ir.save(model, draft, format="protobuf", external_data=data.name)
         else:
-            onnx.save(ir.to_proto(_inlined(model)), draft, format="protobuf")
+            write_inline(_inlined(model), draft)
         # The earlier model keeps its weights until the new one stands in its place.
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
@@ -129,13 +131,9 @@ def data_names(path: Path) -> tuple[Path, Path]:
 
 def _named_in(path: Path, names: Iterable[Path]) -> list[Path]:
     """Return which data file the model at a path names; the last one may be old."""
-    if not path.is_file() or path.stat().st_size == 0:
+    if not path.is_file():
         return []
-    with (
-        path.open("rb") as stream,
-        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
-    ):
-        return [each for each in names if content.find(each.name.encode()) >= 0][:1]
+    return [each for each in names if _holds(path, each.name.encode())][:1]
 
 
 def is_external(model: ir.Model) -> bool:
@@ -151,28 +149,43 @@ def file_bytes(path: Path) -> int:
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
     seal = hashlib.sha256()
-    files = [path, *_external_files(path)]
-    for file in files:
-        with file.open("rb") as stream:
-            for block in iter(lambda: stream.read(1 << 22), b""):
+    if _holds(path, _LOCATION, seal):
+        for file in _external_files(path):
+            for block in _blocks(file):
                 seal.update(block)
     return seal.hexdigest()
 
 
 def _external_files(path: Path) -> list[Path]:
     """List the data files that a model names, in the order of its weights."""
-    if path.stat().st_size == 0:
+    # Parsing hundreds of MB takes as long as hashing them: look first.
+    if not _holds(path, _LOCATION):
         return []
-    with (
-        path.open("rb") as stream,
-        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
-    ):
-        # Parsing hundreds of MB takes as long as hashing them: look first.
-        if content.find(_LOCATION) < 0:
-            return []
     model = ir.load(path, format="protobuf")
     found = [data_file(path, tensor) for tensor in external_tensors(model)]
     return list(dict.fromkeys(found))
+
+
+def _holds(path: Path, words: bytes, seal: "hashlib._Hash | None" = None) -> bool:
+    """Return whether a file holds some bytes; hash it on the way.
+
+    It is read block by block: a mapped file would count as memory of this process.
+    """
+    found, tail = False, b""
+    for block in _blocks(path):
+        if seal is not None:
+            seal.update(block)
+        seen = tail + block
+        found, tail = found or words in seen, seen[-len(words) :]
+        if found and seal is None:
+            break
+    return found
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            yield block
 
 
 def _inlined(model: ir.Model) -> ir.Model:

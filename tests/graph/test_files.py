@@ -8,6 +8,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
+from me2e_compress.graph import files
 
 
 def weighted(rows: int = 64) -> ir.Model:
@@ -71,7 +72,7 @@ def test_a_failed_save_keeps_the_old_file(
     def full(*args: object, **kwargs: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(onnx, "save", full)
+    monkeypatch.setattr(files, "write_inline", full)
     with pytest.raises(OSError, match="No space"):
         graph.save(weighted(32), path)
     assert path.read_bytes() == before
@@ -193,3 +194,18 @@ def test_a_model_without_external_weights_leaves_no_old_ones(tmp_path: Path) -> 
     graph.save(weighted(), tmp_path / "m.onnx", external=True)
     graph.save(weighted(), tmp_path / "m.onnx")
     assert [file.name for file in tmp_path.iterdir()] == ["m.onnx"]
+
+
+@pytest.mark.parametrize("block", [3, 8, 1 << 22])
+def test_a_hash_covers_external_data_wherever_the_name_of_its_file_is_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
+) -> None:
+    path = tmp_path / "m.onnx"
+    graph.save(weighted(), path, external=True)
+    before = graph.sha256_of(path)
+    monkeypatch.setattr(files, "_BLOCK_BYTES", block)
+    assert graph.sha256_of(path) == before
+
+    data = path.with_name("m.onnx.data")
+    data.write_bytes(bytes(data.stat().st_size))
+    assert graph.sha256_of(path) != before

@@ -1,0 +1,72 @@
+"""Files written one weight at a time: the bytes that onnx.save writes."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.graph import inline_file
+from me2e_compress.graph.inline_file import write_inline
+from tests.nets import conv_attention
+
+DTYPES = ("float32", "float64", "float16", "int64", "int32", "int8", "uint8", "bool")
+
+
+def full() -> ir.Model:
+    """Weights of every kind, metadata, functions."""
+    model = conv_attention()
+    model.metadata_props["me2e.plan"] = "ego"
+    model.graph.doc_string = "a graph"
+    random = np.random.default_rng(0)
+    for index, dtype in enumerate(DTYPES):
+        array = (random.normal(size=(3, 5 + index)) * 9).astype(dtype)
+        value = ir.Value(name=f"of_{dtype}", const_value=ir.tensor(array))
+        model.graph.register_initializer(value)
+    words = ir.StringTensor([b"one", b"another"], shape=ir.Shape([2]))
+    model.graph.register_initializer(ir.Value(name="words", const_value=words))
+    noted = ir.tensor(random.normal(size=(4, 4)).astype("f"), doc_string="noted")
+    model.graph.register_initializer(ir.Value(name="noted", const_value=noted))
+    return model
+
+
+@pytest.mark.parametrize("limit", [0, 100, 1 << 20])
+@pytest.mark.parametrize("loaded", [False, True])
+def test_the_bytes_are_those_of_onnx(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, limit: int, loaded: bool
+) -> None:
+    monkeypatch.setattr(inline_file, "LARGE_BYTES", limit)
+    model = full()
+    onnx.save(ir.to_proto(model), tmp_path / "theirs.onnx")
+    if loaded:
+        model = ir.load(tmp_path / "theirs.onnx")
+        onnx.save(ir.to_proto(model), tmp_path / "theirs.onnx")
+
+    write_inline(model, tmp_path / "ours.onnx")
+
+    theirs = (tmp_path / "theirs.onnx").read_bytes()
+    assert (tmp_path / "ours.onnx").read_bytes() == theirs
+
+
+def test_the_model_stays_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(inline_file, "LARGE_BYTES", 0)
+    model = full()
+    before = {
+        name: value.const_value for name, value in model.graph.initializers.items()
+    }
+
+    write_inline(model, tmp_path / "m.onnx")
+
+    for name, value in model.graph.initializers.items():
+        assert value.const_value is before[name]
+
+
+@pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**21, 2**32 + 5])
+def test_lengths_are_varints(number: int) -> None:
+    message = onnx.TensorProto(dims=[number])
+    assert message.SerializeToString()[-len(inline_file._varint(number)) :] == (
+        inline_file._varint(number)
+    )
