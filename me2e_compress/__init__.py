@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.build import BuildOptions, EngineResult, build
     from me2e_compress.workflows.calibrate import CalibrateOptions, calibrate
     from me2e_compress.workflows.calibrate_result import CalibrateResult
+    from me2e_compress.workflows.calibrate_stack import (
+        StackCalibrateResult,
+        calibrate_stack,
+    )
     from me2e_compress.workflows.check_model import ModelCheck, check_model
     from me2e_compress.workflows.compare import CompareResult, compare
     from me2e_compress.workflows.compress import CompressOptions, compress
@@ -89,6 +93,7 @@ __all__ = [
     "SearchResult",
     "SensitivityOptions",
     "SensitivityResult",
+    "StackCalibrateResult",
     "StackCompressResult",
     "Step",
     "StudyResult",
@@ -96,6 +101,7 @@ __all__ = [
     "__version__",
     "build",
     "calibrate",
+    "calibrate_stack",
     "check_model",
     "compare",
     "compress",
@@ -142,6 +148,7 @@ _ROOMS = {
     "workflows.calibrate": ("CalibrateOptions", "calibrate"),
     "workflows.calibrate_result": ("CalibrateResult",),
     "workflows.check_model": ("ModelCheck", "check_model"),
+    "workflows.calibrate_stack": ("StackCalibrateResult", "calibrate_stack"),
     "workflows.compare": ("CompareResult", "compare"),
     "workflows.compress": ("CompressOptions", "compress"),
     "workflows.compress_result": ("CompressResult",),

@@ -155,7 +155,7 @@ class _Job:
         rows = list(self.seen.measured)
 
         def take(readings: Readings, place: int) -> None:
-            _check_finite(readings, self.seen.tensors, place)
+            check_finite(readings, self.seen.tensors, place)
             rows.append(readings)
             self.seen = dataclasses.replace(self.seen, measured=np.stack(rows))
 
@@ -204,7 +204,7 @@ class _Job:
         return results
 
 
-def _check_finite(readings: Readings, tensors: Sequence[str], place: int) -> None:
+def check_finite(readings: Readings, tensors: Sequence[str], place: int) -> None:
     """Refuse a NaN or infinite element; a mean square may overflow without harm.
 
     Raises:

@@ -58,7 +58,7 @@ class PartFrames:
     @property
     def fingerprint(self) -> str:
         """That of the whole recording, and which file of which stack it is."""
-        return f"{self._whole.fingerprint} {self._file.label} {self._stack.sha256()}"
+        return part_fingerprint(self._stack, self._file.label, self._whole)
 
     @property
     def places(self) -> Sequence[int]:
@@ -156,6 +156,11 @@ class PartFrames:
             elif each.part == self._file.part:
                 sessions[label] = _FedOnly(each.inputs, self._provider)
         return StackSession(self._stack, sessions, self._provider)
+
+
+def part_fingerprint(stack: SplitStack, label: str, whole: Recording) -> str:
+    """Return what identifies the frames of one file of a stack."""
+    return f"{whole.fingerprint} {label} {stack.sha256()}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,7 +44,7 @@ class PreparedGraph:
         cls,
         file: Path,
         loaded: ir.Model,
-        module_map: str | Path | None,
+        module_map: str | Path | ModuleMap | None,
         passes: Sequence[Pass] | None = None,
     ) -> Self:
         """Run the passes before the first that reads ranges, unverified.
@@ -52,7 +52,7 @@ class PreparedGraph:
         Args:
             file: what the graph was read from.
             loaded: the graph.
-            module_map: preset or TOML file; None finds the preset.
+            module_map: preset or TOML file, or the map; None finds the preset.
             passes: None stands for the recipe ``exact``.
 
         Raises:
@@ -70,12 +70,13 @@ class PreparedGraph:
                 f"{file}: the graph is quantized already: {quantized}; give the float"
                 " graph that it was made of"
             )
-        modules = load_map(module_map, loaded)
+        if not isinstance(module_map, ModuleMap):
+            module_map = load_map(module_map, loaded)
         manager = PassManager(chosen[:at], verify_frames=0)
-        model = manager.run(loaded, Context(modules)).model
+        model = manager.run(loaded, Context(module_map)).model
         graph.infer_shapes(model)
         _leave_the_message(model)
-        return cls(file, model, modules, reader)
+        return cls(file, model, module_map, reader)
 
     def tensors(self) -> tuple[str, ...]:
         """Name every tensor that any scheme, rule set or target needs a range of.

@@ -8,7 +8,9 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.runtime.providers import provider_named
+from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows import calibrate as workflow
+from me2e_compress.workflows.calibrate_stack import calibrate_stack
 from me2e_compress.workflows.checks import sizes
 
 Frames = Annotated[
@@ -26,7 +28,7 @@ Table = Annotated[Path | None, typer.Option(help="write onnxruntime's too: a fol
 
 
 def calibrate(
-    model: given.FloatModel,
+    model: given.AnyModel,
     frames: Frames = None,
     output: Output = Path("ranges.json"),
     recipe: Recipe = "exact",
@@ -60,5 +62,6 @@ def calibrate(
         dims=sizes(set_dim or ()), provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
-        found = workflow.calibrate(model, frames, output, options, listener)
+        do = calibrate_stack if is_stack(model) else workflow.calibrate
+        found = do(model, frames, output, options, listener)
     show(found, as_json)
