@@ -115,7 +115,8 @@ class CarlaObserver:
 
     Args:
         rig: How the cameras see.
-        with_images: Whether the model takes images.
+        seen: Places among the rig's cameras of those that the model sees; the others
+            stay black, and without any there are no images.
         origin_m: Of the model's ground frame, in the ego frame.
         jpeg_quality: Every image is written and read as a JPEG of this quality, as
             Bench2Drive's agents do to match their training data; 0 leaves it as it is.
@@ -123,7 +124,7 @@ class CarlaObserver:
     """
 
     rig: CarlaRig
-    with_images: bool
+    seen: tuple[int, ...]
     origin_m: Triple
     jpeg_quality: int
     fill: tuple[int, ...] = (0, 0, 0)
@@ -141,7 +142,7 @@ class CarlaObserver:
         self._last = reading.motion
         return Observation(
             time_us,
-            self._images(sensors) if self.with_images else None,
+            self._images(sensors) if self.seen else None,
             self._lidar2img,
             can_bus,
             reading.command,
@@ -151,8 +152,10 @@ class CarlaObserver:
         )
 
     def _images(self, sensors: SensorData) -> Images:
-        ids = [camera.id for camera in self.rig.cameras]
-        return np.stack([self._taken(sensors[each][1]) for each in ids])
+        images = np.zeros((len(self.rig.cameras), *self.rig.taken, 3), np.uint8)
+        for place in self.seen:
+            images[place] = self._taken(sensors[self.rig.cameras[place].id][1])
+        return images
 
     def _taken(self, bgra: Images) -> Images:
         """Return one picture, BGRA [rows, columns, 4], as RGB of the model's size."""

@@ -5,6 +5,7 @@ here, into the ego frame of the contract: x forward, y left, its origin on the g
 under the centre of the ego.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,8 +79,12 @@ class CarlaRig:
         (columns, rows), (high, wide) = self.rendered, self.taken
         return min(wide / columns, high / rows)
 
-    def specs(self, *, with_cameras: bool) -> SensorSpecs:
-        """List the sensors that an agent asks for: cameras, IMU, GPS, speedometer."""
+    def specs(self, seen: Collection[int]) -> SensorSpecs:
+        """List the sensors that an agent asks for: cameras, IMU, GPS, speedometer.
+
+        Args:
+            seen: Places among `cameras` of those that a model sees.
+        """
         columns, rows = self.rendered
         mounted: SensorSpecs = [
             {
@@ -89,7 +94,8 @@ class CarlaRig:
                 **{"width": columns, "height": rows, "fov": camera.fov},
                 "id": camera.id,
             }
-            for camera in self.cameras
+            for place, camera in enumerate(self.cameras)
+            if place in seen
         ]
         level = {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}
         behind = {"x": BEHIND_M, "y": 0.0, "z": 0.0, **level}
@@ -98,7 +104,7 @@ class CarlaRig:
             {"type": "sensor.other.gnss", **behind, "id": GPS},
             {"type": "sensor.speedometer", "reading_frequency": 20, "id": SPEED},
         ]
-        return [*mounted, *others] if with_cameras else others
+        return [*mounted, *others]
 
     def lidar2img(self, origin_m: Triple) -> npt.NDArray[np.float32]:
         """Return [6, 4, 4]: a frame parallel to the ego's to the model's pixels.

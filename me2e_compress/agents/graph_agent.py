@@ -99,8 +99,9 @@ class GraphAgentOptions(AgentOptions):
         fill: tuple[int, ...] = (0, 0, 0)
         if (found := policy.normalization) is not None:
             mean = found.mean if found.order == "rgb" else found.mean[::-1]
-            fill = tuple(min(max(round(level), 0), 255) for level in mean)
-        seen = policy.needs_images
+            levels = (round(level / found.scale) for level in mean)
+            fill = tuple(min(max(level, 0), 255) for level in levels)
+        seen = policy.inputs.cameras
         return CarlaObserver(rig, seen, self.origin_m, self.jpeg_quality, fill)
 
 
@@ -132,7 +133,7 @@ class GraphAgent(ForwardingAgent):
         base = autonomous_agent_class()
         self._policy = options.policy()
         observer = options.observer(self._policy)
-        self._specs = observer.rig.specs(with_cameras=observer.with_images)
+        self._specs = observer.rig.specs(observer.seen)
         self._observer: Preprocessing = observer
         self._pid = WaypointPid(options.pid)
         self._reader: RouteReader | None = None

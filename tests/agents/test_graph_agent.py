@@ -210,6 +210,40 @@ SEES = {
 }
 
 
+AHEAD = """
+[images.img]
+cameras = ["FRONT"]
+camera_size = [900, 1600]
+rendered = [9, 16]
+crop = [[0, 400, 1600, 900]]
+mean = [0.0, 0.0, 0.0]
+std = [1.0, 1.0, 1.0]
+"""
+
+
+def test_a_model_of_one_camera_mounts_no_other(
+    board: Leaderboard, tmp_path: Path
+) -> None:
+    inputs = "float[1, 3, 5, 16] img"
+    picked = "int64[12] picked = {0, 80, 160, 79, 159, 239, 0, 0, 0, 0, 0, 0}"
+    parts = SEES["initializers"].partition("int64[12]")[0] + picked
+    see = {"inputs": inputs, "body": SEES["body"], "initializers": parts}
+    model = straight_on(tmp_path / "m.onnx", **see)  # type: ignore[arg-type]
+    (tmp_path / "a.toml").write_text(AHEAD)
+    conf = tmp_path / "graph.toml"
+    conf.write_text(
+        f'model = "{model}"\nadapter = "{tmp_path / "a.toml"}"\njpeg_quality = 0'
+    )
+    agent = board.make(graph_agent, f"{conf}+{SAVE_NAME}")
+    found = heard(agent)
+
+    board.run(agent, 1)
+
+    mounted = [each["id"] for each in agent.sensors() if "camera" in each["type"]]
+    assert mounted == ["CAM_FRONT"]
+    assert found[0][:6] == pytest.approx([200, 0, 0] * 2)  # red, as CARLA's here
+
+
 @pytest.mark.parametrize(("quality", "off"), [(0, 0.0), (20, 12.0)])
 def test_images_are_rgb_scaled_and_padded_with_the_mean(
     board: Leaderboard, tmp_path: Path, quality: int, off: float

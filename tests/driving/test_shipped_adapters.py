@@ -10,7 +10,7 @@ from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapter
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.zoo.stacks import TCP
+from me2e_compress.zoo.stacks import TCP, VAD_TINY
 from tests.evaluators.highway.drivers import straight_on
 
 
@@ -48,6 +48,27 @@ def test_tcps_waypoints_are_turned_to_ours(tcp: Path) -> None:
     assert isinstance(policy, OnnxPolicy)
     assert policy.image_size == (288, 512)
     assert policy.adapter.to_ego(np.array([[8.0, 3.0]])).tolist() == [[8.0, -3.0]]
+
+
+def test_vad_tiny_is_fed_as_nuscenes_feeds_it(tmp_path: Path) -> None:
+    ports = ", ".join(f"float{list(at)} {k}" for k, at in VAD_TINY.inputs.items())
+    model = straight_on(
+        tmp_path / "m.onnx",
+        inputs=ports,
+        body="bev_embed = Identity (prev_bev) ego_fut_preds = Identity (steps)",
+        outputs="float[10000, 1, 256] bev_embed, float[1, 3, 6, 2] ego_fut_preds",
+        initializers=f", float[1, 3, 6, 2] steps = {{{'1, ' * 35} 1}}",
+    )
+
+    policy = OnnxDriver(model, Path("vad-tiny")).open()
+
+    assert isinstance(policy, OnnxPolicy)
+    assert policy.image_size == (360, 640)
+    assert policy.recurrent == dict(VAD_TINY.recurrent)
+    norm = policy.normalization
+    assert norm is not None
+    assert (norm.mean, norm.std) == (VAD_TINY.image.mean, VAD_TINY.image.std)
+    assert policy.inputs.images["img"].indices == (0, 2, 1, 3, 4, 5)
 
 
 @pytest.mark.parametrize("name", shipped_adapters())

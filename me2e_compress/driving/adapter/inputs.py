@@ -90,6 +90,13 @@ class ModelInputs:
         found = (each.normalization for each in self.images.values())
         return next(found, None)
 
+    @property
+    def cameras(self) -> tuple[int, ...]:
+        """Places among the six of those that the model sees, ascending."""
+        return tuple(
+            sorted({at for each in self.images.values() for at in each.indices})
+        )
+
     def reset(self) -> None:
         """Begin a route: nothing was before."""
         self._track.clear()
