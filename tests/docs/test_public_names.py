@@ -13,6 +13,7 @@ ROOMS = (
     "me2e_compress",
     "me2e_compress.calibration.observers",
     "me2e_compress.driving.contract",
+    "me2e_compress.driving.input_sources",
     "me2e_compress.driving.latency",
     "me2e_compress.driving.policies",
     "me2e_compress.errors",
