@@ -43,6 +43,7 @@ class Stack:
         recurrent: Output that answers each recurrent input.
         plan: Name of the output that is the plan.
         plan_deltas: The plan is metres a step, not positions.
+        plan_step_s: Seconds between its waypoints, where they are not six every 0.5 s.
         heads: Names of the last layers to choose from, the default first, each with
             the row of the plan that is driven without a command.
         image: How the image input is normalised.
@@ -63,6 +64,7 @@ class Stack:
     trained: bool = False
     other_outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     sees: Literal["surround", "strip"] = "surround"
+    plan_step_s: float | None = None
 
     def with_heads(self, heads: str | None) -> "Stack":
         """Return the stack with these heads alone; None is the default.
@@ -83,12 +85,14 @@ class Stack:
 
     def metadata(self) -> dict[str, str]:
         """Return the ONNX metadata properties that describe the exported file."""
-        plan = {
+        plan: dict[str, object] = {
             "output": self.plan,
             "deltas": self.plan_deltas,
             "command_input": None,
             "default_mode": next(iter(self.heads.values()), 0),
         }
+        if self.plan_step_s is not None:
+            plan["step_s"] = self.plan_step_s
         image = {
             "input": "img",
             "mean": self.image.mean,
@@ -182,6 +186,7 @@ TCP = Stack(
         )
     },
     sees="strip",
+    plan_step_s=0.5,
 )
 """OpenDriveLab/TCP, whose control head gives Beta distributions, and Bench2DriveZoo,
 branch tcp/admlp, where it scores 39 actions. Outputs are named as there."""
