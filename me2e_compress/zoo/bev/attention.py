@@ -36,7 +36,7 @@ class PackedAttention(nn.Module):
             query: [B, Q, 256].
             key: [B, K, 256].
             value: [B, K, 256], or [1, K, 256] when all of the batch shares it.
-            ignore: [B, K] bool, true where a key must not be seen.
+            ignore: [B, K] or [B, Q, K] bool, true where a key must not be seen.
 
         Returns:
             [B, Q, 256].
@@ -51,7 +51,9 @@ class PackedAttention(nn.Module):
         )
         logits = torch.matmul(q * HEAD_SCALE, k.transpose(-2, -1))
         if ignore is not None:
-            logits = logits.masked_fill(ignore[:, None, None], MASKED_LOGIT)
+            one_for_all = ignore.dim() == 2
+            ignore = ignore[:, None, None] if one_for_all else ignore[:, None]
+            logits = logits.masked_fill(ignore, MASKED_LOGIT)
         mixed = torch.matmul(logits.softmax(-1), v).transpose(1, 2).flatten(2)
         out: Tensor = self.out_proj(mixed)
         return out
@@ -139,19 +141,29 @@ def deformable_attention(
 
 
 class DecoderAttention(nn.Module):
-    """Queries attend to the BEV around their reference points."""
+    """Queries attend to the BEV around their reference points.
+
+    Args:
+        hw: Rows and columns of the BEV.
+        sampling: See `sample`.
+        held: Levels to hold weights for, of which the first alone is read.
+    """
 
     points = 4
 
-    def __init__(self, hw: tuple[int, int], sampling: Sampling) -> None:
+    def __init__(self, hw: tuple[int, int], sampling: Sampling, held: int = 1) -> None:
         super().__init__()
         self.hw = hw
         self.sampling: Sampling = sampling
-        self.sampling_offsets = nn.Linear(EMBED, ATTENTION_HEADS * self.points * 2)
-        self.attention_weights = nn.Linear(EMBED, ATTENTION_HEADS * self.points)
+        self.held = held
+        samples = ATTENTION_HEADS * held * self.points
+        self.sampling_offsets = nn.Linear(EMBED, samples * 2)
+        self.attention_weights = nn.Linear(EMBED, samples)
         self.value_proj = nn.Linear(EMBED, EMBED)
         self.output_proj = nn.Linear(EMBED, EMBED)
         self.register_buffer("size_xy", torch.tensor(hw[::-1]).float(), False)
+
+    size_xy: Tensor
 
     def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
         """Attend.
@@ -160,7 +172,7 @@ class DecoderAttention(nn.Module):
             query: [1, Q, 256].
             pos: [1, Q, 256], added to the query.
             bev: [1, cells, 256].
-            at: [1, Q, 2] reference points, 0..1.
+            at: [1, Q, 2] reference points, or [1, Q, 4] boxes (cx, cy, w, h), 0..1.
 
         Returns:
             [1, Q, 256], with the residual.
@@ -169,12 +181,25 @@ class DecoderAttention(nn.Module):
         batch, queries, _ = asked.shape
         value = self.value_proj(bev)
         value = value.view(batch, value.shape[1], ATTENTION_HEADS, -1)
-        offsets = self.sampling_offsets(asked)
+        offsets = self._read(self.sampling_offsets(asked))
         offsets = offsets.view(batch, queries, ATTENTION_HEADS, 1, self.points, 2)
-        weights = self.attention_weights(asked)
+        weights = self._read(self.attention_weights(asked))
         weights = weights.view(batch, queries, ATTENTION_HEADS, self.points).softmax(-1)
         weights = weights.view(batch, queries, ATTENTION_HEADS, 1, self.points)
-        locations = at[:, :, None, None, None, :] + offsets / self.size_xy
+        locations = self._locations(at[:, :, None, None, None, :], offsets)
         out = deformable_attention(value, (self.hw,), locations, weights, self.sampling)
         read: Tensor = self.output_proj(out)
         return query + read
+
+    def _read(self, projected: Tensor) -> Tensor:
+        """Keep what belongs to the first level, of [1, Q, heads * levels * n]."""
+        if self.held == 1:
+            return projected
+        parts = projected.unflatten(2, (ATTENTION_HEADS, self.held, -1))
+        return parts[:, :, :, 0].flatten(2)
+
+    def _locations(self, at: Tensor, offsets: Tensor) -> Tensor:
+        """Add offsets, in cells around points and in parts of a half around boxes."""
+        if at.shape[-1] == 2:
+            return at + offsets / self.size_xy
+        return at[..., :2] + offsets * at[..., 2:] * (0.5 / self.points)

@@ -1,0 +1,1 @@
+"""UniAD-tiny in torch, at its published dimensions."""

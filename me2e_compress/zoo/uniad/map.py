@@ -1,0 +1,285 @@
+"""The map head of UniAD: lanes as queries, boxes and masks."""
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.bev.attention import (
+    HEAD_SCALE,
+    DecoderAttention,
+    FeedForward,
+    MultiheadAttention,
+)
+from me2e_compress.zoo.bev.decoder import inverse_sigmoid
+from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, Sampling
+from me2e_compress.zoo.uniad.config import THINGS, UniadConfig
+from me2e_compress.zoo.uniad.layers import mlp
+
+THING_BLOCKS, STUFF_BLOCKS = 4, 6
+MASK_FEED_FORWARD = 1024
+CONFIGURED_LEVELS = 4
+"""Levels that the published attention has weights for; it is given one."""
+
+
+class MaskAttention(nn.Module):
+    """Queries attend to cells, and a mask is read off the attention."""
+
+    def __init__(self, *, tail: bool = False) -> None:
+        super().__init__()
+        self.q = nn.Linear(EMBED, EMBED)
+        self.k = nn.Linear(EMBED, EMBED)
+        self.tail = tail
+        if not tail:
+            self.v = nn.Linear(EMBED, EMBED)
+            self.proj = nn.Linear(EMBED, EMBED)
+        heads = ATTENTION_HEADS
+        self.linear_l1 = nn.Sequential(nn.Linear(heads, heads), nn.ReLU())
+        self.linear = nn.Sequential(nn.Linear(heads, 1), nn.ReLU())
+
+    def forward(
+        self, query: Tensor, key: Tensor, value: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256] and masks [1, Q, K].
+
+        The last layer, the tail, gives its query back as it is.
+        """
+        q, k = _heads(self.q(query)), _heads(self.k(key))
+        logits = torch.matmul(q, k.transpose(-2, -1)) * HEAD_SCALE
+        mask = self.linear(self.linear_l1(logits.permute(0, 2, 3, 1))).squeeze(-1)
+        if self.tail:
+            return query, mask
+        mixed = torch.matmul(logits.softmax(-1), _heads(self.v(value)))
+        return self.proj(mixed.transpose(1, 2).flatten(2)), mask
+
+
+def _heads(x: Tensor) -> Tensor:
+    return x.unflatten(2, (ATTENTION_HEADS, -1)).transpose(1, 2)
+
+
+class SelfAttention(nn.Module):
+    """Attention of the queries to each other (the published background head)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.qkv = nn.Linear(EMBED, 3 * EMBED)
+        self.proj = nn.Linear(EMBED, EMBED)
+
+
+class GeluFeedForward(nn.Module):
+    """Linear, GELU, linear."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(EMBED, MASK_FEED_FORWARD)
+        self.act = nn.GELU()
+        self.fc2 = nn.Linear(MASK_FEED_FORWARD, EMBED)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [..., 256] to [..., 256]."""
+        out: Tensor = self.fc2(self.act(self.fc1(x)))
+        return out
+
+
+class MaskBlock(nn.Module):
+    """`MaskAttention` and `GeluFeedForward`, normalised after each."""
+
+    def __init__(self, *, self_attention: bool) -> None:
+        super().__init__()
+        self.head_norm1 = nn.LayerNorm(EMBED, eps=1e-6)
+        self.attn = MaskAttention()
+        self.head_norm2 = nn.LayerNorm(EMBED, eps=1e-6)
+        self.mlp = GeluFeedForward()
+        if self_attention:
+            self.self_attention = SelfAttention()
+            self.norm3 = nn.LayerNorm(EMBED, eps=1e-6)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256]."""
+        attended, _ = self.attn(query, key, value)
+        query = self.head_norm1(query + attended)
+        out: Tensor = self.head_norm2(query + self.mlp(query))
+        return out
+
+
+class MaskHead(nn.Module):
+    """Queries to masks over the cells."""
+
+    def __init__(self, blocks: int, *, self_attention: bool = False) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(
+            MaskBlock(self_attention=self_attention) for _ in range(blocks)
+        )
+        self.attnen = MaskAttention(tail=True)
+
+    def forward(
+        self, query: Tensor, query_pos: Tensor, cells: Tensor, cells_pos: Tensor
+    ) -> Tensor:
+        """Map [1, Q, 256] and cells [1, K, 256] to masks [1, Q, K]."""
+        key = cells + cells_pos
+        for block in self.blocks:
+            query = block(query + query_pos, key, cells)
+        mask: Tensor = self.attnen(query + query_pos, key, cells)[1]
+        return mask
+
+
+class CellLayer(nn.Module):
+    """Cells attend to cells around them, feed-forward."""
+
+    def __init__(self, hw: tuple[int, int], sampling: Sampling, levels: int) -> None:
+        super().__init__()
+        self.attentions = nn.ModuleList([DecoderAttention(hw, sampling, levels)])
+        self.ffns = nn.ModuleList([FeedForward()])
+        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
+
+    def forward(self, cells: Tensor, pos: Tensor, at: Tensor) -> Tensor:
+        """Map [1, cells, 256] to [1, cells, 256]; ``at`` are their places, 0..1."""
+        cells = self.norms[0](self.attentions[0](cells, pos, cells, at))
+        out: Tensor = self.norms[1](self.ffns[0](cells))
+        return out
+
+
+class CellEncoder(nn.Module):
+    """Six `CellLayer`s."""
+
+    def __init__(self, config: UniadConfig, sampling: Sampling, levels: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(
+            CellLayer(config.head_hw, sampling, levels)
+            for _ in range(config.decoder_layers)
+        )
+
+
+class LaneLayer(nn.Module):
+    """Self-attention, cross-attention to the cells, feed-forward."""
+
+    def __init__(self, hw: tuple[int, int], sampling: Sampling, levels: int) -> None:
+        super().__init__()
+        self.attentions = nn.ModuleList(
+            [MultiheadAttention(), DecoderAttention(hw, sampling, levels)]
+        )
+        self.ffns = nn.ModuleList([FeedForward()])
+        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
+
+    def forward(self, query: Tensor, pos: Tensor, cells: Tensor, at: Tensor) -> Tensor:
+        """Map [1, Q, 256] to [1, Q, 256]; ``at`` are points or boxes, 0..1."""
+        query = self.norms[0](self.attentions[0](query, query, pos, pos))
+        query = self.norms[1](self.attentions[1](query, pos, cells, at))
+        out: Tensor = self.norms[2](self.ffns[0](query))
+        return out
+
+
+class LaneDecoder(nn.Module):
+    """Six `LaneLayer`s."""
+
+    def __init__(self, config: UniadConfig, sampling: Sampling, levels: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(
+            LaneLayer(config.head_hw, sampling, levels)
+            for _ in range(config.decoder_layers)
+        )
+
+
+class MapTransformer(nn.Module):
+    """Cells to cells, and queries that read them (deformable DETR)."""
+
+    def __init__(self, config: UniadConfig, sampling: Sampling, levels: int) -> None:
+        super().__init__()
+        self.encoder = CellEncoder(config, sampling, levels)
+        self.decoder = LaneDecoder(config, sampling, levels)
+        self.level_embeds = nn.Parameter(torch.empty(CONFIGURED_LEVELS, EMBED))
+        self.reference_points = nn.Linear(EMBED, 2)
+        rows, columns = torch.meshgrid(
+            (torch.arange(config.head_hw[0]) + 0.5) / config.head_hw[0],
+            (torch.arange(config.head_hw[1]) + 0.5) / config.head_hw[1],
+            indexing="ij",
+        )
+        places = torch.stack([columns, rows], -1).view(1, -1, 2)
+        self.register_buffer("places", places, False)
+
+    places: Tensor
+
+    def forward(
+        self, cells: Tensor, pos: Tensor, lanes: Tensor, branches: nn.ModuleList
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Decode lanes.
+
+        Args:
+            cells: [1, cells, 256].
+            pos: [1, cells, 256].
+            lanes: [lanes, 512], position then content.
+            branches: One regression branch a layer.
+
+        Returns:
+            Cells [1, cells, 256], lane queries [1, lanes, 256], boxes [1, lanes, 4]
+            (cx, cy, w, h, 0..1).
+        """
+        pos = pos + self.level_embeds[0]
+        for layer in self.encoder.layers:
+            cells = layer(cells, pos, self.places)
+        lane_pos, query = lanes.unsqueeze(0).chunk(2, 2)
+        at = self.reference_points(lane_pos).sigmoid()
+        for layer, branch in zip(self.decoder.layers, branches, strict=True):
+            query = layer(query, lane_pos, cells, at)
+            moved = branch(query)
+            centre = moved[..., :2] + inverse_sigmoid(at[..., :2])
+            size = moved[..., 2:]
+            if at.shape[-1] == 4:
+                size = size + inverse_sigmoid(at[..., 2:])
+            at = torch.cat([centre, size], -1).sigmoid()
+        return cells, query, at
+
+
+class MapHead(nn.Module):
+    """Lanes of the enlarged view.
+
+    Args:
+        config: Sizes.
+        sampling: See `sample`.
+        dead: Hold what inference never reads: an embedding of the cells, the background
+            head, the branches of the mask heads, attention for three levels more.
+    """
+
+    def __init__(
+        self, config: UniadConfig, sampling: Sampling, *, dead: bool = False
+    ) -> None:
+        super().__init__()
+        levels = CONFIGURED_LEVELS if dead else 1
+        layers = config.decoder_layers
+        self.query_embedding = nn.Embedding(config.map_queries, 2 * EMBED)
+        self.transformer = MapTransformer(config, sampling, levels)
+        self.cls_branches = nn.ModuleList(
+            nn.Linear(EMBED, THINGS) for _ in range(layers)
+        )
+        self.reg_branches = nn.ModuleList(_boxes() for _ in range(layers))
+        self.things_mask_head = MaskHead(THING_BLOCKS)
+        if dead:
+            cells = config.head_hw[0] * config.head_hw[1]
+            self.bev_embedding = nn.Embedding(cells, EMBED)
+            self.stuff_mask_head = MaskHead(STUFF_BLOCKS, self_attention=True)
+            self.reg_branches2 = nn.ModuleList(_boxes() for _ in range(THING_BLOCKS))
+            self.cls_thing_branches = nn.ModuleList(
+                nn.Linear(EMBED, THINGS) for _ in range(THING_BLOCKS)
+            )
+            self.cls_stuff_branches = nn.ModuleList(
+                nn.Linear(EMBED, 1) for _ in range(STUFF_BLOCKS)
+            )
+
+    def forward(self, bev: Tensor, pos: Tensor) -> tuple[Tensor, ...]:
+        """Find lanes.
+
+        Args:
+            bev: [1, cells, 256], the enlarged view.
+            pos: [1, cells, 256].
+
+        Returns:
+            Lane queries [1, lanes, 256], their positions [1, lanes, 256], logits
+            [1, lanes, 6], boxes [1, lanes, 4] and masks [1, lanes, cells].
+        """
+        lanes = self.query_embedding.weight
+        cells, query, boxes = self.transformer(bev, pos, lanes, self.reg_branches)
+        lane_pos = lanes[None, :, :EMBED]
+        masks = self.things_mask_head(query, lane_pos, cells, pos)
+        return query, lane_pos, self.cls_branches[-1](query), boxes, masks
+
+
+def _boxes() -> nn.Sequential:
+    return mlp(EMBED, EMBED, EMBED, 4)

@@ -1,0 +1,86 @@
+"""What UniAD keeps of a track between frames: its memory and its next query."""
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.bev.attention import PackedAttention
+from me2e_compress.zoo.bev.sizes import EMBED
+
+SAVE_PERIOD = 3
+"""Frames between two embeddings that the memory keeps."""
+
+
+class MemoryBank(nn.Module):
+    """A track attends to its own past."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.save_proj = nn.Linear(EMBED, EMBED)
+        self.temporal_attn = PackedAttention()
+        self.temporal_fc1 = nn.Linear(EMBED, EMBED)
+        self.temporal_fc2 = nn.Linear(EMBED, EMBED)
+        self.temporal_norm1 = nn.LayerNorm(EMBED)
+        self.temporal_norm2 = nn.LayerNorm(EMBED)
+
+    def forward(self, track: Tensor, bank: Tensor, empty: Tensor) -> Tensor:
+        """Recall.
+
+        Args:
+            track: [tracks, 256].
+            bank: [tracks, 4, 256], the newest last.
+            empty: [tracks, 4] bool. A track whose newest entry is empty stays as it is.
+
+        Returns:
+            [tracks, 256].
+        """
+        recalled = self.temporal_attn(track[:, None], bank, bank, empty)[:, 0]
+        mixed = self.temporal_norm1(track + recalled)
+        changed = self.temporal_fc2(self.temporal_fc1(mixed).relu())
+        mixed = self.temporal_norm2(mixed + changed)
+        return torch.where(empty[:, -1:], track, mixed)
+
+    def save(
+        self, track: Tensor, bank: Tensor, empty: Tensor, due: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Keep the tracks that are due, [tracks, 1] bool, and forget their oldest."""
+        newer = torch.cat([bank[:, 1:], self.save_proj(track)[:, None]], 1)
+        fuller = torch.cat([empty[:, 1:], torch.zeros_like(empty[:, :1])], 1)
+        kept = torch.where(due[:, None], newer, bank)
+        return kept, torch.where(due, fuller, empty)
+
+
+class QueryInteraction(nn.Module):
+    """Tracks attend to each other and become the next frame's queries."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.self_attn = PackedAttention()
+        self.linear1 = nn.Linear(EMBED, EMBED)
+        self.linear2 = nn.Linear(EMBED, EMBED)
+        self.linear_pos1 = nn.Linear(EMBED, EMBED)
+        self.linear_pos2 = nn.Linear(EMBED, EMBED)
+        self.norm_pos = nn.LayerNorm(EMBED)
+        self.linear_feat1 = nn.Linear(EMBED, EMBED)
+        self.linear_feat2 = nn.Linear(EMBED, EMBED)
+        self.norm_feat = nn.LayerNorm(EMBED)
+        self.norm1 = nn.LayerNorm(EMBED)
+        self.norm2 = nn.LayerNorm(EMBED)
+
+    def forward(self, query: Tensor, track: Tensor, ignore: Tensor) -> Tensor:
+        """Update.
+
+        Args:
+            query: [1, tracks, 512], position then content.
+            track: [1, tracks, 256].
+            ignore: [1, tracks] bool, true where a slot holds no track.
+
+        Returns:
+            [1, tracks, 512].
+        """
+        pos, content = query.chunk(2, 2)
+        asked = pos + track
+        x = self.norm1(track + self.self_attn(asked, asked, track, ignore))
+        x = self.norm2(x + self.linear2(self.linear1(x).relu()))
+        pos = self.norm_pos(pos + self.linear_pos2(self.linear_pos1(x).relu()))
+        changed = self.linear_feat2(self.linear_feat1(x).relu())
+        return torch.cat([pos, self.norm_feat(content + changed)], 2)
