@@ -147,13 +147,22 @@ class DecoderAttention(nn.Module):
         hw: Rows and columns of the BEV.
         sampling: See `sample`.
         held: Levels to hold weights for, of which the first alone is read.
+        boxes: Whether the reference points are boxes.
     """
 
     points = 4
 
-    def __init__(self, hw: tuple[int, int], sampling: Sampling, held: int = 1) -> None:
+    def __init__(
+        self,
+        hw: tuple[int, int],
+        sampling: Sampling,
+        *,
+        held: int = 1,
+        boxes: bool = False,
+    ) -> None:
         super().__init__()
         self.hw = hw
+        self.boxes = boxes
         self.sampling: Sampling = sampling
         self.held = held
         samples = ATTENTION_HEADS * held * self.points
@@ -200,6 +209,6 @@ class DecoderAttention(nn.Module):
 
     def _locations(self, at: Tensor, offsets: Tensor) -> Tensor:
         """Add offsets, in cells around points and in parts of a half around boxes."""
-        if at.shape[-1] == 2:
+        if not self.boxes:
             return at + offsets / self.size_xy
         return at[..., :2] + offsets * at[..., 2:] * (0.5 / self.points)

@@ -126,7 +126,7 @@ class CellLayer(nn.Module):
 
     def __init__(self, hw: tuple[int, int], sampling: Sampling, levels: int) -> None:
         super().__init__()
-        self.attentions = nn.ModuleList([DecoderAttention(hw, sampling, levels)])
+        self.attentions = nn.ModuleList([DecoderAttention(hw, sampling, held=levels)])
         self.ffns = nn.ModuleList([FeedForward()])
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
 
@@ -151,11 +151,12 @@ class CellEncoder(nn.Module):
 class LaneLayer(nn.Module):
     """Self-attention, cross-attention to the cells, feed-forward."""
 
-    def __init__(self, hw: tuple[int, int], sampling: Sampling, levels: int) -> None:
+    def __init__(
+        self, hw: tuple[int, int], sampling: Sampling, levels: int, *, boxes: bool
+    ) -> None:
         super().__init__()
-        self.attentions = nn.ModuleList(
-            [MultiheadAttention(), DecoderAttention(hw, sampling, levels)]
-        )
+        read = DecoderAttention(hw, sampling, held=levels, boxes=boxes)
+        self.attentions = nn.ModuleList([MultiheadAttention(), read])
         self.ffns = nn.ModuleList([FeedForward()])
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
 
@@ -173,8 +174,8 @@ class LaneDecoder(nn.Module):
     def __init__(self, config: UniadConfig, sampling: Sampling, levels: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(
-            LaneLayer(config.head_hw, sampling, levels)
-            for _ in range(config.decoder_layers)
+            LaneLayer(config.head_hw, sampling, levels, boxes=layer > 0)
+            for layer in range(config.decoder_layers)
         )
 
 

@@ -97,6 +97,6 @@ class UniadTiny(nn.Module):
         self.memory_bank = MemoryBank()
         self.pts_bbox_head = TrackHead(config, sampling, dead=dead)
         self.seg_head = MapHead(config, sampling, dead=dead)
-        self.motion_head = MotionHead(dead=dead)
+        self.motion_head = MotionHead(config, sampling, dead=dead)
         self.occ_head = OccHead()
         self.planning_head = PlanningHead(config.head_hw)

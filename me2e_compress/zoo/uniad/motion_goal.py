@@ -1,0 +1,86 @@
+"""Modes of an agent read the view around the trajectory that they hold so far."""
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.bev.attention import FeedForward, deformable_attention
+from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, BevGrid, Sampling
+from me2e_compress.zoo.uniad.config import AGENT_STEPS
+from me2e_compress.zoo.uniad.layers import projection
+
+GOAL_POINTS = 4
+
+
+class GoalAttention(nn.Module):
+    """Four samples a head around each of the twelve points of a trajectory.
+
+    Args:
+        grid: Whose metres the trajectory is in.
+        hw: Rows and columns of the enlarged view.
+        sampling: See `sample`.
+    """
+
+    def __init__(self, grid: BevGrid, hw: tuple[int, int], sampling: Sampling) -> None:
+        super().__init__()
+        self.hw = hw
+        self.sampling: Sampling = sampling
+        samples = AGENT_STEPS * ATTENTION_HEADS * GOAL_POINTS
+        self.sampling_offsets = nn.Linear(EMBED, samples * 2)
+        self.attention_weights = nn.Linear(EMBED, samples)
+        self.value_proj = nn.Linear(EMBED, EMBED)
+        self.output_proj = projection(AGENT_STEPS * EMBED, EMBED)
+        low, high = torch.tensor(grid.pc_range[:2]), torch.tensor(grid.pc_range[3:5])
+        self.register_buffer("low", low, False)
+        self.register_buffer("extent", high - low, False)
+        self.register_buffer("size_xy", torch.tensor(hw[::-1]).float(), False)
+
+    low: Tensor
+    extent: Tensor
+    size_xy: Tensor
+
+    def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
+        """Attend.
+
+        Args:
+            query: [1, Q, 256], one for every agent and mode.
+            pos: [1, Q, 256], added to the query.
+            bev: [1, cells, 256].
+            at: [1, Q, 12, 2], metres in the ego frame.
+
+        Returns:
+            [1, Q, 256], with the residual.
+        """
+        asked = query + pos
+        heads, steps, points = ATTENTION_HEADS, AGENT_STEPS, GOAL_POINTS
+        value = self.value_proj(bev).unflatten(2, (heads, -1))
+        offsets = self.sampling_offsets(asked)
+        offsets = offsets.unflatten(2, (heads, steps, 1, points, 2))
+        weights = self.attention_weights(asked).unflatten(2, (heads, steps, points))
+        weights = weights.softmax(-1).unsqueeze(4)
+        places = ((at - self.low) / self.extent)[:, :, None, :, None, None]
+        locations = places + offsets / self.size_xy
+        read = deformable_attention(
+            value,
+            (self.hw,),
+            locations.permute(0, 1, 3, 2, 4, 5, 6).flatten(1, 2),
+            weights.permute(0, 1, 3, 2, 4, 5).flatten(1, 2),
+            self.sampling,
+        )
+        joined = read.unflatten(1, (-1, steps)).flatten(2)
+        return query + self.output_proj(joined)
+
+
+class GoalLayer(nn.Module):
+    """`GoalAttention` and a feed-forward, normalised after each."""
+
+    def __init__(self, grid: BevGrid, hw: tuple[int, int], sampling: Sampling) -> None:
+        super().__init__()
+        self.attentions = nn.ModuleList([GoalAttention(grid, hw, sampling)])
+        self.ffns = nn.ModuleList([FeedForward()])
+        self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(2))
+
+    def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
+        """Map [1, Q, 256] to [1, Q, 256]; see `GoalAttention`."""
+        query = self.norms[0](self.attentions[0](query, pos, bev, at))
+        out: Tensor = self.norms[1](self.ffns[0](query))
+        return out
