@@ -14,7 +14,7 @@ import onnx
 from me2e_compress.errors import GraphError, MissingExtraError
 from me2e_compress.zoo.construct import construct
 from me2e_compress.zoo.model_files import write
-from me2e_compress.zoo.stacks import TCP, Stack, find
+from me2e_compress.zoo.stacks import TCP, UNIADS, Stack, find
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -128,7 +128,6 @@ def build(
         )
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
-    (chosen,) = spec.heads
     if spec.name == TCP.name:
         if fused:
             raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
@@ -136,13 +135,19 @@ def build(
             return _filled(spec, weights)
         from me2e_compress.zoo.tcp.initialise import build_tcp
 
+        (chosen,) = spec.heads
         return build_tcp(seed=seed, heads=cast("ActionHeads", chosen))
-    from me2e_compress.zoo.vad.initialise import build as build_vad
-
     native: Sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
     sampling = "fused" if fused else native
     if weights is not None:
         return _filled(spec, weights, sampling)
+    if spec.name in UNIADS:
+        from me2e_compress.zoo.uniad.initialise import build_uniad
+
+        return build_uniad(spec, seed=seed, sampling=sampling)
+    from me2e_compress.zoo.vad.initialise import build as build_vad
+
+    (chosen,) = spec.heads
     return build_vad(seed=seed, heads=cast("HeadsName", chosen), sampling=sampling)
 
 

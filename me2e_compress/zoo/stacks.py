@@ -30,6 +30,9 @@ IMAGENET = ImageNorm(
 )
 """Statistics of ImageNet in grey levels, as torchvision and mmdetection have them."""
 
+CAFFE = ImageNorm(mean=(103.53, 116.28, 123.675), std=(1.0, 1.0, 1.0), order="bgr")
+"""The same means as Caffe's networks take them."""
+
 
 @dataclass(frozen=True)
 class Stack:
@@ -50,6 +53,8 @@ class Stack:
         dtypes: Element type of the inputs that are not float32.
         trained: The weights ship; else they are drawn from a seed.
         sees: The six cameras one by one, or three of them as one wide image.
+        scale: Of the cameras' 1600 x 900 images.
+        straight_on: The command that follows the lane, of stacks that are told one.
     """
 
     name: str
@@ -65,6 +70,8 @@ class Stack:
     other_outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     sees: Literal["surround", "strip"] = "surround"
     plan_step_s: float | None = None
+    scale: float = 0.4
+    straight_on: int = 0
 
     def with_heads(self, heads: str | None) -> "Stack":
         """Return the stack with these heads alone; None is the default.
@@ -191,7 +198,86 @@ TCP = Stack(
 """OpenDriveLab/TCP, whose control head gives Beta distributions, and Bench2DriveZoo,
 branch tcp/admlp, where it scores 39 actions. Outputs are named as there."""
 
-STACKS: dict[str, Stack] = {stack.name: stack for stack in (VAD_TINY, TCP, HIGHWAY)}
+UNIAD_SLOTS = 249
+"""For tracks: with the 901 new queries of a frame 1150, the most that DL4AGX allows."""
+
+UNIAD_REMEMBERED: dict[str, Shape] = {
+    "l2g_r_mat": (1, 3, 3),
+    "l2g_t": (1, 3),
+    "timestamp": (1,),
+    "track_query": (UNIAD_SLOTS, 512),
+    "track_ref_pts": (UNIAD_SLOTS, 3),
+    "track_obj_idxes": (UNIAD_SLOTS,),
+    "track_disappear_time": (UNIAD_SLOTS,),
+    "track_save_period": (UNIAD_SLOTS,),
+    "track_velocity": (UNIAD_SLOTS, 2),
+    "track_mem_bank": (UNIAD_SLOTS, 4, 256),
+    "track_mem_held": (UNIAD_SLOTS, 4),
+    "max_obj_id": (1,),
+}
+"""What UniAD knows of the last frame, besides its bird's eye view."""
+
+UNIAD_COUNTS = ("obj_idxes", "disappear_time", "save_period", "max_obj_id")
+
+
+def _uniad(
+    name: str, image_hw: tuple[int, int], cells: int, scale: float, straight_on: int
+) -> Stack:
+    remembered = {f"prev_{key}": shape for key, shape in UNIAD_REMEMBERED.items()}
+    counts = [key for key in remembered if key.endswith(UNIAD_COUNTS)]
+    recurrent = {f"prev_{key}": f"next_{key}" for key in UNIAD_REMEMBERED}
+    return Stack(
+        name=name,
+        inputs={
+            "img": (1, 6, 3, *image_hw),
+            "lidar2img": (1, 6, 4, 4),
+            "can_bus": (18,),
+            "command": (1,),
+            "l2g_r_mat": (1, 3, 3),
+            "l2g_t": (1, 3),
+            "timestamp": (1,),
+            "prev_bev": (cells, 1, 256),
+            **remembered,
+        },
+        outputs=(
+            "bev_embed",
+            *recurrent.values(),
+            "all_cls_scores",
+            "all_bbox_preds",
+            "track_boxes",
+            "track_scores",
+            "track_labels",
+            "lane_query",
+            "lane_scores",
+            "lane_boxes",
+            "lane_masks",
+            "traj_preds",
+            "traj_scores",
+            "occupancy",
+            "sdc_traj",
+        ),
+        recurrent={"prev_bev": "bev_embed", **recurrent},
+        plan="sdc_traj",
+        plan_deltas=False,
+        heads={},
+        image=CAFFE,
+        dtypes={"command": "int64", **dict.fromkeys(counts, "int64")},
+        scale=scale,
+        straight_on=straight_on,
+    )
+
+
+UNIAD_TINY = _uniad("uniad-tiny", (928, 1600), 10_000, 1.0, 3)
+"""Bench2DriveZoo, tiny_e2e_b2d.py."""
+
+UNIAD_TRT = _uniad("uniad-trt", (256, 416), 2_500, 0.25, 2)
+"""NVIDIA/DL4AGX, uniad-trt: the tiny model of its TensorRT export, for nuScenes."""
+
+UNIADS = (UNIAD_TINY.name, UNIAD_TRT.name)
+
+STACKS: dict[str, Stack] = {
+    stack.name: stack for stack in (VAD_TINY, UNIAD_TINY, UNIAD_TRT, TCP, HIGHWAY)
+}
 
 
 def find(name: str) -> Stack:

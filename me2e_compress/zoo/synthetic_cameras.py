@@ -18,6 +18,8 @@ SCALE = 0.4
 
 WIDTH, HEIGHT = 640, 360
 
+FULL_HW = (900, 1600)
+
 MOUNTS = (
     ("CAM_FRONT", 0.0, (0.0, 0.7, -0.33), (1266.0, 816.0, 491.0)),
     ("CAM_FRONT_LEFT", 55.0, (-0.5, 0.55, -0.35), (1272.0, 826.0, 480.0)),
@@ -48,12 +50,14 @@ class Pinhole:
     Attributes:
         position: [3] metres, lidar frame.
         to_camera: [3, 3] lidar frame to camera (x right, y down, z forward).
-        intrinsics: [3, 3] pixels of the 640 x 360 image.
+        intrinsics: [3, 3] pixels of the image.
+        hw: Pixels of the image, rows and columns.
     """
 
     position: Array
     to_camera: Array
     intrinsics: Array
+    hw: tuple[int, int] = (HEIGHT, WIDTH)
 
     def lidar2img(self) -> Array:
         """Return [4, 4]: lidar metres to (u * depth, v * depth, depth, 1)."""
@@ -63,20 +67,21 @@ class Pinhole:
         return out
 
     def rays(self) -> Array:
-        """Return [360, 640, 3] rays through the pixel centres, depth 1, lidar frame."""
+        """Return [h, w, 3] rays through the pixel centres, depth 1, lidar frame."""
         focal, cx, cy = (
             self.intrinsics[0, 0],
             self.intrinsics[0, 2],
             self.intrinsics[1, 2],
         )
-        v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32) + np.float32(0.5)
+        v, u = np.mgrid[: self.hw[0], : self.hw[1]].astype(np.float32) + np.float32(0.5)
         flat = np.stack([(u - cx) / focal, (v - cy) / focal, np.ones_like(u)], -1)
         return np.ascontiguousarray(flat @ self.to_camera)
 
 
 @cache
-def rig() -> tuple[Pinhole, ...]:
+def rig(scale: float = SCALE) -> tuple[Pinhole, ...]:
     """Return the six cameras, in the order of the image input."""
+    hw = round(FULL_HW[0] * scale), round(FULL_HW[1] * scale)
     cameras = []
     for _, yaw_deg, position, (focal, cx, cy) in MOUNTS:
         yaw = math.radians(yaw_deg)
@@ -88,34 +93,40 @@ def rig() -> tuple[Pinhole, ...]:
                 np.array([right, (0.0, 0.0, -1.0), ahead], np.float32),
                 np.array(
                     [
-                        [focal * SCALE, 0, cx * SCALE],
-                        [0, focal * SCALE, cy * SCALE],
+                        [focal * scale, 0, cx * scale],
+                        [0, focal * scale, cy * scale],
                         [0, 0, 1],
                     ],
                     np.float32,
                 ),
+                hw,
             )
         )
     return tuple(cameras)
 
 
 @cache
-def _rays() -> tuple[Array, ...]:
-    return tuple(camera.rays() for camera in rig())
+def _rays(scale: float) -> tuple[Array, ...]:
+    return tuple(camera.rays() for camera in rig(scale))
 
 
 def render(
-    world: SyntheticWorld, ego: EgoPose, boxes: Sequence[Cuboid]
+    world: SyntheticWorld,
+    ego: EgoPose,
+    boxes: Sequence[Cuboid],
+    scale: float = SCALE,
 ) -> NDArray[np.uint8]:
-    """Draw what the six cameras see: [6, 360, 640, 3] RGB.
+    """Draw what the six cameras see: [6, h, w, 3] RGB, 360 x 640 at the usual scale.
 
     Args:
         world: The ground.
         ego: Where the vehicle stands in the world.
         boxes: Everything that stands on the ground, in the world.
+        scale: Of the 1600 x 900 images.
     """
-    images = np.empty((len(MOUNTS), HEIGHT, WIDTH, 3), np.uint8)
-    for image, camera, rays in zip(images, rig(), _rays(), strict=True):
+    cameras = rig(scale)
+    images = np.empty((len(cameras), *cameras[0].hw, 3), np.uint8)
+    for image, camera, rays in zip(images, cameras, _rays(scale), strict=True):
         colour, depth = _background(world, ego, camera, rays)
         for box in boxes:
             _draw(box, ego, camera, rays, colour, depth)
@@ -128,7 +139,7 @@ def render(
 def _background(
     world: SyntheticWorld, ego: EgoPose, camera: Pinhole, rays: Array
 ) -> tuple[Array, Array]:
-    """Draw sky and ground: colour [360, 640, 3] and depth [360, 640]."""
+    """Draw sky and ground: colour [h, w, 3] and depth [h, w]."""
     rise = np.clip(rays[..., 2:] / 0.5, 0, 1)
     colour = SKY_LOW * (1 - rise) + SKY_HIGH * rise
     depth = np.full(rays.shape[:2], np.float32(0))
@@ -185,10 +196,10 @@ def _window(box: Cuboid, ego: EgoPose, camera: Pinhole) -> tuple[slice, slice] |
     if depth.max() < NEAR_M:
         return None
     if depth.min() < NEAR_M:
-        return slice(0, HEIGHT), slice(0, WIDTH)
+        return slice(0, camera.hw[0]), slice(0, camera.hw[1])
     uv = (seen @ camera.intrinsics.T)[:, :2] / depth[:, None]
     low, high = np.floor(uv.min(0)).astype(int), np.ceil(uv.max(0)).astype(int)
-    columns = slice(max(int(low[0]), 0), min(int(high[0]) + 1, WIDTH))
-    rows = slice(max(int(low[1]), 0), min(int(high[1]) + 1, HEIGHT))
+    columns = slice(max(int(low[0]), 0), min(int(high[0]) + 1, camera.hw[1]))
+    rows = slice(max(int(low[1]), 0), min(int(high[1]) + 1, camera.hw[0]))
     empty = columns.start >= columns.stop or rows.start >= rows.stop
     return None if empty else (rows, columns)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from me2e_compress.errors import FramesError
 from me2e_compress.zoo.stacks import Stack
-from me2e_compress.zoo.synthetic_cameras import render, rig
+from me2e_compress.zoo.synthetic_cameras import LIDAR_HEIGHT_M, render, rig
 from me2e_compress.zoo.synthetic_strip import route_state, strip
 from me2e_compress.zoo.synthetic_world import (
     FRAME_S,
@@ -16,10 +16,11 @@ from me2e_compress.zoo.synthetic_world import (
     LANES,
     TILE,
     Cuboid,
+    EgoPose,
     SyntheticWorld,
 )
 
-Frame = dict[str, NDArray[np.float32]]
+Frame = dict[str, NDArray[np.float32 | np.int64]]
 
 SENSOR_NOISE = 2.0
 """Standard deviation of pixel noise, in 1 / 255."""
@@ -44,24 +45,30 @@ def frames(
         raise FramesError(
             f"{n} frames in scenes of {scene_length}: both must be at least 1"
         )
-    lidar2img = np.stack([camera.lidar2img() for camera in rig()])[None]
+    cameras = rig(spec.scale)
+    lidar2img = np.stack([camera.lidar2img() for camera in cameras])[None]
     for start in range(first, n, scene_length):
         scene = start // scene_length
         world = draw_world(np.random.default_rng([seed, scene]))
         for step in range(min(scene_length, n - start)):
             noise = np.random.default_rng([seed, scene, step + 1])
             seconds = step * FRAME_S
-            seen = render(world, world.ego(seconds), world.boxes_at(seconds))
+            boxes = world.boxes_at(seconds)
+            seen = render(world, world.ego(seconds), boxes, spec.scale)
             if spec.sees == "strip":
                 state, target = route_state(world, step)
                 image = _normalise(spec, strip(seen)[None], noise)
                 yield {"img": image, "state": state, "target_point": target}
                 continue
-            yield {
+            known: Frame = {
                 "img": _normalise(spec, seen, noise)[None],
                 "lidar2img": lidar2img,
                 "can_bus": _can_bus(world, step),
+                **_place_and_time(world.ego(seconds), seconds),
+                "command": np.array([spec.straight_on]),
             }
+            wanted = spec.inputs.keys() - spec.recurrent.keys()
+            yield {name: value for name, value in known.items() if name in wanted}
 
 
 def _normalise(
@@ -72,10 +79,23 @@ def _normalise(
     pixels = np.clip(np.rint(seen + grain), 0, 255).astype(np.float32)
     mean = np.array(spec.image.mean, np.float32)
     std = np.array(spec.image.std, np.float32)
+    if spec.image.order == "bgr":
+        pixels = pixels[..., ::-1]
     out = np.zeros((len(seen), 3, *spec.inputs["img"][-2:]), np.float32)
     height, width = seen.shape[1:3]
     out[:, :, :height, :width] = ((pixels - mean) / std).transpose(0, 3, 1, 2)
     return out
+
+
+def _place_and_time(ego: EgoPose, seconds: float) -> Frame:
+    """Return where the lidar is, turned how (its axes as rows) and when."""
+    cos, sin = math.cos(ego.yaw), math.sin(ego.yaw)
+    axes = np.array([[sin, -cos, 0], [cos, sin, 0], [0, 0, 1]], np.float32)
+    return {
+        "l2g_r_mat": axes[None],
+        "l2g_t": np.array([[ego.x, ego.y, LIDAR_HEIGHT_M]], np.float32),
+        "timestamp": np.array([seconds], np.float32),
+    }
 
 
 def _can_bus(world: SyntheticWorld, step: int) -> NDArray[np.float32]:

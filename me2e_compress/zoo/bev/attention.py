@@ -113,14 +113,13 @@ def deformable_attention(
         hws: Height and width of each level.
         locations: [B, Q, heads, L, P, 2], x then y; 0 and 1 are the outer edges.
         weights: [B, Q, heads, L, P], summing to 1 over the last two axes.
-        sampling: See `sample`; ``fused`` exports one node for all of it, of one level.
+        sampling: See `sample`; ``fused`` exports one node for all of it.
 
     Returns:
         [B, Q, heads * 32].
     """
     if sampling == "fused":
-        (hw,) = hws
-        return fused_deformable_attention(value, hw, locations, weights).flatten(2)
+        return fused_deformable_attention(value, hws, locations, weights).flatten(2)
     batch, _, heads, channels = value.shape
     queries, points = locations.shape[1], len(hws) * locations.shape[4]
     cells = value.flatten(2).transpose(1, 2)

@@ -8,7 +8,7 @@ from me2e_compress.zoo.bev.attention import (
     FeedForward,
     MultiheadAttention,
 )
-from me2e_compress.zoo.bev.sizes import EMBED, Sampling
+from me2e_compress.zoo.bev.sizes import EMBED, BevGrid, Sampling
 
 EPSILON = torch.tensor(1.0e-5)
 """Keeps the inverse sigmoid finite (deformable DETR). A tensor: the exporter would
@@ -18,6 +18,15 @@ write a Python number as float64."""
 def inverse_sigmoid(x: Tensor) -> Tensor:
     """Return the logit of x in 0..1, kept away from 0 and 1 by `EPSILON`."""
     return torch.log(torch.maximum(x, EPSILON) / torch.maximum(1 - x, EPSILON))
+
+
+def in_metres(raw: Tensor, at: Tensor, grid: BevGrid) -> Tensor:
+    """Return boxes [..., 10]: a raw regression with its refined centre (0..1) in metres."""
+    x0, y0, z0, x1, y1, z1 = grid.pc_range
+    x = at[..., 0:1] * (x1 - x0) + x0
+    y = at[..., 1:2] * (y1 - y0) + y0
+    z = at[..., 2:3] * (z1 - z0) + z0
+    return torch.cat([x, y, raw[..., 2:4], z, raw[..., 5:]], -1)
 
 
 class DecoderLayer(nn.Module):
@@ -31,9 +40,19 @@ class DecoderLayer(nn.Module):
         self.ffns = nn.ModuleList([FeedForward()])
         self.norms = nn.ModuleList(nn.LayerNorm(EMBED) for _ in range(3))
 
-    def forward(self, query: Tensor, pos: Tensor, bev: Tensor, at: Tensor) -> Tensor:
-        """Map [1, Q, 256] to [1, Q, 256]; ``at`` are reference points [1, Q, 2]."""
-        query = self.norms[0](self.attentions[0](query, query, pos, pos))
+    def forward(
+        self,
+        query: Tensor,
+        pos: Tensor,
+        bev: Tensor,
+        at: Tensor,
+        ignore: Tensor | None = None,
+    ) -> Tensor:
+        """Map [1, Q, 256] to [1, Q, 256]; ``at`` are reference points [1, Q, 2].
+
+        ``ignore`` is [1, Q] bool: queries that the others must not see.
+        """
+        query = self.norms[0](self.attentions[0](query, query, pos, pos, ignore))
         query = self.norms[1](self.attentions[1](query, pos, bev, at))
         out: Tensor = self.norms[2](self.ffns[0](query))
         return out
@@ -56,6 +75,7 @@ class Decoder(nn.Module):
         bev: Tensor,
         reference: Tensor,
         branches: nn.ModuleList,
+        ignore: Tensor | None = None,
     ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
         """Decode.
 
@@ -66,6 +86,7 @@ class Decoder(nn.Module):
             reference: [1, Q, 2 or 3], 0..1; the third is the height.
             branches: One regression branch a layer; columns 0 and 1, and 4 where there
                 is a height, move the reference.
+            ignore: [1, Q] bool, true for queries that the others must not see.
 
         Returns:
             For every layer: queries [1, Q, 256], raw regressions [1, Q, code] and
@@ -73,7 +94,7 @@ class Decoder(nn.Module):
         """
         queries, regressions, references = [], [], []
         for layer, branch in zip(self.layers, branches, strict=True):
-            query = layer(query, pos, bev, reference[..., :2])
+            query = layer(query, pos, bev, reference[..., :2], ignore)
             raw = branch(query)
             moves = raw[..., :2]
             if self.height:

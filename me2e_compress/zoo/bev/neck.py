@@ -27,10 +27,18 @@ class FeaturePyramid(nn.Module):
     Args:
         channels: Of the stages, the finest first.
         extra: Levels beyond, each by a strided convolution of the one before.
+        hws: Rows and columns of the stages, where there are several. The exporter
+            would write arithmetic on shapes for them.
     """
 
-    def __init__(self, channels: Sequence[int], extra: int = 0) -> None:
+    def __init__(
+        self,
+        channels: Sequence[int],
+        extra: int = 0,
+        hws: Sequence[tuple[int, int]] = (),
+    ) -> None:
         super().__init__()
+        self.hws = tuple(hws)
         self.lateral_convs = nn.ModuleList(ConvModule(c, EMBED, 1) for c in channels)
         self.fpn_convs = nn.ModuleList(ConvModule(EMBED, EMBED, 3) for _ in channels)
         self.fpn_convs.extend(ConvModule(EMBED, EMBED, 3, 2) for _ in range(extra))
@@ -39,7 +47,7 @@ class FeaturePyramid(nn.Module):
         """Map the stages [N, C, h, w] to the levels [N, 256, h, w]."""
         maps = [conv(x) for conv, x in zip(self.lateral_convs, stages, strict=True)]
         for finer in range(len(maps) - 2, -1, -1):
-            size = [int(n) for n in maps[finer].shape[2:]]
+            size = list(self.hws[finer])
             enlarged = functional.interpolate(maps[finer + 1], size, mode="nearest")
             maps[finer] = maps[finer] + enlarged
         levels = [conv(x) for conv, x in zip(self.fpn_convs, maps, strict=False)]

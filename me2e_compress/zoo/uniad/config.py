@@ -1,27 +1,56 @@
-"""Dimensions of UniAD-tiny (Bench2DriveZoo, tiny_e2e_b2d.py)."""
+"""Dimensions of UniAD-tiny: of Bench2DriveZoo, and of DL4AGX."""
 
 from dataclasses import dataclass
 
 from me2e_compress.zoo.bev.sizes import BevGrid
 
-COMMANDS = 6
 AGENT_MODES = 6
 AGENT_STEPS = 12
 PLAN_STEPS = 6
 """Of 0.5 s each."""
 
-THINGS = 6
-"""Map classes that are instances; there are none that are not."""
-
 MEMORY = 4
 """Past embeddings that are kept of a track."""
 
+OCC_REACH_M = 50.0
+"""Half the side of the square in which occupancy is predicted."""
 
-GRID = BevGrid(
-    hw=(100, 100),
-    pc_range=(-51.2, -51.2, -5.0, 51.2, 51.2, 3.0),
-    rotation_centre=(100.0, 100.0),
-)
+RANGE = (-51.2, -51.2, -5.0, 51.2, 51.2, 3.0)
+
+GRID = BevGrid((100, 100), RANGE, (100.0, 100.0))
+"""Of Bench2DriveZoo, whose previous view turns about a corner (see `vad.config`)."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What differs between the data sets.
+
+    Attributes:
+        groups: Of every class of objects, the group whose motion anchors it has.
+        vehicles: Classes whose occupancy is predicted.
+        things: Map classes that are instances.
+        commands: Of the navigator.
+    """
+
+    groups: tuple[int, ...]
+    vehicles: tuple[int, ...]
+    things: int
+    commands: int
+
+    @property
+    def classes(self) -> int:
+        """Classes of objects."""
+        return len(self.groups)
+
+
+BENCH2DRIVE = Labels((0, 0, 0, 1, 0, 0, 0, 2, 0), (0, 1, 2, 3, 4, 6, 7), 6, 6)
+"""Car, van, truck, bicycle, sign, cone, light, pedestrian, others; the groups are
+vehicles (and whatever has no group of its own), bicycles, pedestrians. Its tiny
+configuration leaves the vehicles at nuScenes' default."""
+
+NUSCENES = Labels((0, 0, 0, 0, 0, 3, 1, 1, 2, 3), (0, 1, 2, 3, 4, 6, 7), 3, 3)
+"""Car, truck, construction vehicle, bus, trailer, barrier, motorcycle, bicycle,
+pedestrian, cone."""
 
 
 @dataclass(frozen=True)
@@ -31,28 +60,32 @@ class UniadConfig:
     Attributes:
         image_hw: Pixels of a camera.
         stem: Channels of the first stage of the backbone.
+        stages: Of the backbone that the neck reads, from 0.
         strides: Of the feature levels.
         grid: Cells of the bird's eye view.
         upsampled: By which the heads behind tracking see the view enlarged.
-        classes: Of objects.
+        labels: Of the data set.
         queries: New track queries a frame, the last of which is the ego vehicle's.
         tracks: Slots for tracks that survive a frame.
         encoder_layers: Of the BEV encoder.
         decoder_layers: Of the track decoder, and of both halves of the map head.
         map_queries: Lanes.
+        map_levels: For which the published map attention has weights; it reads one.
     """
 
     image_hw: tuple[int, int] = (928, 1600)
     stem: int = 64
+    stages: tuple[int, ...] = (1, 2, 3)
     strides: tuple[int, ...] = (8, 16, 32, 64)
     grid: BevGrid = GRID
     upsampled: int = 2
-    classes: int = 9
+    labels: Labels = BENCH2DRIVE
     queries: int = 901
     tracks: int = 249
     encoder_layers: int = 3
     decoder_layers: int = 6
     map_queries: int = 300
+    map_levels: int = 4
 
     @property
     def hws(self) -> tuple[tuple[int, int], ...]:
@@ -65,3 +98,21 @@ class UniadConfig:
         """Rows and columns of the enlarged view."""
         rows, columns = self.grid.hw
         return rows * self.upsampled, columns * self.upsampled
+
+
+PUBLISHED = UniadConfig()
+"""Bench2DriveZoo, adzoo/uniad/configs/stage2_e2e/tiny_e2e_b2d.py."""
+
+DL4AGX = UniadConfig(
+    image_hw=(256, 416),
+    stages=(3,),
+    strides=(32,),
+    grid=BevGrid((50, 50), RANGE, (100.0, 100.0)),
+    upsampled=1,
+    labels=NUSCENES,
+    map_levels=1,
+)
+"""NVIDIA/DL4AGX, uniad-trt: smaller images, one feature level, 50 x 50 cells."""
+
+CONFIGS = {"uniad-tiny": PUBLISHED, "uniad-trt": DL4AGX}
+"""By the name of the stack."""

@@ -1,5 +1,7 @@
 """The map head of UniAD: lanes as queries, boxes and masks."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
@@ -11,13 +13,14 @@ from me2e_compress.zoo.bev.attention import (
 )
 from me2e_compress.zoo.bev.decoder import inverse_sigmoid
 from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, Sampling
-from me2e_compress.zoo.uniad.config import THINGS, UniadConfig
+from me2e_compress.zoo.uniad.config import UniadConfig
 from me2e_compress.zoo.uniad.layers import mlp
+from me2e_compress.zoo.uniad.positions import CellSines
 
 THING_BLOCKS, STUFF_BLOCKS = 4, 6
 MASK_FEED_FORWARD = 1024
-CONFIGURED_LEVELS = 4
-"""Levels that the published attention has weights for; it is given one."""
+LEVEL_EMBEDDINGS = 4
+"""Of which the first alone is read."""
 
 
 class MaskAttention(nn.Module):
@@ -186,7 +189,7 @@ class MapTransformer(nn.Module):
         super().__init__()
         self.encoder = CellEncoder(config, sampling, levels)
         self.decoder = LaneDecoder(config, sampling, levels)
-        self.level_embeds = nn.Parameter(torch.empty(CONFIGURED_LEVELS, EMBED))
+        self.level_embeds = nn.Parameter(torch.empty(LEVEL_EMBEDDINGS, EMBED))
         self.reference_points = nn.Linear(EMBED, 2)
         rows, columns = torch.meshgrid(
             (torch.arange(config.head_hw[0]) + 0.5) / config.head_hw[0],
@@ -218,15 +221,26 @@ class MapTransformer(nn.Module):
             cells = layer(cells, pos, self.places)
         lane_pos, query = lanes.unsqueeze(0).chunk(2, 2)
         at = self.reference_points(lane_pos).sigmoid()
-        for layer, branch in zip(self.decoder.layers, branches, strict=True):
+        layers = zip(self.decoder.layers, branches, strict=True)
+        for number, (layer, branch) in enumerate(layers):
             query = layer(query, lane_pos, cells, at)
             moved = branch(query)
             centre = moved[..., :2] + inverse_sigmoid(at[..., :2])
             size = moved[..., 2:]
-            if at.shape[-1] == 4:
+            if number > 0:  # until then there are points, not boxes
                 size = size + inverse_sigmoid(at[..., 2:])
             at = torch.cat([centre, size], -1).sigmoid()
         return cells, query, at
+
+
+class Lanes(NamedTuple):
+    """What the map head finds."""
+
+    query: Tensor  # [1, lanes, 256]
+    pos: Tensor  # [1, lanes, 256]
+    scores: Tensor  # [1, lanes, things], logits
+    boxes: Tensor  # [1, lanes, 4], cx cy w h, 0..1
+    masks: Tensor  # [1, lanes, rows, columns]
 
 
 class MapHead(nn.Module):
@@ -243,12 +257,14 @@ class MapHead(nn.Module):
         self, config: UniadConfig, sampling: Sampling, *, dead: bool = False
     ) -> None:
         super().__init__()
-        levels = CONFIGURED_LEVELS if dead else 1
-        layers = config.decoder_layers
+        levels = config.map_levels if dead else 1
+        layers, things = config.decoder_layers, config.labels.things
+        self.hw = config.head_hw
+        self.positional_encoding = CellSines(self.hw)
         self.query_embedding = nn.Embedding(config.map_queries, 2 * EMBED)
         self.transformer = MapTransformer(config, sampling, levels)
         self.cls_branches = nn.ModuleList(
-            nn.Linear(EMBED, THINGS) for _ in range(layers)
+            nn.Linear(EMBED, things) for _ in range(layers)
         )
         self.reg_branches = nn.ModuleList(_boxes() for _ in range(layers))
         self.things_mask_head = MaskHead(THING_BLOCKS)
@@ -258,28 +274,20 @@ class MapHead(nn.Module):
             self.stuff_mask_head = MaskHead(STUFF_BLOCKS, self_attention=True)
             self.reg_branches2 = nn.ModuleList(_boxes() for _ in range(THING_BLOCKS))
             self.cls_thing_branches = nn.ModuleList(
-                nn.Linear(EMBED, THINGS) for _ in range(THING_BLOCKS)
+                nn.Linear(EMBED, things) for _ in range(THING_BLOCKS)
             )
             self.cls_stuff_branches = nn.ModuleList(
                 nn.Linear(EMBED, 1) for _ in range(STUFF_BLOCKS)
             )
 
-    def forward(self, bev: Tensor, pos: Tensor) -> tuple[Tensor, ...]:
-        """Find lanes.
-
-        Args:
-            bev: [1, cells, 256], the enlarged view.
-            pos: [1, cells, 256].
-
-        Returns:
-            Lane queries [1, lanes, 256], their positions [1, lanes, 256], logits
-            [1, lanes, 6], boxes [1, lanes, 4] and masks [1, lanes, cells].
-        """
-        lanes = self.query_embedding.weight
+    def forward(self, bev: Tensor) -> Lanes:
+        """Find lanes in the enlarged view, [1, cells, 256]."""
+        lanes, pos = self.query_embedding.weight, self.positional_encoding()
         cells, query, boxes = self.transformer(bev, pos, lanes, self.reg_branches)
         lane_pos = lanes[None, :, :EMBED]
         masks = self.things_mask_head(query, lane_pos, cells, pos)
-        return query, lane_pos, self.cls_branches[-1](query), boxes, masks
+        masks = masks.unflatten(2, self.hw)
+        return Lanes(query, lane_pos, self.cls_branches[-1](query), boxes, masks)
 
 
 def _boxes() -> nn.Sequential:

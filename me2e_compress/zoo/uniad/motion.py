@@ -1,21 +1,33 @@
 """The motion head of UniAD: where the agents and the ego vehicle will go."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.uniad.config import AGENT_MODES, AGENT_STEPS, UniadConfig
 from me2e_compress.zoo.uniad.layers import TransformerLayer, mlp, projection
+from me2e_compress.zoo.uniad.motion_anchors import AgentFrames, anchors
 from me2e_compress.zoo.uniad.motion_goal import GoalLayer
+from me2e_compress.zoo.uniad.positions import PointSines
 
 LAYERS = 3
-ANCHOR_GROUPS = 3
-"""Cars, vans and trucks; bicycles; pedestrians (Bench2Drive)."""
-
 OUTPUTS = 5
 """Mean x and y, both standard deviations, correlation."""
 
 TRACK_LAYERS = 6
+
+
+Goals = tuple[Tensor, Tensor, Tensor]
+"""A goal as the agent sees it, along the axes of the ego, and from the ego."""
+
+
+class Intent(NamedTuple):
+    """Where the modes of the agents are going, [A, 6, 256] each."""
+
+    static: Tensor  # what the anchors say, the same in all layers
+    goals: Goals  # what the trajectories so far say
 
 
 class Wrapped(nn.Module):
@@ -49,12 +61,13 @@ class MotionFormer(nn.Module):
         self.in_query_fuser = mlp(2 * EMBED, 2 * EMBED, EMBED)
         self.out_query_fuser = mlp(4 * EMBED, 2 * EMBED, EMBED)
 
-    def mix(
+    def forward(
         self,
         layer: int,
         query: Tensor,
+        intent: Intent,
         agents: tuple[Tensor, Tensor, Tensor],
-        lanes: tuple[Tensor, Tensor],
+        lanes: Tensor,
         bev: Tensor,
         at: Tensor,
     ) -> Tensor:
@@ -62,23 +75,27 @@ class MotionFormer(nn.Module):
 
         Args:
             layer: Which.
-            query: [A, 6, 256].
+            query: [A, 6, 256], of the layer before.
+            intent: Where the modes are going.
             agents: Track queries [1, A, 256], their positions [1, A, 256], and where a
                 slot holds no agent [1, A] bool.
-            lanes: Lane queries and their positions, [1, lanes, 256] each.
+            lanes: Lane queries with their positions, [1, lanes, 256].
             bev: [1, cells, 256], the enlarged view.
-            at: [A, 6, 12, 2], the trajectories so far, metres.
+            at: [A, 6, 12, 2], the trajectories so far, metres, lidar frame.
 
         Returns:
             [A, 6, 256].
         """
+        dynamic = self.dynamic_embed_fuser(torch.cat(intent.goals, -1))
+        fused = self.static_dynamic_fuser(torch.cat([intent.static, dynamic], -1))
+        query = self.in_query_fuser(torch.cat([query, fused], -1))
         track, track_pos, empty = agents
         pos = track_pos[0][:, None].expand_as(query)
         asked = query + pos
         social = self.track_agent_interaction_layers[layer](
             asked, track + track_pos, empty
         )
-        aware = self.map_interaction_layers[layer](asked, lanes[0] + lanes[1])
+        aware = self.map_interaction_layers[layer](asked, lanes)
         flat = [x.flatten(0, 1).unsqueeze(0) for x in (query, pos, at)]
         goal = self.bev_interaction_layers[layer](flat[0], flat[1], bev, flat[2])
         own = track[0][:, None].expand_as(query) + pos
@@ -89,6 +106,24 @@ class MotionFormer(nn.Module):
 
 def _repeat(layer: type[Wrapped]) -> nn.ModuleList:
     return nn.ModuleList(layer(cross=True) for _ in range(LAYERS))
+
+
+class Agents(NamedTuple):
+    """Tracks in their slots, the ego vehicle behind them."""
+
+    query: Tensor  # [1, A, 256]
+    boxes: Tensor  # [A, 10], metres
+    labels: Tensor  # [A] int64
+    empty: Tensor  # [1, A] bool: nothing is there, or nothing is seen
+
+
+class Forecasts(NamedTuple):
+    """Where agents will go."""
+
+    trajectories: Tensor  # [3, 1, A, 6, 12, 5], metres from where the agent is
+    scores: Tensor  # [3, 1, A, 6], logarithms of probabilities
+    modes: Tensor  # [1, A, 6, 256], queries of the last layer
+    pos: Tensor  # [1, A, 256], of the agents
 
 
 class MotionHead(nn.Module):
@@ -104,8 +139,9 @@ class MotionHead(nn.Module):
         self, config: UniadConfig, sampling: Sampling, *, dead: bool = False
     ) -> None:
         super().__init__()
+        groups = max(config.labels.groups) + 1
         self.learnable_motion_query_embedding = nn.Embedding(
-            AGENT_MODES * ANCHOR_GROUPS, EMBED
+            AGENT_MODES * groups, EMBED
         )
         self.motionformer = MotionFormer(config, sampling)
         self.agent_level_embedding_layer = mlp(EMBED, 2 * EMBED, EMBED)
@@ -125,3 +161,58 @@ class MotionHead(nn.Module):
         )
         if dead:
             self.layer_track_query_fuser = projection(TRACK_LAYERS * EMBED, EMBED)
+        self.sines = PointSines(config.grid.pc_range)
+        self.register_buffer("anchors", anchors(groups), False)
+        self.register_buffer("group_of", torch.tensor(config.labels.groups), False)
+
+    anchors: Tensor
+    group_of: Tensor
+
+    def forward(self, agents: Agents, lanes: Tensor, bev: Tensor) -> Forecasts:
+        """Predict the motion of all agents in all modes.
+
+        Args:
+            agents: Tracks and the ego vehicle.
+            lanes: Lane queries with their positions, [1, lanes, 256].
+            bev: [1, cells, 256], the enlarged view.
+        """
+        frames = AgentFrames.of(agents.boxes)
+        pos = self.boxes_query_embedding_layer(self.sines(agents.boxes[:, :2]))
+        pos = pos.unsqueeze(0)
+        group = self.group_of[agents.labels]
+        anchor = self.anchors[group]
+        offsets = frames.turned(anchor)
+        goals = self._goals(anchor, offsets, offsets + frames.centre)
+        learned = self.learnable_motion_query_embedding.weight
+        learned = learned.unflatten(0, (-1, AGENT_MODES))[group]
+        own = self.motionformer.intention_interaction_layers(goals[0])
+        goals = (own, *goals[1:])
+        static = own + goals[1] + learned
+        query = torch.zeros_like(static)
+        read = agents.query, pos, agents.empty
+        trajectories, scores = [], []
+        for layer in range(LAYERS):
+            at = offsets + frames.centre
+            intent = Intent(static, goals)
+            query = self.motionformer(layer, query, intent, read, lanes, bev, at)
+            steps = self.traj_reg_branches[layer](query)
+            steps = steps.unflatten(2, (AGENT_STEPS, OUTPUTS))
+            offsets = steps[..., :2].cumsum(2)
+            spread = [steps[..., 2:4].exp(), steps[..., 4:].tanh()]
+            trajectories.append(torch.cat([offsets, *spread], -1).unsqueeze(0))
+            score = self.traj_cls_branches[layer](query).squeeze(2)
+            scores.append(score.log_softmax(1).unsqueeze(0))
+            if layer < LAYERS - 1:
+                ahead = frames.turned_back(offsets)
+                goals = self._goals(ahead, offsets, offsets + frames.centre)
+        return Forecasts(
+            torch.stack(trajectories), torch.stack(scores), query.unsqueeze(0), pos
+        )
+
+    def _goals(self, own: Tensor, offsets: Tensor, places: Tensor) -> Goals:
+        """Embed the last points of [A, 6, 12, 2] as an agent, the axes and the ego see it."""
+        return (
+            self.agent_level_embedding_layer(self.sines(own[:, :, -1])),
+            self.scene_level_offset_embedding_layer(self.sines(offsets[:, :, -1])),
+            self.scene_level_ego_embedding_layer(self.sines(places[:, :, -1])),
+        )

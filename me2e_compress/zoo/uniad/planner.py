@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.bev.sizes import EMBED
-from me2e_compress.zoo.uniad.config import COMMANDS, PLAN_STEPS
+from me2e_compress.zoo.uniad.config import PLAN_STEPS
 from me2e_compress.zoo.uniad.layers import TransformerLayer, mlp, projection
 
 ADAPTERS, LAYERS = 3, 3
@@ -28,10 +28,10 @@ class PlannerDecoder(nn.Module):
 class PlanningHead(nn.Module):
     """One query a frame, made of the ego's track, its motion and the command."""
 
-    def __init__(self, hw: tuple[int, int]) -> None:
+    def __init__(self, hw: tuple[int, int], commands: int) -> None:
         super().__init__()
         self.hw = hw
-        self.navi_embed = nn.Embedding(COMMANDS, EMBED)
+        self.navi_embed = nn.Embedding(commands, EMBED)
         self.reg_branch = mlp(EMBED, EMBED, PLAN_STEPS * 2)
         self.attn_module = PlannerDecoder()
         self.mlp_fuser = projection(3 * EMBED, EMBED)
@@ -60,7 +60,7 @@ class PlanningHead(nn.Module):
         Args:
             modes: [1, 6, 256], the ego's queries of the last motion layer.
             track: [1, 256], the ego's track query.
-            command: [1] int64, 0 to 5.
+            command: [1] int64.
             bev: [1, cells, 256], the enlarged view.
             bev_pos: [1, cells, 256].
 

@@ -1,79 +1,64 @@
-"""The whole of UniAD-tiny: its modules and their parameters."""
+"""The whole of UniAD-tiny."""
+
+from typing import NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.nn import functional
 
-from me2e_compress.zoo.bev.decoder import Decoder
-from me2e_compress.zoo.bev.encoder import BevEncoder, GridPosition
 from me2e_compress.zoo.bev.neck import FeaturePyramid
-from me2e_compress.zoo.bev.sizes import BOX_CODE, CAMERAS, EMBED, Sampling
+from me2e_compress.zoo.bev.sizes import EMBED, Sampling
+from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.resnet import BLOCKS, Bottleneck, ResNet
-from me2e_compress.zoo.uniad.config import UniadConfig
-from me2e_compress.zoo.uniad.layers import mlp, projection
+from me2e_compress.zoo.uniad.config import PUBLISHED, UniadConfig
 from me2e_compress.zoo.uniad.map import MapHead
-from me2e_compress.zoo.uniad.motion import MotionHead
+from me2e_compress.zoo.uniad.motion import Agents, MotionHead
 from me2e_compress.zoo.uniad.occ import OccHead
+from me2e_compress.zoo.uniad.perception import Found, Motions, Queries, TrackHead
 from me2e_compress.zoo.uniad.planner import PlanningHead
+from me2e_compress.zoo.uniad.track_life import (
+    SAVE_PERIOD,
+    SLEEPS,
+    Pose,
+    TrackLife,
+    Tracks,
+    VelocityUpdate,
+)
 from me2e_compress.zoo.uniad.tracking import MemoryBank, QueryInteraction
 
-CAN_BUS = 18
-PAST_STEPS = 8
 
-PUBLISHED = UniadConfig()
+class CameraTrunk(ResNet):
+    """ResNet-50 to the feature maps that the neck reads."""
 
+    def __init__(self, stem: int, stages: tuple[int, ...]) -> None:
+        super().__init__(Bottleneck, BLOCKS, stem)
+        self.chosen = stages
+        self.read = [self.channels[stage] for stage in stages]
 
-class TrackTransformer(nn.Module):
-    """BEV encoder and track decoder."""
-
-    def __init__(self, config: UniadConfig, sampling: Sampling) -> None:
-        super().__init__()
-        levels = len(config.hws)
-        self.level_embeds = nn.Parameter(torch.empty(levels, EMBED))
-        self.cams_embeds = nn.Parameter(torch.empty(CAMERAS, EMBED))
-        self.can_bus_mlp = nn.Sequential(
-            nn.Linear(CAN_BUS, EMBED // 2),
-            nn.ReLU(),
-            nn.Linear(EMBED // 2, EMBED),
-            nn.ReLU(),
-        )
-        self.can_bus_mlp.add_module("norm", nn.LayerNorm(EMBED))
-        self.encoder = BevEncoder(
-            config.grid, config.image_hw, config.hws, config.encoder_layers, sampling
-        )
-        self.decoder = Decoder(
-            config.grid.hw, config.decoder_layers, sampling, height=True
-        )
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """Map [N, 3, H, W] to [N, channels, h, w] each."""
+        maps = self.stages(images)
+        return [maps[stage] for stage in self.chosen]
 
 
-class TrackHead(nn.Module):
-    """Queries and branches of tracking."""
+class Seen(NamedTuple):
+    """Tracks of this frame in their slots, and the ego vehicle behind them."""
 
-    def __init__(self, config: UniadConfig, sampling: Sampling, *, dead: bool) -> None:
-        super().__init__()
-        layers = range(config.decoder_layers)
-        self.code_weights = nn.Parameter(torch.empty(BOX_CODE))
-        self.positional_encoding = GridPosition(config.grid.hw)
-        self.transformer = TrackTransformer(config, sampling)
-        self.bev_embedding = nn.Embedding(config.grid.cells, EMBED)
-        self.cls_branches = nn.ModuleList(
-            nn.Sequential(
-                *projection(EMBED, EMBED),
-                *projection(EMBED, EMBED),
-                nn.Linear(EMBED, config.classes),
-            )
-            for _ in layers
-        )
-        self.reg_branches = nn.ModuleList(
-            mlp(EMBED, EMBED, EMBED, BOX_CODE) for _ in layers
-        )
-        if dead:
-            self.past_traj_reg_branches = nn.ModuleList(
-                mlp(EMBED, EMBED, EMBED, PAST_STEPS * 2) for _ in layers
-            )
+    agents: Agents
+    boxes: Tensor  # [slots, 10], metres
+    scores: Tensor  # [slots], 0 in empty slots
 
 
 class UniadTiny(nn.Module):
-    """UniAD-tiny of Bench2DriveZoo (Hu et al. 2023).
+    """Cameras, ego motion and the tracks so far to tracks, map, forecasts and a plan.
+
+    Hu et al. 2023, written from the published description, at the published dimensions
+    and with the parameter names of the original. What differs is what a graph of fixed
+    shapes asks for: camera attention reads every camera for every cell and masks; tracks
+    stand in slots, of which the empty ones are masked (see `TrackLife`); all agents keep
+    their slot in motion and occupancy, where the original gathers those that it sees.
+    The host's: which earlier view is fed as the previous one, the threshold of occupancy
+    and the optimisation of the plan against it.
 
     Args:
         config: Sizes.
@@ -89,14 +74,184 @@ class UniadTiny(nn.Module):
         dead: bool = False,
     ) -> None:
         super().__init__()
-        self.img_backbone = ResNet(Bottleneck, BLOCKS, config.stem)
-        self.img_neck = FeaturePyramid(self.img_backbone.channels[1:], extra=1)
+        self.config = config
+        self.img_backbone = CameraTrunk(config.stem, config.stages)
+        self.img_neck = FeaturePyramid(
+            self.img_backbone.read, len(config.hws) - len(config.stages), config.hws
+        )
         self.query_embedding = nn.Embedding(config.queries, 2 * EMBED)
         self.reference_points = nn.Linear(EMBED, 3)
+        self.velo_update = VelocityUpdate(config.grid.pc_range)
+        self.track_base = TrackLife(config)
         self.query_interact = QueryInteraction()
         self.memory_bank = MemoryBank()
         self.pts_bbox_head = TrackHead(config, sampling, dead=dead)
         self.seg_head = MapHead(config, sampling, dead=dead)
         self.motion_head = MotionHead(config, sampling, dead=dead)
-        self.occ_head = OccHead()
-        self.planning_head = PlanningHead(config.head_hw)
+        self.occ_head = OccHead(config, sampling)
+        self.planning_head = PlanningHead(config.head_hw, config.labels.commands)
+
+    def forward(
+        self,
+        img: Tensor,
+        lidar2img: Tensor,
+        can_bus: Tensor,
+        command: Tensor,
+        l2g_r_mat: Tensor,
+        l2g_t: Tensor,
+        timestamp: Tensor,
+        prev_bev: Tensor,
+        prev_l2g_r_mat: Tensor,
+        prev_l2g_t: Tensor,
+        prev_timestamp: Tensor,
+        *prev_tracks: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Drive one frame.
+
+        Args:
+            img: [1, 6, 3, rows, columns] float32, normalised.
+            lidar2img: [1, 6, 4, 4] float32.
+            can_bus: [18] float32.
+            command: [1] int64, of the navigator.
+            l2g_r_mat: [1, 3, 3] float32, rows are the lidar's axes in the world.
+            l2g_t: [1, 3] float32, metres: where the lidar is.
+            timestamp: [1] float32, seconds; from any beginning, so that they are small.
+            prev_bev: [cells, 1, 256] float32; all zeros at the start of a scene, as
+                all that is remembered.
+            prev_l2g_r_mat: Of the last frame, as are the next two.
+            prev_l2g_t: [1, 3].
+            prev_timestamp: [1].
+            prev_tracks: The fields of `Tracks`.
+
+        Returns:
+            The answers to all that is remembered, then what `OUTPUTS` names.
+        """
+        before, tracks = (
+            Pose(prev_l2g_r_mat, prev_l2g_t, prev_timestamp),
+            Tracks(*prev_tracks),
+        )
+        now = Pose(l2g_r_mat, l2g_t, timestamp)
+        with region("backbone"):
+            stages = self.img_backbone(img.flatten(0, 1))
+        with region("neck"):
+            levels = self.img_neck(stages)
+        with region("track"):
+            queries = self._queries(tracks, before, now)
+        motions = Motions(lidar2img, can_bus, prev_bev)
+        found = self.pts_bbox_head(levels, motions, queries)
+        with region("track"):
+            seen, kept = self._track(found, queries.query, tracks)
+        with region("bev_encoder"):
+            bev, bev_pos = self.enlarged(found.bev), self.enlarged(found.bev_pos)
+        with region("map"):
+            lanes = self.seg_head(bev)
+        with region("motion"):
+            motion = self.motion_head(seen.agents, lanes.query + lanes.pos, bev)
+        with region("occ"):
+            occupancy = self.occ_head(bev, seen.agents, motion, seen.scores)
+        with region("planner"):
+            plan = self.planning_head(
+                motion.modes[:, -1], seen.agents.query[:, -1], command, bev, bev_pos
+            )
+        with region("bev_encoder"):
+            answer = found.bev.transpose(0, 1)
+        with region("track"):
+            pose = l2g_r_mat + 0, l2g_t + 0, timestamp + 0
+        return (
+            answer,
+            *pose,
+            *kept,
+            found.scores,
+            found.boxes,
+            seen.boxes,
+            seen.scores,
+            seen.agents.labels[:-1],
+            lanes.query,
+            lanes.scores,
+            lanes.boxes,
+            lanes.masks,
+            motion.trajectories,
+            motion.scores,
+            occupancy,
+            plan,
+        )
+
+    def enlarged(self, cells: Tensor) -> Tensor:
+        """Map [1, cells, 256] to what the heads behind tracking see."""
+        if self.config.upsampled == 1:
+            return cells
+        image = cells.transpose(1, 2).unflatten(2, self.config.grid.hw)
+        image = functional.interpolate(image, self.config.head_hw, mode="nearest")
+        return image.flatten(2).transpose(1, 2)
+
+    def _queries(self, tracks: Tracks, before: Pose, now: Pose) -> Queries:
+        """Return new queries, the last of them the ego's, and the tracks' behind."""
+        new = self.query_embedding.weight
+        at = self.reference_points(new[:, :EMBED])
+        carried = self.velo_update(tracks.ref_pts, tracks.velocity, before, now)
+        empty = torch.cat([torch.zeros_like(at[:, 0]) > 0, tracks.obj_idxes == 0])
+        return Queries(
+            torch.cat([new, tracks.query])[None],
+            torch.cat([at, carried])[None],
+            empty[None],
+        )
+
+    def _track(
+        self, found: Found, query: Tensor, before: Tracks
+    ) -> tuple[Seen, Tracks]:
+        """Decide what is tracked, and make the queries of the next frame."""
+        new = self.config.queries
+        last, boxes = found.scores[-1, 0], found.boxes[-1, 0]
+        scores, labels = last.sigmoid().amax(1), last.argmax(1)
+        lives = self.track_base(scores, before)
+        chosen, ids = lives.chosen, lives.obj_idxes
+        seen = self._seen(found, chosen, ids, (boxes, scores, labels))
+        place = (chosen - new).clamp(0)
+        old = (chosen >= new).to(torch.int64)
+        kept = old.to(scores.dtype)
+        period = before.save_period[place] * old
+        due = (period == 0) & (ids > 0)
+        track, bank, held = self.memory_bank(
+            found.embeddings[chosen],
+            before.mem_bank[place],
+            before.mem_held[place] * kept[:, None],
+            due,
+        )
+        period = torch.where(due, period + SAVE_PERIOD, (period - 1).clamp(0))
+        asked = self.query_interact(query[:, chosen], track[None], (ids == 0)[None])
+        return seen, Tracks(
+            asked[0],
+            found.reference[chosen],
+            ids,
+            lives.disappear_time,
+            period,
+            boxes[chosen][:, -2:],
+            bank,
+            held,
+            lives.max_obj_id,
+        )
+
+    def _seen(
+        self,
+        found: Found,
+        chosen: Tensor,
+        ids: Tensor,
+        of_all: tuple[Tensor, Tensor, Tensor],
+    ) -> Seen:
+        """Return what the heads behind tracking read: slots, then the ego vehicle."""
+        boxes, scores, labels = of_all
+        ego = self.config.queries - 1
+        score = scores[chosen]
+        empty = (ids == 0) | (score < SLEEPS)
+        label = labels[chosen]
+        nothing = torch.zeros_like(label[:1])
+        agents = Agents(
+            torch.cat([found.embeddings[chosen], found.embeddings[ego : ego + 1]])[
+                None
+            ],
+            torch.cat([boxes[chosen], boxes[ego : ego + 1]]),
+            torch.cat([label, nothing]),
+            torch.cat([empty, nothing > 0])[None],
+        )
+        there = (ids > 0).to(score.dtype)
+        return Seen(agents, boxes[chosen], score * there)

@@ -6,12 +6,9 @@ from torch import Tensor, nn
 from me2e_compress.zoo.bev.attention import PackedAttention
 from me2e_compress.zoo.bev.sizes import EMBED
 
-SAVE_PERIOD = 3
-"""Frames between two embeddings that the memory keeps."""
-
 
 class MemoryBank(nn.Module):
-    """A track attends to its own past."""
+    """A track attends to its own past, and what is due is remembered."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -22,31 +19,31 @@ class MemoryBank(nn.Module):
         self.temporal_norm1 = nn.LayerNorm(EMBED)
         self.temporal_norm2 = nn.LayerNorm(EMBED)
 
-    def forward(self, track: Tensor, bank: Tensor, empty: Tensor) -> Tensor:
-        """Recall.
+    def forward(
+        self, track: Tensor, bank: Tensor, held: Tensor, due: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Recall, then remember.
 
         Args:
             track: [tracks, 256].
             bank: [tracks, 4, 256], the newest last.
-            empty: [tracks, 4] bool. A track whose newest entry is empty stays as it is.
+            held: [tracks, 4] float32, 1 where an entry of the bank holds something. A
+                track whose newest entry holds nothing stays as it is.
+            due: [tracks] bool: the oldest entry goes and a new one comes.
 
         Returns:
-            [tracks, 256].
+            Tracks [tracks, 256], bank and ``held`` of the next frame.
         """
+        empty = held < 1
         recalled = self.temporal_attn(track[:, None], bank, bank, empty)[:, 0]
         mixed = self.temporal_norm1(track + recalled)
         changed = self.temporal_fc2(self.temporal_fc1(mixed).relu())
         mixed = self.temporal_norm2(mixed + changed)
-        return torch.where(empty[:, -1:], track, mixed)
-
-    def save(
-        self, track: Tensor, bank: Tensor, empty: Tensor, due: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Keep the tracks that are due, [tracks, 1] bool, and forget their oldest."""
+        track = torch.where(empty[:, -1:], track, mixed)
         newer = torch.cat([bank[:, 1:], self.save_proj(track)[:, None]], 1)
-        fuller = torch.cat([empty[:, 1:], torch.zeros_like(empty[:, :1])], 1)
-        kept = torch.where(due[:, None], newer, bank)
-        return kept, torch.where(due, fuller, empty)
+        fuller = torch.cat([held[:, 1:], torch.ones_like(held[:, :1])], 1)
+        bank = torch.where(due[:, None, None], newer, bank)
+        return track, bank, torch.where(due[:, None], fuller, held)
 
 
 class QueryInteraction(nn.Module):

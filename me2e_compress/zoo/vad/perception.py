@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.decoder import in_metres
 from me2e_compress.zoo.bev.encoder import GridPosition
 from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
 from me2e_compress.zoo.regions import region
@@ -114,7 +115,7 @@ class PerceptionHead(nn.Module):
             branch(query)
             for branch, query in zip(self.cls_branches, queries, strict=True)
         ]
-        boxes = [_box(r, a) for r, a in zip(raw, at, strict=True)]
+        boxes = [in_metres(r, a, GRID) for r, a in zip(raw, at, strict=True)]
         return Agents(
             torch.stack(scores), torch.stack(boxes), queries[-1], at[-1][..., :2]
         )
@@ -134,15 +135,6 @@ class PerceptionHead(nn.Module):
 
 def _repeat(make: Callable[[int], nn.Module], outputs: int) -> nn.ModuleList:
     return nn.ModuleList(make(outputs) for _ in range(LAYERS))
-
-
-def _box(raw: Tensor, at: Tensor) -> Tensor:
-    """Convert raw regression and refined centre (0..1) to a box in metres."""
-    x0, y0, z0, x1, y1, z1 = GRID.pc_range
-    x = at[..., 0:1] * (x1 - x0) + x0
-    y = at[..., 1:2] * (y1 - y0) + y0
-    z = at[..., 2:3] * (z1 - z0) + z0
-    return torch.cat([x, y, raw[..., 2:4], z, raw[..., 5:]], -1)
 
 
 def _enclosing(points: Tensor) -> Tensor:

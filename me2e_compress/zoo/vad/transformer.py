@@ -3,27 +3,13 @@
 import torch
 from torch import Tensor, nn
 
+from me2e_compress.zoo.bev.can_bus import CanBusEncoder
 from me2e_compress.zoo.bev.decoder import Decoder
 from me2e_compress.zoo.bev.encoder import BevEncoder
 from me2e_compress.zoo.bev.reference_points import cell_positions, ego_shift, turn
 from me2e_compress.zoo.bev.sizes import CAMERAS, EMBED, FEATURE_LEVELS, Sampling
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.vad.config import FEATURE_HWS, GRID, IMAGE_HW, LAYERS
-
-CAN_BUS = 18
-
-
-class CanBusEncoder(nn.Sequential):
-    """Ego motion to a vector that is added to every BEV query."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            nn.Linear(CAN_BUS, EMBED // 2),
-            nn.ReLU(),
-            nn.Linear(EMBED // 2, EMBED),
-            nn.ReLU(),
-        )
-        self.add_module("norm", nn.LayerNorm(EMBED))
 
 
 class PerceptionTransformer(nn.Module):

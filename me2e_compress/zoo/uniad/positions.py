@@ -1,0 +1,72 @@
+"""Sines and cosines of positions (Vaswani et al. 2017)."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.bev.sizes import EMBED
+
+TEMPERATURE = 10_000.0
+HALF = EMBED // 2
+"""Numbers that say one coordinate."""
+
+
+def _divisors() -> Tensor:
+    """Return the wave lengths [64], over 2 pi."""
+    return TEMPERATURE ** (torch.arange(0, HALF, 2) / HALF)
+
+
+def _waves(at: Tensor, divisors: Tensor) -> Tensor:
+    """Map coordinates [...] in 0..2 pi to sine and cosine in turn, [..., 128]."""
+    angles = at.unsqueeze(-1) / divisors
+    return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)
+
+
+class CellSines(nn.Module):
+    """A fixed embedding of a row and a column (DETR, offset by half a cell).
+
+    Args:
+        hw: Rows and columns.
+    """
+
+    def __init__(self, hw: tuple[int, int]) -> None:
+        super().__init__()
+        self.hw = hw
+        for name, count in (("rows", hw[0]), ("columns", hw[1])):
+            at = (torch.arange(count) + 0.5) / count * (2 * math.pi)
+            self.register_buffer(name, _waves(at, _divisors()), False)
+
+    rows: Tensor
+    columns: Tensor
+
+    def forward(self) -> Tensor:
+        """Return [1, cells, 256]: row half, then column half."""
+        height, width = self.hw
+        rows = self.rows.unsqueeze(1).expand(-1, width, -1)
+        columns = self.columns.unsqueeze(0).expand(height, -1, -1)
+        return torch.cat([rows, columns], -1).flatten(0, 1).unsqueeze(0)
+
+
+class PointSines(nn.Module):
+    """Points in metres to an embedding.
+
+    Args:
+        pc_range: x, y, z minima then maxima in metres.
+    """
+
+    def __init__(self, pc_range: tuple[float, ...]) -> None:
+        super().__init__()
+        low, high = torch.tensor(pc_range[:2]), torch.tensor(pc_range[3:5])
+        self.register_buffer("low", low, False)
+        self.register_buffer("circle", 2 * math.pi / (high - low), False)
+        self.register_buffer("divisors", _divisors(), False)
+
+    low: Tensor
+    circle: Tensor
+    divisors: Tensor
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Map [..., 2] (x, y) to [..., 256]: y half, then x half."""
+        at = (points - self.low) * self.circle
+        return _waves(at.flip(-1), self.divisors).flatten(-2)

@@ -1,0 +1,127 @@
+"""When a track begins, sleeps and ends, in a fixed number of slots.
+
+The original keeps a list of tracks that grows and shrinks between frames, on the host.
+Here a list is so many slots, of which the empty ones, those without an id, are seen by
+nobody. All of it is one graph, and no shape depends on the data.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from me2e_compress.zoo.bev.decoder import inverse_sigmoid
+from me2e_compress.zoo.uniad.config import UniadConfig
+
+BEGINS = torch.tensor(0.4)
+"""Score from which a query becomes a track."""
+
+SLEEPS = torch.tensor(0.35)
+"""Score below which a track is not seen."""
+
+PATIENCE = 5
+"""Frames out of sight after which a track ends. All three: UniAD's tracker. Tensors:
+the exporter would write a Python number as float64."""
+
+SAVE_PERIOD = 3
+"""Frames between two embeddings that the memory keeps."""
+
+
+class Tracks(NamedTuple):
+    """Slots for tracks, from frame to frame; all zeros hold none."""
+
+    query: Tensor  # [slots, 512], position then content
+    ref_pts: Tensor  # [slots, 3], logits of x y z as parts of the range
+    obj_idxes: Tensor  # [slots] int64, from 1; 0 is an empty slot
+    disappear_time: Tensor  # [slots] int64, frames out of sight
+    save_period: Tensor  # [slots] int64, frames until its embedding is kept
+    velocity: Tensor  # [slots, 2], metres a second
+    mem_bank: Tensor  # [slots, 4, 256], the newest last
+    mem_held: Tensor  # [slots, 4], 1 where the bank holds something
+    max_obj_id: Tensor  # [1] int64, the newest id
+
+
+class Lives(NamedTuple):
+    """Which queries are tracks, of a frame."""
+
+    chosen: Tensor  # [slots] int64: the query that each slot takes
+    obj_idxes: Tensor  # [slots] int64, 0 for none
+    disappear_time: Tensor  # [slots] int64
+    max_obj_id: Tensor  # [1] int64
+
+
+class Pose(NamedTuple):
+    """Where the lidar frame is, and when."""
+
+    rotation: Tensor  # [1, 3, 3]: rows are the axes of the lidar frame in the world
+    position: Tensor  # [1, 3], metres
+    seconds: Tensor  # [1]
+
+
+class TrackLife(nn.Module):
+    """Decide which of the frame's queries are tracks, and give every track a slot.
+
+    Queries come new ones first, then slots. A track keeps its place before all that are
+    new; new ones take what is free in their order, and for those that find no slot there
+    is none.
+    """
+
+    def __init__(self, config: UniadConfig) -> None:
+        super().__init__()
+        new, slots = config.queries, config.tracks
+        self.slots = slots
+        order = torch.cat([torch.arange(new) + slots, torch.arange(slots)])
+        self.register_buffer("rank", (new + slots - order).float(), False)
+        self.register_buffer("places", torch.tensor([float(new + slots)]), False)
+        self.register_buffer("none", torch.zeros(new, dtype=torch.int64), False)
+        may_begin = torch.arange(new + slots) < new - 1  # not the ego vehicle's
+        self.register_buffer("may_begin", may_begin, False)
+
+    rank: Tensor
+    places: Tensor
+    none: Tensor
+    may_begin: Tensor
+
+    def forward(self, scores: Tensor, before: Tracks) -> Lives:
+        """Map scores [queries] and the slots of the last frame to those of this."""
+        ids = torch.cat([self.none, before.obj_idxes])
+        missed = torch.cat([self.none, before.disappear_time])
+        seen = scores >= BEGINS
+        begins = (seen & self.may_begin).to(torch.int64)
+        ids = ids + begins * (before.max_obj_id + begins.cumsum(0))
+        unseen = (ids > 0) & (scores < SLEEPS)
+        missed = missed * torch.logical_not(seen).to(torch.int64)
+        missed = missed + unseen.to(torch.int64)
+        ids = ids * (missed < PATIENCE).to(torch.int64)
+        missed = missed * (ids > 0).to(torch.int64)
+        urgency = self.rank + self.places * (ids > 0).to(self.rank.dtype)
+        chosen = torch.topk(urgency, self.slots).indices
+        newest = before.max_obj_id + begins.sum(0, keepdim=True)
+        return Lives(chosen, ids[chosen], missed[chosen], newest)
+
+
+class VelocityUpdate(nn.Module):
+    """Carry reference points on to the present: their own motion, and the vehicle's."""
+
+    def __init__(self, pc_range: tuple[float, ...]) -> None:
+        super().__init__()
+        low, high = torch.tensor(pc_range[:3]), torch.tensor(pc_range[3:])
+        self.register_buffer("low", low, False)
+        self.register_buffer("extent", high - low, False)
+
+    low: Tensor
+    extent: Tensor
+
+    def forward(
+        self, ref_pts: Tensor, velocity: Tensor, before: Pose, now: Pose
+    ) -> Tensor:
+        """Map logits [slots, 3] and metres a second [slots, 2] to logits [slots, 3].
+
+        The world turns back by the transpose, which of a rotation is the inverse.
+        """
+        points = ref_pts.sigmoid() * self.extent + self.low
+        seconds = now.seconds - before.seconds
+        moved = torch.cat([velocity, torch.zeros_like(velocity[:, :1])], 1) * seconds
+        world = torch.matmul(points + moved, before.rotation[0]) + before.position
+        points = torch.matmul(world - now.position, now.rotation[0].transpose(0, 1))
+        return inverse_sigmoid((points - self.low) / self.extent)
