@@ -132,7 +132,7 @@ def export_stack(
     """Write a reference stack as ONNX: drawn, of a checkpoint, or our driver.
 
     Args:
-        stack: ``vad-tiny``, ``tcp`` or ``highway``.
+        stack: ``vad-tiny``, ``uniad-tiny``, ``uniad-trt``, ``tcp`` or ``highway``.
         output: the file; its folder is made.
         options: None takes the defaults.
 

@@ -126,7 +126,7 @@ def record_frames(
 
     A run that was killed goes on after its last whole scene.
 
-    Of ``vad-tiny`` and ``tcp`` a synthetic world is drawn; for ``highway``, or any
+    Of the other stacks a synthetic world is drawn; for ``highway``, or any
     ONNX file that keeps the policy contract, the expert drives fresh routes of
     highway-env. With a log, recorded driving is laid out as either takes it.
 

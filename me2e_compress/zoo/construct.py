@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, cast
 
-from me2e_compress.zoo.stacks import TCP, UNIADS, Stack
+from me2e_compress.zoo.stacks import TCP, Stack
 
 if TYPE_CHECKING:
     from torch import nn
@@ -15,20 +15,12 @@ if TYPE_CHECKING:
 def construct(spec: Stack, sampling: "Sampling" = "operator") -> "nn.Module":
     """Build the module of a stack with its only heads; its weights mean nothing yet.
 
-    UniAD holds what its checkpoints do, of which the graph reads a part.
-
     Args:
         spec: Of `Stack.with_heads`.
         sampling: How features are sampled, of a stack that samples any.
     """
-    model: nn.Module
-    if spec.name in UNIADS:
-        from me2e_compress.zoo.uniad.config import CONFIGS
-        from me2e_compress.zoo.uniad.stack import UniadTiny
-
-        model = UniadTiny(CONFIGS[spec.name], sampling, dead=True)
-        return model.requires_grad_(False).eval()
     (heads,) = spec.heads
+    model: nn.Module
     if spec.name == TCP.name:
         from me2e_compress.zoo.tcp.stack import Tcp
 

@@ -85,7 +85,8 @@ class Stack:
             return self
         if heads not in self.heads:
             raise GraphError(
-                f"{self.name} has no heads {heads!r}: there is {', '.join(self.heads)}"
+                f"{self.name} has no heads {heads!r}: there is"
+                f" {', '.join(self.heads) or 'nothing to choose'}"
             )
         outputs = self.other_outputs.get(heads, self.outputs)
         return replace(self, outputs=outputs, heads={heads: self.heads[heads]})

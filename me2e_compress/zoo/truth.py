@@ -59,13 +59,26 @@ def record(
     return truth_of(find(stack).with_heads(heads), model, opset)
 
 
-def truth_of(spec: Stack, model: "nn.Module", opset: int = 17) -> Truth:
+def truth_of(
+    spec: Stack,
+    model: "nn.Module",
+    opset: int = 17,
+    *,
+    plain: onnx.ModelProto | None = None,
+) -> Truth:
     """Record what the trace of a module knows, as `record` does of a stack.
+
+    Args:
+        spec: Of the stack.
+        model: Its module.
+        opset: Of the exports.
+        plain: The export without marks, where there is one already.
 
     Raises:
         GraphError: The two exports differ in more than names.
     """
-    plain = trace(spec, model, opset)
+    if plain is None:
+        plain = trace(spec, model, opset)
     with listening(_push_scope):
         marked = trace(spec, model, opset)
     return Truth(_align(plain, marked), count_macs(spec, model))

@@ -44,7 +44,9 @@ Ema = Annotated[
 
 
 def export(
-    stack: Annotated[str, typer.Argument(help="vad-tiny, tcp or highway")],
+    stack: Annotated[
+        str, typer.Argument(help="vad-tiny, uniad-tiny, uniad-trt, tcp or highway")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the ONNX file")],
     opset: Opset = workflow.OPSET,
     heads: Heads = None,

@@ -14,7 +14,7 @@ from me2e_compress.workflows import frames as workflow
 Length = Annotated[
     int | None,
     typer.Option(
-        help=f"frames a scene; default {workflow.SCENE_LENGTH} for vad-tiny and tcp,"
+        help=f"frames a scene; default {workflow.SCENE_LENGTH} for a synthetic world,"
         f" else {workflow.DRIVEN_SCENE_LENGTH}, of a log all"
     ),
 ]
@@ -25,7 +25,10 @@ Log = Annotated[
 
 
 def frames(
-    stack: Annotated[str, typer.Argument(help="vad-tiny, tcp, highway or M.onnx")],
+    stack: Annotated[
+        str,
+        typer.Argument(help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway or M.onnx"),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     count: given.Count = 256,
     scene_length: Length = None,
@@ -39,7 +42,7 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    For vad-tiny and tcp a synthetic world is drawn; for highway, or any ONNX file that
+    For the other stacks a synthetic world is drawn; for highway, or any ONNX file that
     keeps the policy contract (--adapter), the expert drives fresh routes. With
     --from, recorded driving of nuScenes or Bench2Drive is laid out as either takes it.
     """

@@ -21,7 +21,7 @@ def inverse_sigmoid(x: Tensor) -> Tensor:
 
 
 def in_metres(raw: Tensor, at: Tensor, grid: BevGrid) -> Tensor:
-    """Return boxes [..., 10]: a raw regression with its refined centre (0..1) in metres."""
+    """Return boxes [..., 10]: raw ones whose refined centres (0..1) are in metres."""
     x0, y0, z0, x1, y1, z1 = grid.pc_range
     x = at[..., 0:1] * (x1 - x0) + x0
     y = at[..., 1:2] * (y1 - y0) + y0

@@ -8,12 +8,11 @@ from me2e_compress.zoo.bev.can_bus import CAN_BUS
 from me2e_compress.zoo.bev.neck import FeaturePyramid
 from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
 from me2e_compress.zoo.drawing import Gains, draw_weights, one_thread, take_statistics
-from me2e_compress.zoo.stacks import UNIAD_TRT, Stack
+from me2e_compress.zoo.stacks import Stack
 from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.uniad.config import (
     AGENT_MODES,
-    DL4AGX,
-    PUBLISHED,
+    CONFIGS,
 )
 from me2e_compress.zoo.uniad.motion import Agents, Forecasts
 from me2e_compress.zoo.uniad.perception import Motions
@@ -63,7 +62,7 @@ def build_uniad(
     dead: bool = False,
 ) -> UniadTiny:
     """Build and initialise; the same seed gives the same bytes."""
-    config = DL4AGX if spec.name == UNIAD_TRT.name else PUBLISHED
+    config = CONFIGS[spec.name]
     model = UniadTiny(config, sampling, dead=dead).requires_grad_(False).eval()
     (frame,) = frames(spec, 1, seed)
     step = STRIDE if len(config.hws) > 1 else 1
@@ -96,10 +95,8 @@ def initialise(
         levels = _normalised(model.img_neck, model.img_backbone(images))
         view = _view(model, levels, lidar2img)
         _balance_classes(model, view, beginning)
-        enlarged = model.enlarged(view)
-        take_statistics(
-            _Occupancy(model, torch.Generator().manual_seed(seed)), enlarged
-        )
+        noise = torch.Generator().manual_seed(seed)
+        take_statistics(_Occupancy(model, noise), model.enlarged(view))
 
 
 def _normalised(neck: FeaturePyramid, stages: list[Tensor]) -> list[Tensor]:

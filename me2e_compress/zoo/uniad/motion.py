@@ -210,7 +210,7 @@ class MotionHead(nn.Module):
         )
 
     def _goals(self, own: Tensor, offsets: Tensor, places: Tensor) -> Goals:
-        """Embed the last points of [A, 6, 12, 2] as an agent, the axes and the ego see it."""
+        """Embed the last points of [A, 6, 12, 2], seen in three ways."""
         return (
             self.agent_level_embedding_layer(self.sines(own[:, :, -1])),
             self.scene_level_offset_embedding_layer(self.sines(offsets[:, :, -1])),

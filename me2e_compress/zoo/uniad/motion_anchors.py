@@ -1,4 +1,4 @@
-"""Where the motion head begins: six ways to go on, seen from an agent and from the ego."""
+"""Where the motion head begins: six ways to go on, in the frame of an agent."""
 
 from typing import NamedTuple, Self
 
@@ -21,8 +21,8 @@ TINY = torch.tensor(1.0e-5)
 def anchors(groups: int) -> Tensor:
     """Return [groups, 6, 12, 2], metres, the agent's frame, y ahead.
 
-    The published anchors are k-means centres of the data set's trajectories; they are in
-    no checkpoint, and these six arcs a group stand for them.
+    The published anchors are k-means centres of the data set's trajectories; they are
+    in no checkpoint, and these six arcs a group stand for them.
     """
     seconds = torch.arange(1, AGENT_STEPS + 1) * STEP_S
     ways = []
@@ -53,7 +53,7 @@ class AgentFrames(NamedTuple):
         )
 
     def turned(self, points: Tensor) -> Tensor:
-        """Turn points [A, modes, steps, 2] of the agents' frames to the lidar's axes."""
+        """Turn points [A, modes, steps, 2] of the agents to the axes of the lidar."""
         x, y = points[..., 0], points[..., 1]
         return torch.stack(
             [self.cos * x - self.sin * y, self.sin * x + self.cos * y], -1

@@ -54,11 +54,11 @@ class UniadTiny(nn.Module):
 
     Hu et al. 2023, written from the published description, at the published dimensions
     and with the parameter names of the original. What differs is what a graph of fixed
-    shapes asks for: camera attention reads every camera for every cell and masks; tracks
-    stand in slots, of which the empty ones are masked (see `TrackLife`); all agents keep
-    their slot in motion and occupancy, where the original gathers those that it sees.
-    The host's: which earlier view is fed as the previous one, the threshold of occupancy
-    and the optimisation of the plan against it.
+    shapes asks for: camera attention reads every camera for every cell and masks;
+    tracks stand in slots, of which the empty ones are masked (see `TrackLife`); all
+    agents keep their slot in motion and occupancy, where the original gathers those
+    that it sees. The host's: which earlier view is fed as the previous one, the
+    threshold of occupancy and the optimisation of the plan against it.
 
     Args:
         config: Sizes.
@@ -124,12 +124,10 @@ class UniadTiny(nn.Module):
             prev_tracks: The fields of `Tracks`.
 
         Returns:
-            The answers to all that is remembered, then what `OUTPUTS` names.
+            The answers to all that is remembered, then the other outputs of the stack.
         """
-        before, tracks = (
-            Pose(prev_l2g_r_mat, prev_l2g_t, prev_timestamp),
-            Tracks(*prev_tracks),
-        )
+        before = Pose(prev_l2g_r_mat, prev_l2g_t, prev_timestamp)
+        tracks = Tracks(*prev_tracks)
         now = Pose(l2g_r_mat, l2g_t, timestamp)
         with region("backbone"):
             stages = self.img_backbone(img.flatten(0, 1))
@@ -240,16 +238,15 @@ class UniadTiny(nn.Module):
     ) -> Seen:
         """Return what the heads behind tracking read: slots, then the ego vehicle."""
         boxes, scores, labels = of_all
-        ego = self.config.queries - 1
+        behind = self.config.queries
+        ego = behind - 1
         score = scores[chosen]
         empty = (ids == 0) | (score < SLEEPS)
         label = labels[chosen]
         nothing = torch.zeros_like(label[:1])
         agents = Agents(
-            torch.cat([found.embeddings[chosen], found.embeddings[ego : ego + 1]])[
-                None
-            ],
-            torch.cat([boxes[chosen], boxes[ego : ego + 1]]),
+            torch.cat([found.embeddings[chosen], found.embeddings[ego:behind]])[None],
+            torch.cat([boxes[chosen], boxes[ego:behind]]),
             torch.cat([label, nothing]),
             torch.cat([empty, nothing > 0])[None],
         )

@@ -61,9 +61,9 @@ class Pose(NamedTuple):
 class TrackLife(nn.Module):
     """Decide which of the frame's queries are tracks, and give every track a slot.
 
-    Queries come new ones first, then slots. A track keeps its place before all that are
-    new; new ones take what is free in their order, and for those that find no slot there
-    is none.
+    Queries come new ones first, then slots. A track keeps its place before all that
+    are new; new ones take what is free in their order, and those that find no slot are
+    forgotten.
     """
 
     def __init__(self, config: UniadConfig) -> None:

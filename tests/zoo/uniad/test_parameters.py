@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from me2e_compress.modules import ModuleMap
+from me2e_compress.zoo.uniad.config import DL4AGX
 from me2e_compress.zoo.uniad.stack import UniadTiny
 
 PUBLISHED = {
@@ -48,3 +49,10 @@ def test_parameters_are_the_published_ones() -> None:
 def test_what_inference_never_reads_is_left_out(module: str | None) -> None:
     left = parameters(dead=False)[module]
     assert PUBLISHED[module] - left == NEVER_READ.get(module or "", 0)
+
+
+def test_dl4agx_holds_what_is_published() -> None:
+    with torch.device("meta"):
+        model = UniadTiny(DL4AGX, dead=True)
+    total = sum(parameter.numel() for parameter in model.parameters())
+    assert round(total / 1e6, 3) == 85.807
