@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -98,19 +98,23 @@ def _torch(given: argparse.Namespace) -> dict[str, object]:
         with torch.no_grad():
             outputs = model(*(torch.from_numpy(feed[name]) for name in spec.inputs))
         named = dict(zip(spec.outputs, (x.numpy() for x in outputs), strict=True))
-        np.savez(given.out / f"torch-{index}.npz", **named)
+        _save(given.out / f"torch-{index}.npz", named)
         state = {name: named[answer] for name, answer in spec.recurrent.items()}
-    return {"tracks": int((named["next_track_obj_idxes"] > 0).sum())}
+    return {"tracks": int((state["prev_track_obj_idxes"] > 0).sum())}
+
+
+def _save(path: Path, named: Mapping[str, np.ndarray]) -> None:
+    np.savez(path, allow_pickle=False, **named)
 
 
 def _onnxruntime(given: argparse.Namespace) -> dict[str, object]:
-    from me2e_compress.runtime.sessions import Session
+    from me2e_compress.runtime.session import Session
 
     spec = find(given.stack)
     session, state = Session(_model(given)), _nothing(spec)
     for index, frame in enumerate(_frames(spec, given.frames)):
         named = session.run({**frame, **state})
-        np.savez(given.out / f"onnxruntime-{index}.npz", **named)
+        _save(given.out / f"onnxruntime-{index}.npz", named)
         state = {name: named[answer] for name, answer in spec.recurrent.items()}
     return {}
 
@@ -125,7 +129,7 @@ def _truth(given: argparse.Namespace) -> dict[str, object]:
     graph = ir.load(_model(given))
     placed = assign(graph, ModuleMap.load("uniad"))
     hits = [
-        placed.module_of(node) == known.modules[node.name]
+        placed.module_of(node) == known.modules[node.name or ""]
         for node in graph.graph
         if node.name in known.modules
     ]

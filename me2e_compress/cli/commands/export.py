@@ -26,7 +26,7 @@ Seed = Annotated[
 
 Operators = Annotated[
     Literal["standard", "plugin"],
-    typer.Option(help="plugin: deformable attention of vad-tiny as one node"),
+    typer.Option(help="plugin: deformable attention (not of tcp) as one node"),
 ]
 DialectName = Annotated[
     str | None,

@@ -88,7 +88,8 @@ def initialise(
         beginning: Part of the queries that find something in what these cameras see.
     """
     draw_weights(model, GAINS, seed)
-    for parameter in model.pts_bbox_head.transformer.can_bus_mlp.norm.parameters():
+    norm = model.pts_bbox_head.transformer.can_bus_mlp.get_submodule("norm")
+    for parameter in norm.parameters():
         parameter.mul_(OWN_MOTION)
     with one_thread():
         take_statistics(model.img_backbone, images)
@@ -102,12 +103,12 @@ def initialise(
 def _normalised(neck: FeaturePyramid, stages: list[Tensor]) -> list[Tensor]:
     """Give every level unit deviation, channel by channel, and return the levels."""
     maps = [
-        _unit(conv.conv, stage)
+        _unit(conv, stage)
         for conv, stage in zip(neck.lateral_convs, stages, strict=True)
     ]
-    levels = [_unit(c.conv, m) for c, m in zip(neck.fpn_convs, maps, strict=False)]
+    levels = [_unit(conv, x) for conv, x in zip(neck.fpn_convs, maps, strict=False)]
     for convolution in neck.fpn_convs[len(maps) :]:
-        levels.append(_unit(convolution.conv, levels[-1]))
+        levels.append(_unit(convolution, levels[-1]))
     return levels
 
 
@@ -123,7 +124,8 @@ def _view(model: UniadTiny, levels: list[Tensor], lidar2img: Tensor) -> Tensor:
     return head.transformer.bev(right, *cells, Motions(lidar2img, *still))
 
 
-def _unit(convolution: nn.Conv2d, x: Tensor) -> Tensor:
+def _unit(module: nn.Module, x: Tensor) -> Tensor:
+    (convolution,) = (m for m in module.modules() if isinstance(m, nn.Conv2d))
     out = convolution(x)
     scale = out.std((0, 2, 3)).reciprocal()
     own = convolution.bias
@@ -145,7 +147,8 @@ def _balance_classes(model: UniadTiny, cells: Tensor, beginning: float) -> None:
     states, _, _ = decoder(content, pos, cells, at, head.reg_branches)
     for branch, state in zip(head.cls_branches, states, strict=True):
         best = branch(state).amax(2)
-        branch[-1].bias.add_(BEGINS.logit() - best.quantile(1 - beginning))
+        last = branch.get_submodule("6")
+        last.get_parameter("bias").add_(BEGINS.logit() - best.quantile(1 - beginning))
 
 
 class _Occupancy(nn.Module):

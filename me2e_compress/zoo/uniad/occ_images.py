@@ -129,7 +129,7 @@ class DecoderBlock(nn.Module):
     def __init__(self, hw: Size, *, last: bool) -> None:
         super().__init__()
         half = EMBED // 2
-        self.size = [2 * n for n in hw]
+        self.size = (2 * hw[0], 2 * hw[1])
         self.last = last
         self.conv = nn.Sequential(
             nn.Upsample(size=self.size, mode="bilinear", align_corners=True),
