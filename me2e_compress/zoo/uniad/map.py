@@ -6,122 +6,20 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.bev.attention import (
-    HEAD_SCALE,
     DecoderAttention,
     FeedForward,
     MultiheadAttention,
 )
 from me2e_compress.zoo.bev.decoder import inverse_sigmoid
-from me2e_compress.zoo.bev.sizes import ATTENTION_HEADS, EMBED, Sampling
+from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.uniad.config import UniadConfig
 from me2e_compress.zoo.uniad.layers import mlp
+from me2e_compress.zoo.uniad.map_masks import MaskHead
 from me2e_compress.zoo.uniad.positions import CellSines
 
 THING_BLOCKS, STUFF_BLOCKS = 4, 6
-MASK_FEED_FORWARD = 1024
 LEVEL_EMBEDDINGS = 4
 """Of which the first alone is read."""
-
-
-class MaskAttention(nn.Module):
-    """Queries attend to cells, and a mask is read off the attention."""
-
-    def __init__(self, *, tail: bool = False) -> None:
-        super().__init__()
-        self.q = nn.Linear(EMBED, EMBED)
-        self.k = nn.Linear(EMBED, EMBED)
-        self.tail = tail
-        if not tail:
-            self.v = nn.Linear(EMBED, EMBED)
-            self.proj = nn.Linear(EMBED, EMBED)
-        heads = ATTENTION_HEADS
-        self.linear_l1 = nn.Sequential(nn.Linear(heads, heads), nn.ReLU())
-        self.linear = nn.Sequential(nn.Linear(heads, 1), nn.ReLU())
-
-    def forward(
-        self, query: Tensor, key: Tensor, value: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256] and masks [1, Q, K].
-
-        The last layer, the tail, gives its query back as it is.
-        """
-        q, k = _heads(self.q(query)), _heads(self.k(key))
-        logits = torch.matmul(q, k.transpose(-2, -1)) * HEAD_SCALE
-        mask = self.linear(self.linear_l1(logits.permute(0, 2, 3, 1))).squeeze(-1)
-        if self.tail:
-            return query, mask
-        mixed = torch.matmul(logits.softmax(-1), _heads(self.v(value)))
-        return self.proj(mixed.transpose(1, 2).flatten(2)), mask
-
-
-def _heads(x: Tensor) -> Tensor:
-    return x.unflatten(2, (ATTENTION_HEADS, -1)).transpose(1, 2)
-
-
-class SelfAttention(nn.Module):
-    """Attention of the queries to each other (the published background head)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.qkv = nn.Linear(EMBED, 3 * EMBED)
-        self.proj = nn.Linear(EMBED, EMBED)
-
-
-class GeluFeedForward(nn.Module):
-    """Linear, GELU, linear."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(EMBED, MASK_FEED_FORWARD)
-        self.act = nn.GELU()
-        self.fc2 = nn.Linear(MASK_FEED_FORWARD, EMBED)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [..., 256] to [..., 256]."""
-        out: Tensor = self.fc2(self.act(self.fc1(x)))
-        return out
-
-
-class MaskBlock(nn.Module):
-    """`MaskAttention` and `GeluFeedForward`, normalised after each."""
-
-    def __init__(self, *, self_attention: bool) -> None:
-        super().__init__()
-        self.head_norm1 = nn.LayerNorm(EMBED, eps=1e-6)
-        self.attn = MaskAttention()
-        self.head_norm2 = nn.LayerNorm(EMBED, eps=1e-6)
-        self.mlp = GeluFeedForward()
-        if self_attention:
-            self.self_attention = SelfAttention()
-            self.norm3 = nn.LayerNorm(EMBED, eps=1e-6)
-
-    def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Map [1, Q, 256] and cells [1, K, 256] to [1, Q, 256]."""
-        attended, _ = self.attn(query, key, value)
-        query = self.head_norm1(query + attended)
-        out: Tensor = self.head_norm2(query + self.mlp(query))
-        return out
-
-
-class MaskHead(nn.Module):
-    """Queries to masks over the cells."""
-
-    def __init__(self, blocks: int, *, self_attention: bool = False) -> None:
-        super().__init__()
-        self.blocks = nn.ModuleList(
-            MaskBlock(self_attention=self_attention) for _ in range(blocks)
-        )
-        self.attnen = MaskAttention(tail=True)
-
-    def forward(
-        self, query: Tensor, query_pos: Tensor, cells: Tensor, cells_pos: Tensor
-    ) -> Tensor:
-        """Map [1, Q, 256] and cells [1, K, 256] to masks [1, Q, K]."""
-        key = cells + cells_pos
-        for block in self.blocks:
-            query = block(query + query_pos, key, cells)
-        mask: Tensor = self.attnen(query + query_pos, key, cells)[1]
-        return mask
 
 
 class CellLayer(nn.Module):
@@ -149,6 +47,12 @@ class CellEncoder(nn.Module):
             CellLayer(config.head_hw, sampling, levels)
             for _ in range(config.decoder_layers)
         )
+
+    def forward(self, cells: Tensor, pos: Tensor, at: Tensor) -> Tensor:
+        """Map [1, cells, 256] to the same; ``at`` are their places, 0..1."""
+        for layer in self.layers:
+            cells = layer(cells, pos, at)
+        return cells
 
 
 class LaneLayer(nn.Module):
@@ -180,6 +84,30 @@ class LaneDecoder(nn.Module):
             LaneLayer(config.head_hw, sampling, levels, boxes=layer > 0)
             for layer in range(config.decoder_layers)
         )
+
+    def forward(
+        self,
+        lanes: tuple[Tensor, Tensor],
+        cells: Tensor,
+        at: Tensor,
+        branches: nn.ModuleList,
+    ) -> tuple[Tensor, Tensor]:
+        """Refine lanes: content and position, [1, lanes, 256], at points 0..1.
+
+        Returns:
+            Queries [1, lanes, 256] and boxes [1, lanes, 4] (cx, cy, w, h, 0..1).
+        """
+        query, pos = lanes
+        layers = zip(self.layers, branches, strict=True)
+        for number, (layer, branch) in enumerate(layers):
+            query = layer(query, pos, cells, at)
+            moved = branch(query)
+            centre = moved[..., :2] + inverse_sigmoid(at[..., :2])
+            size = moved[..., 2:]
+            if number > 0:  # until then there are points, not boxes
+                size = size + inverse_sigmoid(at[..., 2:])
+            at = torch.cat([centre, size], -1).sigmoid()
+        return query, at
 
 
 class MapTransformer(nn.Module):
@@ -217,19 +145,10 @@ class MapTransformer(nn.Module):
             (cx, cy, w, h, 0..1).
         """
         pos = pos + self.level_embeds[0]
-        for layer in self.encoder.layers:
-            cells = layer(cells, pos, self.places)
+        cells = self.encoder(cells, pos, self.places)
         lane_pos, query = lanes.unsqueeze(0).chunk(2, 2)
         at = self.reference_points(lane_pos).sigmoid()
-        layers = zip(self.decoder.layers, branches, strict=True)
-        for number, (layer, branch) in enumerate(layers):
-            query = layer(query, lane_pos, cells, at)
-            moved = branch(query)
-            centre = moved[..., :2] + inverse_sigmoid(at[..., :2])
-            size = moved[..., 2:]
-            if number > 0:  # until then there are points, not boxes
-                size = size + inverse_sigmoid(at[..., 2:])
-            at = torch.cat([centre, size], -1).sigmoid()
+        query, at = self.decoder((query, lane_pos), cells, at, branches)
         return cells, query, at
 
 

@@ -82,6 +82,13 @@ class StateDecoder(nn.Module):
         self.layers = nn.ModuleList(StateLayer() for _ in range(FUTURES))
         self.post_norm = nn.LayerNorm(EMBED)
 
+    def forward(
+        self, step: int, x: Tensor, instances: Tensor, ignore: Tensor
+    ) -> Tensor:
+        """Apply the layer of a step; see `StateLayer`."""
+        out: Tensor = self.layers[step](x, instances, ignore)
+        return out
+
 
 class Layered(nn.Module):
     """Linear layers with ReLUs between them, under their published names."""
@@ -181,6 +188,6 @@ class OccHead(nn.Module):
         mine = mine & torch.logical_not(hidden).unsqueeze(1)
         ignore = torch.logical_not(mine) & mine.any(2, keepdim=True)
         ignore = ignore | hidden.unsqueeze(1)
-        cells = self.transformer_decoder.layers[step](cells, asked, ignore)
+        cells = self.transformer_decoder(step, cells, asked, ignore)
         image = cells.transpose(1, 2).unflatten(2, self.small_hw)
         return self.upsample_adds[step](image, state), embedding

@@ -35,7 +35,8 @@ class CellSines(nn.Module):
         self.hw = hw
         for name, count in (("rows", hw[0]), ("columns", hw[1])):
             at = (torch.arange(count) + 0.5) / count * (2 * math.pi)
-            self.register_buffer(name, _waves(at, _divisors()), False)
+            # saved, as else the tracer would write what comes of them, 41 MB twice
+            self.register_buffer(name, _waves(at, _divisors()))
 
     rows: Tensor
     columns: Tensor

@@ -47,6 +47,7 @@ class Seen(NamedTuple):
     agents: Agents
     boxes: Tensor  # [slots, 10], metres
     scores: Tensor  # [slots], 0 in empty slots
+    labels: Tensor  # [slots] int64
 
 
 class UniadTiny(nn.Module):
@@ -163,7 +164,7 @@ class UniadTiny(nn.Module):
             found.boxes,
             seen.boxes,
             seen.scores,
-            seen.agents.labels[:-1],
+            seen.labels,
             lanes.query,
             lanes.scores,
             lanes.boxes,
@@ -251,4 +252,4 @@ class UniadTiny(nn.Module):
             torch.cat([empty, nothing > 0])[None],
         )
         there = (ids > 0).to(score.dtype)
-        return Seen(agents, boxes[chosen], score * there)
+        return Seen(agents, boxes[chosen], score * there, label)
