@@ -42,7 +42,7 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    For the other stacks a synthetic world is drawn; for highway, or any ONNX file that
+    A synthetic world is drawn for stacks; for highway, or any ONNX file that
     keeps the policy contract (--adapter), the expert drives fresh routes. With
     --from, recorded driving of nuScenes or Bench2Drive is laid out as either takes it.
     """
