@@ -61,7 +61,8 @@ def _measured(run: Callable[[], dict[str, object]]) -> None:
 
 def _model(given: argparse.Namespace) -> Path:
     form = "plugin" if given.plugin else "standard"
-    return given.out / f"{given.stack}-{given.opset}-{form}.onnx"
+    out: Path = given.out
+    return out / f"{given.stack}-{given.opset}-{form}.onnx"
 
 
 def _export(given: argparse.Namespace) -> dict[str, object]:

@@ -205,7 +205,8 @@ class DecoderAttention(nn.Module):
         if self.held == 1:
             return projected
         parts = projected.unflatten(2, (ATTENTION_HEADS, self.held, -1))
-        return parts[:, :, :, 0].flatten(2)
+        first: Tensor = parts[:, :, :, 0].flatten(2)
+        return first
 
     def _locations(self, at: Tensor, offsets: Tensor) -> Tensor:
         """Add offsets, in cells around points and in parts of a half around boxes."""

@@ -41,7 +41,8 @@ class MaskAttention(nn.Module):
 
 
 def _heads(x: Tensor) -> Tensor:
-    return x.unflatten(2, (ATTENTION_HEADS, -1)).transpose(1, 2)
+    heads: Tensor = x.unflatten(2, (ATTENTION_HEADS, -1)).transpose(1, 2)
+    return heads
 
 
 class SelfAttention(nn.Module):

@@ -67,7 +67,8 @@ class GoalAttention(nn.Module):
             self.sampling,
         )
         joined = read.unflatten(1, (-1, steps)).flatten(2)
-        return query + self.output_proj(joined)
+        out: Tensor = query + self.output_proj(joined)
+        return out
 
 
 class GoalLayer(nn.Module):

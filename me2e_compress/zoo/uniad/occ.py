@@ -175,7 +175,8 @@ class OccHead(nn.Module):
         taken = torch.matmul(masks, dense).sigmoid()
         weight = scores * torch.logical_not(hidden[0]).to(scores.dtype)
         taken = (taken * weight.view(1, -1, 1)).amax(1)
-        return taken.unflatten(1, self.hw).unsqueeze(0)
+        cells: Tensor = taken.unflatten(1, self.hw).unsqueeze(0)
+        return cells
 
     def _step(
         self, step: int, state: Tensor, asked: Tensor, hidden: Tensor
