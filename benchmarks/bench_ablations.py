@@ -3,10 +3,10 @@
     python -m benchmarks.bench_ablations OUT
     python -m benchmarks.bench_ablations OUT --stacks uniad-tiny,vad-tiny,highway
 
-Exports each stack into OUT unless it is there, and runs every recipe of its schemes
-from file to file. Parameters, MACs, nodes and bytes are held against what the recipe
-``exact`` makes of the same file, so that they are the ablation's alone; parameters are
-also held against the ledger of the published stacks. The driver ``highway`` has no
+Exports each stack into OUT unless it is there, and runs every recipe of its schemes.
+Parameters, MACs, nodes and bytes of weights are held against what the recipe ``exact``
+makes of the same file, so that they are the ablation's alone; parameters are also held
+against the ledger of the published stacks. The driver ``highway`` has no
 published ablations: its rows stand beside UniAD's of the same modules.
 """
 
@@ -16,15 +16,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import onnx_ir as ir
+
+from me2e_compress import graph, recipe
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError
+from me2e_compress.manager import PassManager
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context, Pass
 from me2e_compress.study.paper.published import (
     MODULES_AWAY,
     MODULES_AWAY_OF_VAD,
     PublishedDrive,
 )
-from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.export import export_stack
-from me2e_compress.workflows.inspect import inspect
+from me2e_compress.workflows.inspect import weigh
 from me2e_compress.zoo.shipped import sample_frames
 
 LEDGER_M = {
@@ -36,6 +42,8 @@ LEDGER_M = {
 }
 """Millions of parameters by the published sizes of the modules, what inference never
 reads left out; of those schemes whose modules do not lie in each other."""
+COMMON = 2
+"""Passes that every recipe begins with: import and folding."""
 HEAD = """\
 | stack | recipe | M parameters less | by the ledger | GMACs less | of all \
 | nodes less | MB less | the paper's scheme | its FPS | its J a frame |
@@ -114,34 +122,37 @@ def rows(name: str, out: Path) -> Iterable[str]:
     stack, source = STACKS[name], out / f"{name}.onnx"
     if not source.is_file():
         export_stack(name, source)
-    whole = made(source, "exact", stack.preset, out)
-    for number, (recipe, modules) in enumerate(stack.recipes.items(), 1):
-        left = made(source, recipe, stack.preset, out)
-        scheme = recipe.removeprefix("uniad-scheme-").removeprefix("vad-scheme-")
+    frames = sample_frames(source)
+    recording = None if frames is None else CalibrationSet(frames)
+    context = Context(ModuleMap.load(stack.preset), recording)
+    folded = run(graph.load(source), recipe.load("exact")[:COMMON], context)
+    whole = made(folded, "exact", context)
+    for number, (chosen, modules) in enumerate(stack.recipes.items(), 1):
+        left = made(folded, chosen, context)
+        scheme = chosen.removeprefix("uniad-scheme-").removeprefix("vad-scheme-")
         label = f"({scheme})" if scheme.isdigit() else f"({number}) of UniAD"
         cells = (
-            *(name, f"`{recipe}`"),
-            *against(whole, left, LEDGER_M.get(recipe)),
+            *(name, f"`{chosen}`"),
+            *against(whole, left, LEDGER_M.get(chosen)),
             label,
             *beside(stack.paper["float"], stack.paper[modules]),
         )
         yield f"| {' | '.join(cells)} |"
 
 
-def made(source: Path, recipe: str, preset: str, out: Path) -> Weight:
-    """Run a recipe from file to file and weigh what it made."""
-    target = out / f"{source.stem}.{recipe}.onnx"
-    frames = sample_frames(source)
-    options = CompressOptions(
-        module_map=preset, verify_frames=0, measure_frames=0, force=True
-    )
-    compress(source, target, recipe, frames, options)
-    found = inspect(target, preset)
+def run(model: ir.Model, passes: tuple[Pass, ...], context: Context) -> ir.Model:
+    return PassManager(passes, verify_frames=0).run(model, context).model
+
+
+def made(folded: ir.Model, name: str, context: Context) -> Weight:
+    """Run the rest of a recipe and weigh what it made."""
+    model = run(folded.clone(), recipe.load(name)[COMMON:], context)
+    found = weigh(model, context.modules)
     return Weight(
-        sum(each.parameters for each in found.modules),
-        found.macs or 0,
-        sum(each.nodes for each in found.modules),
-        found.file_bytes,
+        sum(each.parameters for each in found),
+        sum(each.macs or 0 for each in found),
+        sum(each.nodes for each in found),
+        sum(each.weight_bytes for each in found),
     )
 
 

@@ -49,7 +49,7 @@ def write_inline(model: ir.Model, path: Path) -> None:
     begins, lengths = list[bytes](), list[int]()
     for each in proto.graph.initializer:
         held = of_name.get(each.name)
-        begin = each.SerializeToString() if held is None else _begin(held)
+        begin = each.SerializeToString() if held is None else _begin(each.name, held)
         begins.append(begin)
         lengths.append(len(begin) + (0 if held is None else held.nbytes))
     total = sum(1 + len(_varint(length)) + length for length in lengths)
@@ -93,12 +93,12 @@ def _light(
             value.const_value = tensor
 
 
-def _begin(tensor: ir.TensorProtocol) -> bytes:
-    """Return all of a tensor's message but the numbers."""
+def _begin(name: str, tensor: ir.TensorProtocol) -> bytes:
+    """Return all of a tensor's message but the numbers; its name is the value's."""
     begin = onnx.TensorProto(
         dims=[int(size) for size in tensor.shape.numpy()],
         data_type=tensor.dtype.value,
-        name=tensor.name,
+        name=name,
     )
     return bytes(begin.SerializeToString()) + _RAW_DATA + _varint(tensor.nbytes)
 

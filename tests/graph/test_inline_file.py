@@ -26,6 +26,11 @@ def full() -> ir.Model:
         model.graph.register_initializer(value)
     words = ir.StringTensor([b"one", b"another"], shape=ir.Shape([2]))
     model.graph.register_initializer(ir.Value(name="words", const_value=words))
+    for name, known in (("nameless", None), ("renamed", "before")):
+        held = ir.tensor(np.arange(12, dtype=np.float32), name=known)
+        value = ir.Value(name=name, const_value=held)
+        model.graph.register_initializer(value)
+        held.name = known
     noted = ir.tensor(random.normal(size=(4, 4)).astype("f"), doc_string="noted")
     model.graph.register_initializer(ir.Value(name="noted", const_value=noted))
     return model
@@ -38,13 +43,13 @@ def test_the_bytes_are_those_of_onnx(
 ) -> None:
     monkeypatch.setattr(inline_file, "LARGE_BYTES", limit)
     model = full()
-    onnx.save(ir.to_proto(model), tmp_path / "theirs.onnx")
     if loaded:
-        model = ir.load(tmp_path / "theirs.onnx")
-        onnx.save(ir.to_proto(model), tmp_path / "theirs.onnx")
+        onnx.save(ir.to_proto(model), tmp_path / "first.onnx")
+        model = ir.load(tmp_path / "first.onnx")
 
     write_inline(model, tmp_path / "ours.onnx")
 
+    onnx.save(ir.to_proto(model), tmp_path / "theirs.onnx")  # last: it names tensors
     theirs = (tmp_path / "theirs.onnx").read_bytes()
     assert (tmp_path / "ours.onnx").read_bytes() == theirs
 
