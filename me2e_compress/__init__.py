@@ -42,6 +42,10 @@ if TYPE_CHECKING:
     from me2e_compress.workflows.frames import FramesOptions, record_frames
     from me2e_compress.workflows.inspect import inspect
     from me2e_compress.workflows.inspect_result import InspectResult
+    from me2e_compress.workflows.inspect_stack import (
+        StackInspectResult,
+        inspect_stack,
+    )
     from me2e_compress.workflows.lint import LintOptions, LintResult, lint
     from me2e_compress.workflows.listener import Listener
     from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
@@ -95,6 +99,7 @@ __all__ = [
     "SensitivityResult",
     "StackCalibrateResult",
     "StackCompressResult",
+    "StackInspectResult",
     "Step",
     "StudyResult",
     "Verification",
@@ -109,6 +114,7 @@ __all__ = [
     "evaluate",
     "graph",
     "inspect",
+    "inspect_stack",
     "lint",
     "load_study",
     "measure_sensitivity",
@@ -159,6 +165,7 @@ _ROOMS = {
     "workflows.frames": ("FramesOptions", "record_frames"),
     "workflows.inspect": ("inspect",),
     "workflows.inspect_result": ("InspectResult",),
+    "workflows.inspect_stack": ("StackInspectResult", "inspect_stack"),
     "workflows.lint": ("LintOptions", "LintResult", "lint"),
     "workflows.listener": ("Listener",),
     "workflows.plan": ("PlanOptions", "PlanResult", "plan"),

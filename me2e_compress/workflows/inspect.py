@@ -76,7 +76,27 @@ def inspect(
     if frames is not None:
         taken = _timed(path, module_map, frames, listener)
     loaded = graph.load(path)
-    modules = load_map(module_map, loaded)
+    return inspected(path, loaded, load_map(module_map, loaded), dims, process, taken)
+
+
+def inspected(
+    path: Path,
+    loaded: ir.Model,
+    modules: ModuleMap,
+    dims: Mapping[str, int] | None = None,
+    process: str | None = None,
+    taken: LatencyTrace | None = None,
+) -> InspectResult:
+    """Weigh the modules of a graph; the arguments are those of :func:`inspect`.
+
+    Args:
+        path: the file of the graph.
+        loaded: the graph.
+        modules: its map.
+        dims: sizes of open dimensions.
+        process: that energy is modelled for.
+        taken: latencies by module.
+    """
     if dims:
         loaded = FixShapes(dims).run(loaded, Context(modules)).model
     placed = assign(loaded, modules)

@@ -11,7 +11,7 @@ from me2e_compress.workflows import compare as workflow
 
 
 def compare(
-    reference: Annotated[str, typer.Argument(help="the graph to be true to")],
+    reference: Annotated[str, typer.Argument(help="graph or stack to be true to")],
     candidate: Annotated[str, typer.Argument(help="the graph that is judged")],
     frames: given.Recording,
     as_it_stands: Annotated[

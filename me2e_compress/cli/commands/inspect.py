@@ -7,12 +7,14 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.runtime.stack.split_stack import is_stack
 from me2e_compress.workflows import inspect as workflow
 from me2e_compress.workflows.checks import sizes
+from me2e_compress.workflows.inspect_stack import inspect_stack
 
 
 def inspect(
-    model: given.Model,
+    model: given.AnyModel,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
     modelled_energy: Annotated[
@@ -32,7 +34,6 @@ def inspect(
     """
     dims = sizes(set_dim or ())
     with listening() as listener:
-        found = workflow.inspect(
-            *(model, module_map, dims, modelled_energy, trace, frames, listener)
-        )
+        do = inspect_stack if is_stack(model) else workflow.inspect
+        found = do(*(model, module_map, dims, modelled_energy, trace, frames, listener))
     show(found, as_json)
