@@ -5,10 +5,12 @@ import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.zoo.stacks import TCP, VAD_TINY
 from tests.evaluators.highway.drivers import straight_on
@@ -69,6 +71,19 @@ def test_vad_tiny_is_fed_as_nuscenes_feeds_it(tmp_path: Path) -> None:
     assert norm is not None
     assert (norm.mean, norm.std) == (VAD_TINY.image.mean, VAD_TINY.image.std)
     assert policy.inputs.images["img"].indices == (0, 2, 1, 3, 4, 5)
+
+
+def test_uniad_tiny_is_told_where_its_lidar_is(tmp_path: Path) -> None:
+    ports = """float[1, 6, 3, 928, 1600] img, float[1, 6, 4, 4] lidar2img,
+        float[18] can_bus, int64[1] command, float[1, 3, 3] l2g_r_mat,
+        float[1, 3] l2g_t, float[1] timestamp"""
+    session = Session(straight_on(tmp_path / "m.onnx", inputs=ports), threads=1)
+
+    adapter = Adapter.load(adapter_file(Path("uniad-tiny")))
+    inputs = ModelInputs.of(session, adapter, {})
+
+    assert inputs.image_size == (900, 1600)
+    assert set(inputs.given) == set(session.inputs) - {"img"}
 
 
 @pytest.mark.parametrize("name", shipped_adapters())
