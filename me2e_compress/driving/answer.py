@@ -1,6 +1,7 @@
 """What a policy may answer, checked and in one form."""
 
 import numpy as np
+import numpy.typing as npt
 
 from me2e_compress.driving.contract import (
     PLAN_SHAPE,
@@ -43,7 +44,7 @@ def timed(plan: Plan | Trajectory) -> Trajectory:
     return plan if isinstance(plan, Trajectory) else Trajectory(plan, PLAN_TIMES_S)
 
 
-def six_waypoints(answer: object) -> Plan:
+def six_waypoints(answer: object) -> npt.NDArray[np.float64]:
     """Return a plan as six waypoints every 0.5 s, others read off between its own.
 
     Raises:
@@ -53,7 +54,7 @@ def six_waypoints(answer: object) -> Plan:
     if isinstance(found, PedalsAndWheel):
         raise EvaluationError("the policy answers controls: there is no plan")
     if np.array_equal(found.times_s, PLAN_TIMES_S):
-        return found.points
+        return np.asarray(found.points, np.float64)
     return found.at(PLAN_TIMES_S)
 
 

@@ -54,7 +54,8 @@ class HostStage(abc.ABC):
         """Return the plan that drives.
 
         Args:
-            plan: [6, 2], of the network, metres in the ego frame.
+            plan: [6, 2], of the network, metres in the ego frame; one of other times
+                is read off at these.
             outputs: Of the network, by name.
 
         Raises:

@@ -4,12 +4,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-import numpy as np
-
 from me2e_compress.driving.adapter import Adapter, ImageNormalization
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import ModelOutputs
 from me2e_compress.driving.adapter.recurrent import FirstValues, answers_by_input
+from me2e_compress.driving.answer import PLAN_TIMES_S, six_waypoints
 from me2e_compress.driving.contract import Answer, Observation, RouteInfo, Trajectory
 from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.driving.ports import fits
@@ -151,9 +150,10 @@ class OnnxPolicy:
     def _changed(
         self, plan: Trajectory, stage: HostStage, outputs: dict[str, Array]
     ) -> Trajectory:
-        work = stage.work(np.asarray(plan.points, np.float64), outputs)
+        """Let the host change the plan, as six waypoints every 0.5 s."""
+        work = stage.work(six_waypoints(plan), outputs)
         self.host_iterations, self.host_cells = work.iterations, work.cells
-        return Trajectory(work.plan, plan.times_s)
+        return Trajectory(work.plan, PLAN_TIMES_S)
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
         """Lay an observation out as the graph takes it, recurrent inputs left out.

@@ -21,6 +21,7 @@ __all__ = [
     "Driver",
     "SizedPolicy",
     "driver_named",
+    "opened",
 ]
 
 
@@ -93,6 +94,7 @@ MODEL = "onnx"
 PYTHON = "python"
 """The policy that ``package.module:function`` means."""
 
+_MEMBERS = ("needs_images", "privileged", "reset", "plan")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
@@ -111,7 +113,13 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
         MissingExtraError: The package that it needs is not installed.
     """
     if name_in(text) in POLICIES.names():
-        driver = POLICIES.parse(text).resolved()
+        driver = POLICIES.parse(text)
+        if not isinstance(driver, Driver):
+            raise EvaluationError(
+                f"policy {name_in(text)!r} is a {type(driver).__name__}, which is no"
+                " Driver: derive it from me2e_compress.driving.policies.Driver"
+            )
+        driver = driver.resolved()
     elif _FACTORY.fullmatch(text) and not Path(text).exists():
         driver = POLICIES.build(PYTHON, {"factory": text})
     else:
@@ -119,6 +127,21 @@ def driver_named(text: str, adapter: Path | None = None) -> Driver:
     if adapter is None or "adapter" not in type(driver).__dataclass_fields__:
         return driver
     return POLICIES.with_options(driver, {"adapter": adapter})
+
+
+def opened(driver: Driver) -> Policy:
+    """Open a driver's policy, and look that it is one.
+
+    Raises:
+        EvaluationError: It cannot be opened, or lacks a member of `Policy`.
+    """
+    policy = driver.open()
+    if lacks := [member for member in _MEMBERS if not hasattr(policy, member)]:
+        raise EvaluationError(
+            f"policy {driver.label}: a {type(policy).__name__} is no policy: it has no"
+            f" {', '.join(lacks)}"
+        )
+    return policy
 
 
 def _sha256(path: Path) -> str:

@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import ClassVar, cast
 
 from me2e_compress.driving.contract import Policy
-from me2e_compress.driving.policies import POLICIES, Driver
+from me2e_compress.driving.policies import POLICIES, Driver, opened
 from me2e_compress.errors import EvaluationError
-
-MEMBERS = ("needs_images", "privileged", "reset", "plan")
-"""Of `Policy`."""
 
 _FACTORY = re.compile(r"(?P<module>[A-Za-z_][\w.]*):(?P<name>[A-Za-z_]\w*)")
 
@@ -45,8 +42,8 @@ class PythonDriver(Driver):
         """Import the module and make the policy.
 
         Raises:
-            EvaluationError: It cannot be imported, has no such function, the function
-                raises, or what it returns is no policy.
+            EvaluationError: It cannot be imported, has no such function, or that
+                raises.
         """
         module, name = self.factory.split(":")
         _look_here()
@@ -55,18 +52,12 @@ class PythonDriver(Driver):
             if not callable(make):
                 raise EvaluationError(f"{module} has no function {name}")
             made = make()
-            policy = made.open() if isinstance(made, Driver) else made
+            return opened(made) if isinstance(made, Driver) else cast("Policy", made)
         except Exception as error:  # whatever code of theirs may raise: chained
             words = " ".join(str(error).split())
             if not isinstance(error, EvaluationError):
                 words = f"{type(error).__name__}: {words}"
             raise EvaluationError(f"policy {self.factory}: {words}") from error
-        if lacks := [member for member in MEMBERS if not hasattr(policy, member)]:
-            raise EvaluationError(
-                f"policy {self.factory}: a {type(policy).__name__} is no policy: it has"
-                f" no {', '.join(lacks)}"
-            )
-        return cast("Policy", policy)
 
     @property
     def label(self) -> str:

@@ -8,6 +8,7 @@ from me2e_compress.driving.adapter.input_uses import input_uses
 from me2e_compress.driving.adapter.output_uses import OutputUses
 from me2e_compress.driving.adapter.port_use import PortUse
 from me2e_compress.driving.onnx_policy import OnnxPolicy, recurrent_of
+from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.any_session import AnySession
@@ -118,7 +119,7 @@ def check_model(
     named = str(policy)
     driver = driver_of(named, adapter, provider)
     if not isinstance(driver, OnnxDriver):
-        driver.open()
+        opened(driver)
         return ModelCheck(named, "what its code answers", (), (), ())
     try_file(driver.path, listener, provider)
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)

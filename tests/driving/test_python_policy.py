@@ -2,16 +2,20 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
-from me2e_compress.driving.policies import driver_named
+from me2e_compress.driving.contract import Policy
+from me2e_compress.driving.policies import Driver, driver_named, opened
 from me2e_compress.driving.python_policy import PythonDriver
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
 from me2e_compress.testing import check_policy
+from tests.installed import install
 
 Write = Callable[[str], str]
 
@@ -97,9 +101,41 @@ def test_what_makes_no_policy_is_one_line(
     module = write(text)
 
     with pytest.raises(EvaluationError, match=message) as caught:
-        driver_named(f"{module}:make").open()
+        opened(driver_named(f"{module}:make"))
     assert str(caught.value).startswith(f"policy {module}:make: ")
     assert "\n" not in str(caught.value)
+
+
+@dataclass(frozen=True)
+class Undrivable:
+    """Has a name, and is no driver."""
+
+    name: ClassVar[str] = "undrivable"
+
+
+def test_an_entry_point_that_is_no_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = {"undrivable": f"{__name__}:Undrivable"}
+    install(monkeypatch, tmp_path, "a-policy", "me2e_compress.policies", entry)
+
+    with pytest.raises(EvaluationError, match="a Undrivable, which is no Driver"):
+        driver_named("undrivable")
+
+
+@dataclass(frozen=True)
+class Empty(Driver):
+    """Opens nothing that drives."""
+
+    name: ClassVar[str] = "empty"
+
+    def open(self) -> Policy:
+        return object()  # type: ignore[return-value]
+
+
+def test_a_driver_that_opens_no_policy() -> None:
+    with pytest.raises(EvaluationError, match="empty: a object is no policy: it has"):
+        opened(Empty())
 
 
 def test_no_such_module() -> None:

@@ -8,7 +8,7 @@ from typing import ClassVar
 from pydantic import TypeAdapter, ValidationError
 
 from me2e_compress.driving.latency import parse_latency
-from me2e_compress.driving.policies import Driver, driver_named
+from me2e_compress.driving.policies import Driver, driver_named, opened
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import (
     Conditions,
@@ -102,7 +102,7 @@ class HighwayEvaluation:
         conditions = Conditions(
             latency,
             step_us(self.dt_ms),
-            image_size_of(driver.open()),
+            image_size_of(opened(driver)),
             weather_of(self.weather),
             latency_model_named(self.latency_model),
         )

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
+from me2e_compress.driving.policies import opened
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.durations import longest_first
 from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
@@ -81,7 +82,7 @@ class HighwayEvaluator:
         """
         if not routes:
             raise EvaluationError("there is no route to drive")
-        self.job.driver.open()
+        opened(self.job.driver)
         made_by = fingerprint(self.job, self.routes, self.set_size)
         folder = ResultsFolder.create(self.folder, made_by)
         done = folder.episodes()

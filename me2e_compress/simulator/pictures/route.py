@@ -37,7 +37,8 @@ class Moment:
     Attributes:
         scene: Everything there was.
         images: The six cameras, uint8 [6, H, W, 3] RGB; None if not rendered.
-        plan: [6, 2] metres in the ego frame: the plan in force; None before the first.
+        plan: [n, 2] metres in the ego frame: the plan in force; None before the first,
+            and of a policy that answers controls.
         events: Events, at least since the moment before; a repeated event is drawn
             once.
         score: Driving score so far, 0 to 100; None if not computed.

@@ -89,7 +89,7 @@ class BirdsEye:
         Args:
             scene: What is there.
             trail: [N, 2] where the ego was.
-            plan: [6, 2] metres in the ego frame, or None.
+            plan: [n, 2] metres in the ego frame, or None.
             events: Infractions to mark.
             size: Rows and columns of the picture; it shows 72 m from top to bottom.
         """

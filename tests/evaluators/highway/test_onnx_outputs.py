@@ -1,17 +1,25 @@
 """What a graph answers, read by an adapter: other waypoints, controls, both fused."""
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
+from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
+from me2e_compress.driving.host_stage import HostStage, HostWork
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.episode import Ending
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.trajectory import Floats
 from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.evaluators.highway.test_onnx_policy import observation
 
@@ -122,3 +130,32 @@ def test_a_host_stage_needs_a_plan(tmp_path: Path) -> None:
 
     with pytest.raises(EvaluationError, match="changes a plan, and this model answers"):
         driver.open()
+
+
+@dataclass(frozen=True)
+class Same(HostStage):
+    """Changes nothing."""
+
+    name: ClassVar[str] = "same"
+
+    def work(self, plan: Floats, outputs: Mapping[str, Array]) -> HostWork:
+        return HostWork(plan)
+
+
+def test_a_host_stage_takes_six_waypoints_of_any_plan(tmp_path: Path) -> None:
+    """Three, a second apart, 4 m/s: those between are halfway."""
+    model = straight_on(
+        tmp_path / "m.onnx",
+        outputs="float[1, 3, 2] plan",
+        body="plan = Identity (way)",
+        initializers=", float[1, 3, 2] way = {4, 0, 8, 1, 12, 1}",
+    )
+    plan = PlanAdapter(output="plan", step_s=1.0)
+    policy = OnnxPolicy.open(model, Adapter(plan=plan), stage=Same())
+    policy.reset(EXIT)
+
+    found = policy.plan(observation())
+
+    assert isinstance(found, Trajectory)
+    assert found.points[:, 0].tolist() == [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]
+    assert found.points[2].tolist() == [6.0, 0.5]
