@@ -16,6 +16,8 @@ from me2e_compress.zoo.stacks import STACKS, Stack
 
 STACK = "me2e.stack"
 """Metadata key: the stack of the zoo that a file was exported from."""
+PICTURE_COLUMNS = 1600
+"""Of nuScenes and Bench2Drive, which the scale of a stack is of."""
 
 
 def inputs_of_stack(stack: Stack) -> LoggedInputs:
@@ -33,7 +35,7 @@ def inputs_of_stack(stack: Stack) -> LoggedInputs:
         rows=rows,
         columns=columns,
     )
-    return LoggedInputs(forms, image, stack.trained)
+    return LoggedInputs(forms, image, stack.trained, _picture_columns(stack, columns))
 
 
 def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
@@ -80,7 +82,14 @@ def inputs_of_model(path: Path, size: tuple[int, int] | None) -> LoggedInputs:
         rows=rows,
         columns=columns,
     )
-    return LoggedInputs(forms, image, forward_left)
+    return LoggedInputs(forms, image, forward_left, _picture_columns(stack, columns))
+
+
+def _picture_columns(stack: Stack | None, columns: int) -> int | None:
+    """Return the columns that a picture takes: of 416, UniAD of DL4AGX fills 400."""
+    if stack is None or stack.trained or columns != stack.inputs["img"][-1]:
+        return None
+    return round(PICTURE_COLUMNS * stack.scale)
 
 
 def _unscaled(levels: Triple, scale: float) -> Triple:

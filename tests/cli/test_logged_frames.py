@@ -10,7 +10,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.stacks import UNIAD_TRT, VAD_TINY
 from tests.calibration.logs.small_logs import write_bench2drive, write_nuscenes
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
@@ -109,6 +109,22 @@ def test_what_does_not_fit_is_one_line(
     shown = " ".join(capsys.readouterr().err.split())
     assert message in shown
     assert not (tmp_path / "out").exists()
+
+
+def test_uniad_is_fed_all_that_it_takes(command: Command, tmp_path: Path) -> None:
+    """Pictures of 400 x 225 in an input of 416 x 256."""
+    log = f"nuscenes:{write_nuscenes(tmp_path / 'log', 1)}"
+
+    assert command("frames", "uniad-trt", "--from", log, "-o", tmp_path / "out") == 0
+
+    recording = CalibrationSet(tmp_path / "out")
+    arrays = recording[0].arrays
+    wanted = {*UNIAD_TRT.inputs} - {*UNIAD_TRT.recurrent}
+    shapes = {name: array.shape for name, array in arrays.items()}
+    assert shapes == {name: UNIAD_TRT.inputs[name] for name in wanted}
+    assert arrays["command"].dtype.kind == "i"
+    with np.load(recording.files[0]) as held:
+        assert held["img"].shape == (1, 6, 3, 225, 400)
 
 
 BACKBONE = """
