@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, cast
 
-from me2e_compress.zoo.stacks import TCP, Stack
+from me2e_compress.zoo.stacks import TCP, UNIADS, Stack
 
 if TYPE_CHECKING:
     from torch import nn
@@ -13,20 +13,26 @@ if TYPE_CHECKING:
 
 
 def construct(spec: Stack, sampling: "Sampling" = "operator") -> "nn.Module":
-    """Build the module of a stack with its only heads; its weights mean nothing yet.
+    """Build the module that weights of the original fit; its own mean nothing yet.
 
     Args:
         spec: Of `Stack.with_heads`.
         sampling: How features are sampled, of a stack that samples any.
     """
-    (heads,) = spec.heads
     model: nn.Module
     if spec.name == TCP.name:
         from me2e_compress.zoo.tcp.stack import Tcp
 
+        (heads,) = spec.heads
         model = Tcp(cast("ActionHeads", heads))
+    elif spec.name in UNIADS:
+        from me2e_compress.zoo.uniad.config import CONFIGS
+        from me2e_compress.zoo.uniad.stack import UniadTiny
+
+        model = UniadTiny(CONFIGS[spec.name], sampling, trained=True)
     else:
         from me2e_compress.zoo.vad.stack import VadTiny
 
+        (heads,) = spec.heads
         model = VadTiny(cast("HeadsName", heads), sampling)
     return model.requires_grad_(False).eval()

@@ -85,8 +85,11 @@ class NameMatch:
     @cached_property
     def wanted(self) -> "Mapping[str, tuple[str, Tensor]]":
         """By published name: our name, and a tensor of the shape and type."""
-        own = self.module.state_dict()
-        return {self.names.published(name): (name, own[name]) for name in own}
+        return {
+            self.names.published(name): (name, tensor)
+            for name, tensor in self.module.state_dict().items()
+            if not self.names.is_computed(name)
+        }
 
     def keys(self) -> Mapping[str, str]:
         """Return which tensor of the file is read, by published name."""

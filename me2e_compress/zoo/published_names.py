@@ -14,10 +14,13 @@ class PublishedNames:
             that none matches are the original's.
         unread: Patterns of names of the original that our graph leaves out, since
             driving does not read them.
+        computed: Patterns of our names for tables that no file holds, since they follow
+            from the sizes.
     """
 
     renamed: Sequence[tuple[str, str]] = ()
     unread: Sequence[str] = ()
+    computed: Sequence[str] = ()
 
     def published(self, name: str) -> str:
         """Return what the original calls our parameter or buffer."""
@@ -29,6 +32,10 @@ class PublishedNames:
         """Return whether a name of the original is one that we leave out."""
         return any(re.match(pattern, name) for pattern in self.unread)
 
+    def is_computed(self, name: str) -> bool:
+        """Return whether one of our names is of a table that no file holds."""
+        return any(re.match(pattern, name) for pattern in self.computed)
+
 
 PUBLISHED: dict[str, PublishedNames] = {
     "vad-tiny": PublishedNames(
@@ -37,9 +44,24 @@ PUBLISHED: dict[str, PublishedNames] = {
             (r"(\.lmlp_\d)\.norm\.", r"\1.mlp.1."),
         ),
     ),
+    "uniad-tiny": PublishedNames(
+        unread=(
+            r"criterion\.",
+            r"pts_bbox_head\.past_traj_reg_branches\.",
+            r"seg_head\.(bev_embedding|stuff_query|stuff_mask_head)\.",
+            r"seg_head\.(reg_branches2|cls_thing_branches|cls_stuff_branches)\.",
+            r"motion_head\.layer_track_query_fuser\.",
+        ),
+        computed=(r"seg_head\.positional_encoding\.",),
+    ),
     "tcp": PublishedNames(
         unread=(r"speed_branch\.", r"value_branch_\w+\.", r"feature_branch_\w+\."),
     ),
 }
-"""By the name of the stack: hustvl/VAD, ``VAD_head.py`` (Bench2DriveZoo has the same),
-and OpenDriveLab/TCP, ``TCP/model.py``, with Bench2DriveZoo's branch tcp/admlp."""
+"""By the name of the stack.
+
+* vad-tiny: hustvl/VAD, ``VAD_head.py``; Bench2DriveZoo has the same.
+* uniad-tiny: Bench2DriveZoo, ``uniad_track.py`` and the heads. Its motion anchors lie
+  in a file of their own; they belong under ``motion_head.kmeans_anchors``.
+* tcp: OpenDriveLab/TCP, ``TCP/model.py``, and Bench2DriveZoo, branch tcp/admlp.
+"""

@@ -31,8 +31,11 @@ class PublishedWeights:
     record: WeightsRecord
 
     def fill(self, model: "nn.Module") -> None:
-        """Set all parameters and buffers of a stack's module, in place."""
-        model.load_state_dict(dict(self.tensors))
+        """Set all parameters and buffers of a stack's module, in place.
+
+        What the module computed itself stays (`PublishedNames.computed`).
+        """
+        model.load_state_dict({**model.state_dict(), **self.tensors})
 
 
 def published_weights(

@@ -12,19 +12,25 @@ from me2e_compress.zoo.tcp.stack import Tcp
 from tests.zoo.published_files import state
 from tests.zoo.published_layouts import Shapes, tcp, vad_tiny
 from tests.zoo.tcp.small import SMALL
+from tests.zoo.uniad_layout import ANCHORS, uniad_tiny
 
 LAYOUTS = {
     ("vad-tiny", "nuscenes"): vad_tiny(),
     ("vad-tiny", "bench2drive"): vad_tiny(classes=9, map_classes=6, modes=6),
+    ("uniad-tiny", None): uniad_tiny() | ANCHORS,
     ("tcp", "bench2drive"): tcp(),
     ("tcp", "beta"): tcp("beta"),
 }
 
 
-def own_shapes(stack: str, heads: str) -> Shapes:
+def own_shapes(stack: str, heads: str | None) -> Shapes:
     with torch.device("meta"):
         model = construct(STACKS[stack].with_heads(heads))
-    return {name: tuple(each.shape) for name, each in model.state_dict().items()}
+    return {
+        name: tuple(each.shape)
+        for name, each in model.state_dict().items()
+        if not PUBLISHED[stack].is_computed(name)
+    }
 
 
 def test_originals_are_of_stacks_that_are_drawn() -> None:
@@ -33,7 +39,7 @@ def test_originals_are_of_stacks_that_are_drawn() -> None:
 
 
 @pytest.mark.parametrize(("stack", "heads"), LAYOUTS)
-def test_names_and_shapes_are_the_original_s(stack: str, heads: str) -> None:
+def test_names_and_shapes_are_the_original_s(stack: str, heads: str | None) -> None:
     names = PUBLISHED[stack]
     renamed = {names.published(n): s for n, s in own_shapes(stack, heads).items()}
     layout = LAYOUTS[stack, heads]
@@ -42,7 +48,7 @@ def test_names_and_shapes_are_the_original_s(stack: str, heads: str) -> None:
 
 
 @pytest.mark.parametrize(("stack", "heads"), LAYOUTS)
-def test_no_two_names_become_one(stack: str, heads: str) -> None:
+def test_no_two_names_become_one(stack: str, heads: str | None) -> None:
     own = own_shapes(stack, heads)
     published = {PUBLISHED[stack].published(name) for name in own}
     averages = {AVERAGE + name.replace(".", "_") for name in published}
@@ -50,9 +56,18 @@ def test_no_two_names_become_one(stack: str, heads: str) -> None:
     assert len(own) == len(published) == len(averages)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=map(" ".join, LAYOUTS))
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=map(str, LAYOUTS))
 def test_no_name_begins_as_a_wrapper_s_prefix(layout: Shapes) -> None:
     assert [name for name in layout if name.startswith(PREFIXES)] == []
+
+
+def test_no_parameter_is_taken_for_a_computed_table() -> None:
+    for name, stack in STACKS.items():
+        if name in PUBLISHED:
+            with torch.device("meta"):
+                model = construct(stack.with_heads(None))
+            learned = dict(model.named_parameters())
+            assert not any(map(PUBLISHED[name].is_computed, learned))
 
 
 def test_lane_layers_are_told_apart() -> None:

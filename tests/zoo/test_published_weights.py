@@ -38,6 +38,7 @@ from tests.zoo.published_files import (
 )
 from tests.zoo.published_layouts import tcp, vad_tiny
 from tests.zoo.tcp.small import SMALL, small_spec
+from tests.zoo.uniad_layout import ANCHORS, uniad_tiny
 
 
 @pytest.fixture
@@ -91,6 +92,7 @@ def test_the_graph_answers_as_the_original(tmp_path: Path, trained: Tcp) -> None
     [
         ("vad-tiny", None, vad_tiny()),
         ("vad-tiny", "bench2drive", vad_tiny(classes=9, map_classes=6, modes=6)),
+        ("uniad-tiny", None, uniad_tiny() | ANCHORS),
         ("tcp", "beta", tcp("beta")),
     ],
 )
@@ -260,6 +262,11 @@ def test_every_name_that_does_not_fit_can_be_asked_for(tmp_path: Path) -> None:
     found = mismatch("tcp", saved(tmp_path / "a.pth", thin(vad_tiny())))
     assert len(found.missing) > 100
     assert set(found.unexpected) == set(vad_tiny())
+
+
+def test_anchors_of_uniad_are_asked_for(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.pth", thin(uniad_tiny()))
+    assert mismatch("uniad-tiny", path).missing == ["motion_head.kmeans_anchors"]
 
 
 def test_a_stack_without_an_original(tmp_path: Path) -> None:

@@ -146,7 +146,10 @@ class DecoderAttention(nn.Module):
     Args:
         hw: Rows and columns of the BEV.
         sampling: See `sample`.
-        held: Levels to hold weights for, of which the first alone is read.
+        held: Levels to hold weights for. There is one; for more, samples are where the
+            kernel of mmcv takes them: it walks through offsets and weights as if they
+            were for one level, so that a part of the queries speaks for all. Published
+            models were trained so (UniAD's map head holds four).
         boxes: Whether the reference points are boxes.
     """
 
@@ -190,23 +193,24 @@ class DecoderAttention(nn.Module):
         batch, queries, _ = asked.shape
         value = self.value_proj(bev)
         value = value.view(batch, value.shape[1], ATTENTION_HEADS, -1)
-        offsets = self._read(self.sampling_offsets(asked))
-        offsets = offsets.view(batch, queries, ATTENTION_HEADS, 1, self.points, 2)
-        weights = self._read(self.attention_weights(asked))
-        weights = weights.view(batch, queries, ATTENTION_HEADS, self.points).softmax(-1)
-        weights = weights.view(batch, queries, ATTENTION_HEADS, 1, self.points)
+        speak, samples = queries, self.held * self.points
+        if self.held > 1:
+            speak = (queries + self.held - 1) // self.held
+            asked, at = asked[:, :speak], at[:, :speak]
+        offsets = self.sampling_offsets(asked)
+        offsets = offsets.view(batch, speak, ATTENTION_HEADS, self.held, self.points, 2)
+        weights = self.attention_weights(asked)
+        weights = weights.view(batch, speak, ATTENTION_HEADS, samples).softmax(-1)
+        weights = weights.view(batch, speak, ATTENTION_HEADS, self.held, self.points)
         locations = self._locations(at[:, :, None, None, None, :], offsets)
+        if self.held > 1:
+            locations, weights = (
+                each.reshape(1, -1, ATTENTION_HEADS, 1, *each.shape[4:])[:, :queries]
+                for each in (locations, weights)
+            )
         out = deformable_attention(value, (self.hw,), locations, weights, self.sampling)
         read: Tensor = self.output_proj(out)
         return query + read
-
-    def _read(self, projected: Tensor) -> Tensor:
-        """Keep what belongs to the first level, of [1, Q, heads * levels * n]."""
-        if self.held == 1:
-            return projected
-        parts = projected.unflatten(2, (ATTENTION_HEADS, self.held, -1))
-        first: Tensor = parts[:, :, :, 0].flatten(2)
-        return first
 
     def _locations(self, at: Tensor, offsets: Tensor) -> Tensor:
         """Add offsets, in cells around points and in parts of a half around boxes."""

@@ -170,13 +170,19 @@ class MapHead(nn.Module):
         sampling: See `sample`.
         dead: Hold what inference never reads: an embedding of the cells, the background
             head, the branches of the mask heads, attention for three levels more.
+        trained: Hold that attention, read as it was trained (see `DecoderAttention`).
     """
 
     def __init__(
-        self, config: UniadConfig, sampling: Sampling, *, dead: bool = False
+        self,
+        config: UniadConfig,
+        sampling: Sampling,
+        *,
+        dead: bool = False,
+        trained: bool = False,
     ) -> None:
         super().__init__()
-        levels = config.map_levels if dead else 1
+        levels = config.map_levels if dead or trained else 1
         layers, things = config.decoder_layers, config.labels.things
         self.hw = config.head_hw
         self.positional_encoding = CellSines(self.hw)

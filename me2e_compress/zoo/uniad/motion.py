@@ -162,10 +162,10 @@ class MotionHead(nn.Module):
         if dead:
             self.layer_track_query_fuser = projection(TRACK_LAYERS * EMBED, EMBED)
         self.sines = PointSines(config.grid.pc_range)
-        self.register_buffer("anchors", anchors(groups), False)
+        self.register_buffer("kmeans_anchors", anchors(groups))
         self.register_buffer("group_of", torch.tensor(config.labels.groups), False)
 
-    anchors: Tensor
+    kmeans_anchors: Tensor
     group_of: Tensor
 
     def forward(self, agents: Agents, lanes: Tensor, bev: Tensor) -> Forecasts:
@@ -180,7 +180,7 @@ class MotionHead(nn.Module):
         pos = self.boxes_query_embedding_layer(self.sines(agents.boxes[:, :2]))
         pos = pos.unsqueeze(0)
         group = self.group_of[agents.labels]
-        anchor = self.anchors[group]
+        anchor = self.kmeans_anchors[group]
         offsets = frames.turned(anchor)
         goals = self._goals(anchor, offsets, offsets + frames.centre)
         learned = self.learnable_motion_query_embedding.weight

@@ -65,6 +65,7 @@ class UniadTiny(nn.Module):
         config: Sizes.
         sampling: See `sample`.
         dead: Hold the weights that inference never reads, as the published file does.
+        trained: Have the map head's attention as weights of the published file need it.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class UniadTiny(nn.Module):
         sampling: Sampling = "operator",
         *,
         dead: bool = False,
+        trained: bool = False,
     ) -> None:
         super().__init__()
         self.config = config
@@ -87,7 +89,7 @@ class UniadTiny(nn.Module):
         self.query_interact = QueryInteraction()
         self.memory_bank = MemoryBank()
         self.pts_bbox_head = TrackHead(config, sampling, dead=dead)
-        self.seg_head = MapHead(config, sampling, dead=dead)
+        self.seg_head = MapHead(config, sampling, dead=dead, trained=trained)
         self.motion_head = MotionHead(config, sampling, dead=dead)
         self.occ_head = OccHead(config, sampling)
         self.planning_head = PlanningHead(config.head_hw, config.labels.commands)
