@@ -234,7 +234,7 @@ def test_a_wrong_table_is_refused(table: dict[str, Any], words: str) -> None:
     ("table", "shape", "words"),
     [
         ({}, (1, 5, 3, 8, 8), r"must be \[1, 6, 3, 'any', 'any'\]"),
-        ({}, (1, 3, 8, 8), r"has shape \[1, 3, 8, 8\]"),
+        ({}, (1, 3, 8, 8), r"or \[images.img\] say which cameras it shows"),
         ({"cameras": ["FRONT"]}, (1, 8, 8, 3), r"must be \[1, 3, 'any', 'any'\]"),
         ({"layout": "chw"}, (3, 8, 8), r"has shape \[3, 8, 8\]"),
         ({"size": [9, 8]}, (1, 6, 3, 8, 8), "a size of 9 x 8 does not fit"),

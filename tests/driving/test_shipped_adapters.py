@@ -12,7 +12,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.zoo.stacks import TCP, VAD_TINY
+from me2e_compress.zoo.stacks import STACKS, TCP, VAD_TINY
 from tests.evaluators.highway.drivers import straight_on
 
 
@@ -74,10 +74,14 @@ def test_vad_tiny_is_fed_as_nuscenes_feeds_it(tmp_path: Path) -> None:
 
 
 def test_uniad_tiny_is_told_where_its_lidar_is(tmp_path: Path) -> None:
-    ports = """float[1, 6, 3, 928, 1600] img, float[1, 6, 4, 4] lidar2img,
-        float[18] can_bus, int64[1] command, float[1, 3, 3] l2g_r_mat,
-        float[1, 3] l2g_t, float[1] timestamp"""
-    session = Session(straight_on(tmp_path / "m.onnx", inputs=ports), threads=1)
+    stack = STACKS["uniad-tiny"]
+    ports = [
+        f"{'int64' if name in stack.dtypes else 'float'}{list(shape)} {name}"
+        for name, shape in stack.inputs.items()
+        if name not in stack.recurrent
+    ]
+    model = straight_on(tmp_path / "m.onnx", inputs=", ".join(ports))
+    session = Session(model, threads=1)
 
     adapter = Adapter.load(adapter_file(Path("uniad-tiny")))
     inputs = ModelInputs.of(session, adapter, {})

@@ -154,9 +154,13 @@ class ImagePort:
             )
             or ("n" not in layout and pictures > 1)
         ):
-            raise EvaluationError(
-                f"input {name} has shape {list(shape)}, it must be {wanted}"
-            )
+            said = f"input {name} has shape {list(shape)}, it must be "
+            if table == ImageInput():
+                raise EvaluationError(
+                    f"{said}[1, 6, 3, 'any', 'any'], or [images.{name}] say which"
+                    " cameras it shows"
+                )
+            raise EvaluationError(f"{said}{wanted}")
         rows, columns = (shape[layout.index(letter)] for letter in "hw")
         usual_rows, usual_columns = table.size or DEFAULT_IMAGE_SIZE
         return cls(
