@@ -1,12 +1,10 @@
-"""Small stacks of several files, and one graph taken apart into such a stack."""
+"""Small stacks of several files."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
-import onnx_ir.passes.common as common
 
 from me2e_compress import graph, rewrite
 from me2e_compress.runtime.frames import Frame
@@ -118,53 +116,3 @@ def ones(*starts: bool) -> list[Frame]:
     """Return a frame of ones a flag, which says whether a scene begins."""
     image: npt.NDArray[np.float32] = np.ones((1, 4), np.float32)
     return [Frame(at, start, {"img": image}) for at, start in enumerate(starts)]
-
-
-def take_apart(whole: Path, cut: Sequence[str], folder: Path) -> Path:
-    """Write a graph as two files, joined at some of its tensors; return the TOML.
-
-    The first gives these tensors and whatever else does not need them.
-    """
-    first, second = graph.load(whole), graph.load(whole)
-    for each in (first, second):
-        graph.infer_shapes(each)
-    behind = _behind(second, cut)
-    outputs = [value for value in first.graph.outputs if value.name not in behind]
-    made = {str(v.name): v for node in first.graph for v in node.outputs}
-    first.graph.outputs.clear()
-    first.graph.outputs.extend(outputs + [made[name] for name in cut])
-    _into_inputs(second, cut)
-    kept = [value for value in second.graph.outputs if value.name in behind]
-    second.graph.outputs.clear()
-    second.graph.outputs.extend(kept)
-    lines = list[str]()
-    for name, model in (("backbone", first), ("head", second)):
-        common.RemoveUnusedNodesPass()(model)
-        unread = [v for v in model.graph.inputs if not v.uses()]
-        for value in unread:
-            model.graph.inputs.remove(value)
-        model.metadata_props.pop("me2e.recurrent", None)
-        graph.save(model, folder / f"{name}.onnx")
-        lines += ["[[part]]", f'name = "{name}"', f'file = "{name}.onnx"']
-    path = folder / "stack.toml"
-    path.write_text("\n".join(lines))
-    return path
-
-
-def _behind(model: ir.Model, cut: Sequence[str]) -> set[str]:
-    """Name every value that needs one of the tensors."""
-    reached = set(cut)
-    for node in model.graph:
-        if any(value is not None and value.name in reached for value in node.inputs):
-            reached |= {str(value.name) for value in node.outputs}
-    return reached - set(cut)
-
-
-def _into_inputs(model: ir.Model, cut: Sequence[str]) -> None:
-    made = {str(v.name): v for node in model.graph for v in node.outputs}
-    for name in cut:
-        old = made[name]
-        new = ir.Value(name=name, type=old.type, shape=old.shape)
-        old.name = f"{name}.inside"
-        ir.convenience.replace_all_uses_with(old, new)
-        model.graph.inputs.append(new)

@@ -2,10 +2,15 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from me2e_compress.driving.answer import checked
+from me2e_compress.driving.contract import Observation, Trajectory
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.stack.stack_file import StackFile
-from me2e_compress.zoo.shipped import sample_frames, shipped
+from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.zoo.shipped import shipped
 from tests.cli.conftest import Command, command
 from tests.docs.pages import ROOT, blocks
 from tests.stacks import dense_frames, write_dense
@@ -15,38 +20,48 @@ __all__ = ["command"]
 PAGE = ROOT / "docs" / "stacks.md"
 
 
-def test_the_example_of_the_page_runs(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    command: Command,
-    capsys: pytest.CaptureFixture[str],
+def decided(model: Path) -> list[object]:
+    """Return three plans of a driver from the start of a route."""
+    policy, rig = OnnxPolicy.open(model), CameraRig(96, 160)
+    policy.reset(None)
+    random = np.random.default_rng(0)
+    plans = list[object]()
+    for step in range(3):
+        seen = Observation(
+            50_000 * step,
+            random.integers(0, 256, (6, 96, 160, 3)).astype(np.uint8),
+            rig.lidar2img,
+            random.normal(size=18).astype(np.float32),
+            2,
+            5.0,
+        )
+        answer = checked(policy.plan(seen))
+        assert isinstance(answer, Trajectory)
+        plans.append(answer.points.tolist())
+    return plans
+
+
+def test_the_driver_of_the_page_decides_as_the_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (toml, *_), (script, *_) = blocks(PAGE, "toml"), blocks(PAGE, "python")
     Path("stack.toml").write_text(toml.text)
     exec(script.text, {})
-    recorded = sample_frames(shipped("highway"))
-    assert recorded is not None
-    Path("frames").symlink_to(recorded)
-    first, *_ = blocks(PAGE, "sh")
-    for line in first.text.splitlines():
-        assert command(*line.split()[1:]) == 0, line
 
-    assert (
-        "plan displacement: mean 0.0000 m, largest 0.0000 m" in capsys.readouterr().out
-    )
+    assert decided(Path("stack.toml")) == decided(shipped("highway"))
 
 
-def test_the_other_commands_of_the_page_run(
+def test_the_commands_of_the_page_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_dense(tmp_path)
     dense_frames(tmp_path)
-    _, *others = blocks(PAGE, "sh")
 
-    for line in "".join(each.text for each in others).splitlines():
-        assert command(*line.split()[1:]) == 0, line
+    for line in "".join(each.text for each in blocks(PAGE, "sh")).splitlines():
+        if " highway " not in line:  # on a smaller stack
+            assert command(*line.split()[1:]) == 0, line
 
 
 def test_the_state_of_the_page_is_read(tmp_path: Path) -> None:

@@ -13,19 +13,8 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.stack.split_stack import digest_of_files
-from me2e_compress.simulator.cameras import CameraRig
-from me2e_compress.zoo.shipped import shipped
 from tests.frames import record
-from tests.stacks import HEAD, TWO_PARTS, take_apart, write_stack
-
-NECK = ("/neck/Add_output_0", "/neck/Add_1_output_0")
-"""Where the driver that ships is cut: what its neck gives."""
-
-
-@pytest.fixture(scope="module")
-def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the TOML of the driver that ships, taken apart behind its neck."""
-    return take_apart(shipped("highway"), NECK, tmp_path_factory.mktemp("halves"))
+from tests.stacks import HEAD, TWO_PARTS, write_stack
 
 
 def recording(folder: Path, scenes: tuple[int, ...] = (0, 3)) -> Path:
@@ -34,29 +23,39 @@ def recording(folder: Path, scenes: tuple[int, ...] = (0, 3)) -> Path:
     return record(folder / "frames", [{"img": each} for each in images], scenes)
 
 
-def decided(model: Path) -> list[object]:
-    """Return three plans of a driver from the start of a route."""
-    policy, rig = OnnxPolicy.open(model), CameraRig(96, 160)
-    policy.reset(None)
-    random = np.random.default_rng(0)
-    plans = list[object]()
-    for step in range(3):
-        seen = Observation(
-            50_000 * step,
-            random.integers(0, 256, (6, 96, 160, 3)).astype(np.uint8),
-            rig.lidar2img,
-            random.normal(size=18).astype(np.float32),
-            2,
-            5.0,
-        )
-        answer = checked(policy.plan(seen))
-        assert isinstance(answer, Trajectory)
-        plans.append(answer.points.tolist())
-    return plans
+NEXT = """
+<ir_version: 9, opset_import: ["" : 17]>
+next (float[18] can_bus, float[1,6,2] prev_steps)
+    => (float[1,6,2] plan, float[1,6,2] next_steps) <float one = {1}> {
+    next_steps = Add(prev_steps, one)
+    plan = Identity(next_steps)
+}
+"""
+FIRST = f"""
+<ir_version: 9, opset_import: ["" : 17]>
+first (float[18] can_bus) => (float[1,6,2] plan, float[1,6,2] next_steps)
+<float[1,6,2] ten = {{{", ".join(["10"] * 12)}}}> {{
+    next_steps = Identity(ten)
+    plan = Identity(ten)
+}}
+"""
 
 
-def test_the_driver_in_two_files_decides_as_the_whole(halves: Path) -> None:
-    assert decided(halves) == decided(shipped("highway"))
+def test_a_route_begins_with_the_file_for_first_frames(tmp_path: Path) -> None:
+    toml = '[[part]]\nname = "n"\nfile = "next.onnx"\nfirst_frame = "first.onnx"\n'
+    policy = OnnxPolicy.open(write_stack(tmp_path, toml, next=NEXT, first=FIRST))
+    seen = Observation(
+        0, None, np.eye(4, dtype=np.float32), np.zeros(18, np.float32), 2, 5.0
+    )
+    counted = list[float]()
+    for _ in range(2):
+        policy.reset(None)
+        for _ in range(3):
+            answer = checked(policy.plan(seen))
+            assert isinstance(answer, Trajectory)
+            counted.append(answer.points[0, 0])
+
+    assert counted == [10, 11, 12, 10, 11, 12]
 
 
 def test_what_drives_is_known_by_all_of_its_files(tmp_path: Path) -> None:
