@@ -70,4 +70,5 @@ class PointSines(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Map [..., 2] (x, y) to [..., 256]: y half, then x half."""
         at = (points - self.low) * self.circle
-        return _waves(at.flip(-1), self.divisors).flatten(-2)
+        swapped = torch.stack([at[..., 1], at[..., 0]], -1)
+        return _waves(swapped, self.divisors).flatten(-2)

@@ -1,3 +1,4 @@
+import functools
 from collections import Counter
 
 import pytest
@@ -29,6 +30,7 @@ NEVER_READ = {
 heads, twelve attentions whose last three levels nothing feeds; a fuser of layers."""
 
 
+@functools.cache
 def parameters(*, dead: bool) -> Counter[str | None]:
     modules = ModuleMap.load("uniad")
     with torch.device("meta"):
