@@ -35,7 +35,7 @@ from me2e_compress.zoo.shipped import sample_frames
 
 LEDGER_M = {
     "uniad-scheme-1": 14.455,
-    "uniad-scheme-2": 28.995 - 10.240 - 6.453 - 0.530 - 0.008 + 2.372,
+    "uniad-scheme-2": 28.995 - 10.240 - 6.453 - 0.888 - 0.530 - 0.008 + 2.372,
     "uniad-scheme-3": 13.770 - 0.394,
     "vad-scheme-8": 4.07,
     "vad-scheme-9": 2.216 - 0.099 + 0.853,
