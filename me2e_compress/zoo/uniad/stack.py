@@ -207,8 +207,8 @@ class UniadTiny(nn.Module):
         lives = self.track_base(scores, before)
         chosen, ids = lives.chosen, lives.obj_idxes
         seen = self._seen(found, chosen, ids, (boxes, scores, labels))
-        place = (chosen - new).clamp(0)
         old = (chosen >= new).to(torch.int64)
+        place = (chosen - new) * old
         kept = old.to(scores.dtype)
         period = before.save_period[place] * old
         due = (period == 0) & (ids > 0)
@@ -218,7 +218,8 @@ class UniadTiny(nn.Module):
             before.mem_held[place] * kept[:, None],
             due,
         )
-        period = torch.where(due, period + SAVE_PERIOD, (period - 1).clamp(0))
+        less = (period - 1) * (period > 0).to(torch.int64)
+        period = torch.where(due, period + SAVE_PERIOD, less)
         asked = self.query_interact(query[:, chosen], track[None], (ids == 0)[None])
         return seen, Tracks(
             asked[0],

@@ -88,7 +88,9 @@ class TrackLife(nn.Module):
         missed = torch.cat([self.none, before.disappear_time])
         seen = scores >= BEGINS
         begins = (seen & self.may_begin).to(torch.int64)
-        ids = ids + begins * (before.max_obj_id + begins.cumsum(0))
+        # TensorRT adds up in float alone; numbers of queries are exact there
+        nth = begins.to(self.rank.dtype).cumsum(0).to(torch.int64)
+        ids = ids + begins * (before.max_obj_id + nth)
         unseen = (ids > 0) & (scores < SLEEPS)
         missed = missed * torch.logical_not(seen).to(torch.int64)
         missed = missed + unseen.to(torch.int64)

@@ -14,6 +14,7 @@ import torch
 from me2e_compress.errors import GraphError
 from me2e_compress.modules import ModuleMap, assign
 from me2e_compress.operators import fused_nodes
+from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.zoo.bev.sizes import Sampling
 from me2e_compress.zoo.export import trace
@@ -125,6 +126,10 @@ def test_nothing_is_float64_and_no_shape_depends_on_data(
     assert kinds["TopK"] == 1
     for value in (*traced.graph.input, *traced.graph.output):
         assert all(d.dim_value > 0 for d in value.type.tensor_type.shape.dim)
+
+
+def test_tensorrt_takes_every_node(traced: onnx.ModelProto) -> None:
+    assert list(TARGETS.parse("tensorrt").lint(ir.from_proto(traced))) == []
 
 
 @pytest.mark.slow
