@@ -91,8 +91,8 @@ class DriveLog(ABC):
 
     Attributes:
         scenes: which, by name; none means all.
-        cameras: which, in the order of the image input; none means the six of
-            Bench2Drive's order, front first.
+        cameras: which, in the order of the image input; none means all six, in the
+            order of the models that are trained on it.
         every: takes every n-th moment.
         size: rows and columns of the image input, where the model leaves them open.
         width: columns of the image input that a picture takes, the others are zeros;
@@ -157,9 +157,14 @@ class DriveLog(ABC):
         return self.scenes or there
 
     @property
+    def all_cameras(self) -> tuple[str, ...]:
+        """Name all cameras, in the order of the models that are trained on it."""
+        return CAMERAS
+
+    @property
     def seen(self) -> tuple[str, ...]:
         """Name the cameras in their order."""
-        return self.cameras or CAMERAS
+        return self.cameras or self.all_cameras
 
 
 def pose(rotation: Sequence[float], translation: Sequence[float], what: str) -> Floats:

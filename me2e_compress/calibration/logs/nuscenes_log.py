@@ -10,6 +10,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from me2e_compress.calibration.logs.base import (
+    CAMERAS,
     CAN_BUS_SIZE,
     DriveLog,
     Floats,
@@ -25,6 +26,15 @@ CENTRE_M = 0.5
 """Of the vehicle, ahead of its lidar: UniAD's and VAD's planning metric."""
 TURN_M = 2.0
 """To the side in 3 s, from which on the command is a turn: UniAD and VAD."""
+CONVERTED = (
+    "CAM_FRONT",
+    "CAM_FRONT_RIGHT",
+    "CAM_FRONT_LEFT",
+    "CAM_BACK",
+    "CAM_BACK_LEFT",
+    "CAM_BACK_RIGHT",
+)
+"""Cameras in the order of mmdetection3d's converter: of UniAD and VAD for nuScenes."""
 CAN_BUS_KEYS = ("accel", "rotation_rate", "vel")
 """Of a pose message, in the order of the published ``can_bus``, from its 8th number."""
 
@@ -39,11 +49,12 @@ class NuScenesLog(DriveLog):
     Attributes:
         root: the folder that holds ``v1.0-*`` and ``samples``.
         version: of the tables; none means the only one that there is.
-        layout: how commands are counted and the CAN bus is filled: ``nuscenes`` as
-            UniAD and VAD for nuScenes do (right, left, straight), ``bench2drive`` as
-            Bench2Drive's and the policy contract (left, right, straight, follow).
+        layout: how commands are counted, the CAN bus is filled and cameras stand:
+            ``nuscenes`` as UniAD and VAD for nuScenes do (right, left, straight; front
+            right before front left), ``bench2drive`` as Bench2Drive's and the policy
+            contract (left, right, straight, follow; front left before front right).
         scenes: by name, such as scene-0061; none means all.
-        cameras: in the order of the image input; none means front first.
+        cameras: in the order of the image input; none means all, as `layout` has them.
         every: takes every n-th key frame.
         size: rows and columns of the image input, where the model leaves them open.
         width: columns of the image input that a picture takes, the others are zeros;
@@ -58,6 +69,11 @@ class NuScenesLog(DriveLog):
     root: Path = field(kw_only=False)
     version: str = ""
     layout: Literal["nuscenes", "bench2drive"] = "nuscenes"
+
+    @property
+    def all_cameras(self) -> tuple[str, ...]:
+        """Name all cameras, as the layout has them."""
+        return CONVERTED if self.layout == "nuscenes" else CAMERAS
 
     def names(self) -> Sequence[str]:
         """List the scenes of the version."""

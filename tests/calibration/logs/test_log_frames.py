@@ -90,7 +90,7 @@ def test_a_point_lands_on_the_pixel_it_was_drawn_at(
 ) -> None:
     frame = frames(log, LoggedInputs(FORMS, PIXELS, forward_left), 1)[0]
 
-    for index, camera in enumerate(YAWS):
+    for index, camera in enumerate(log.seen):
         point = to_lidar(seen_point(camera))
         if forward_left:
             point = log.scene(log.chosen()[0])[0].lidar_to_ego @ point
@@ -175,6 +175,23 @@ def test_the_can_bus_is_filled_as_each_data_set_does(
         bus = frames(log, count=1)[0].arrays["can_bus"]
         wanted = {at: expected.get(at, 0.0) for at in range(7, 16)}
         assert dict(enumerate(bus[7:16].tolist(), 7)) == pytest.approx(wanted, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "second"),
+    [
+        ("nuscenes{{root={nuscenes}}}", "CAM_FRONT_RIGHT"),
+        ("nuscenes{{root={nuscenes}, layout=bench2drive}}", "CAM_FRONT_LEFT"),
+        ("bench2drive{{root={bench2drive}}}", "CAM_FRONT_LEFT"),
+    ],
+)
+def test_cameras_stand_as_the_models_of_the_data_set_have_them(
+    roots: dict[str, Path], text: str, second: str
+) -> None:
+    log = LOGS.parse(text.format_map(roots))
+
+    assert sorted(log.seen) == sorted(YAWS)
+    assert log.seen[1] == second
 
 
 def test_no_can_bus_is_zeros(tmp_path: Path) -> None:
