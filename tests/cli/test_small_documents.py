@@ -43,11 +43,14 @@ def test_a_stack_of_a_checkpoint(
 
 
 def test_recorded_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("000000.npz", "000001.npz"):
+        (tmp_path / name).touch()
+
     show(FramesResult("vad-tiny", tmp_path, FramesOptions(count=3)), as_json=True)
 
     found = strict(capsys.readouterr().out)
     assert faults("frames", found) == []
-    assert found["frames"] == 3
+    assert found["frames"] == 2, "those that there are, not those that were asked for"
 
 
 def test_a_course_of_training(

@@ -83,6 +83,7 @@ def test_other_opsets_agree_too(opset: int, sampling: Sampling) -> None:
         assert {name: e for name, e in errors.items() if e > 1e-4} == {}
 
 
+@pytest.mark.slow
 def test_the_map_knows_the_module_of_nearly_every_node(
     traced: onnx.ModelProto,
 ) -> None:
