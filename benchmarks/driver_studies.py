@@ -15,7 +15,7 @@ SCHEMES = ("exact", "feature-ext", "prediction", "full")
 FPS = (20, 10, 5, 2, 1)
 FLOAT_MEDIAN_S = 0.43
 """Median latency of the float driver on the device imagined."""
-MEDIANS_S = (0.15, 0.2, 0.25, 0.3, 0.35, 0.43, 0.5, 0.6)
+MEDIANS_S = (0.15, 0.2, 0.25, 0.3, 0.35, FLOAT_MEDIAN_S, 0.5, 0.6)
 """The same on devices of other speeds, some on each side of a multiple of 50 ms."""
 LATENCY_SAMPLES = 300
 IDEAL = Condition("ideal", "none")
@@ -103,13 +103,16 @@ def schemes(bench: Bench) -> Study:
 def scales(bench: Bench) -> Study:
     """Drive on faster and slower devices: each model's own latencies, stretched."""
     devices = tuple(
-        Condition(
-            f"median-{1000 * median:.0f}ms",
-            f"trace{{scale={median / FLOAT_MEDIAN_S:.6g}}}",
-        )
+        DEVICE if median == FLOAT_MEDIAN_S else _stretched(median)
         for median in MEDIANS_S
     )
     return bench.study("Scales", (bench.float, bench.compressed("full")), devices)
+
+
+def _stretched(median_s: float) -> Condition:
+    """Return the device on which the float driver's median latency is this."""
+    scale = f"trace{{scale={median_s / FLOAT_MEDIAN_S:.6g}}}"
+    return Condition(f"median-{1000 * median_s:.0f}ms", scale)
 
 
 def latency(bench: Bench) -> Study:
