@@ -3,7 +3,6 @@
 Both know one number a tensor, so what comes back is symmetric: [-reach, reach].
 """
 
-import os
 import re
 import struct
 import tempfile
@@ -14,6 +13,7 @@ import numpy as np
 from onnxruntime.quantization.calibrate import TensorData
 from onnxruntime.quantization.quant_utils import write_calibration_table
 
+from me2e_compress import drafts
 from me2e_compress.calibration.observers import QUANT_MAX, scale_of
 from me2e_compress.calibration.observers.base import MaxMin
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
@@ -57,7 +57,7 @@ def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
     with tempfile.TemporaryDirectory(dir=folder, prefix=".table-") as draft:
         write_calibration_table(table, draft)
         for file in sorted(Path(draft).iterdir()):
-            os.replace(file, folder / file.name)
+            drafts.put(file, folder / file.name)
 
 
 def read_foreign(path: Path, model: str, tensors: tuple[str, ...]) -> Ranges:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -11,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from me2e_compress import documents
+from me2e_compress import documents, drafts
 from me2e_compress.calibration.dataset import FUTURE
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.errors import FramesError
@@ -80,9 +79,7 @@ def write_recording(
         if not draft.scenes:
             raise FramesError(f"{folder}: there are no frames to write")
         draft.finish()
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(draft.folder, folder)
+        drafts.put(draft.folder, folder)
     finally:
         if len(draft.scenes) < 2:  # nothing to go on from
             shutil.rmtree(draft.folder, ignore_errors=True)

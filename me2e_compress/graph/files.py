@@ -1,7 +1,6 @@
 """Read and write ONNX files: weights mapped, outputs atomic, sources untouched."""
 
 import hashlib
-import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
+from me2e_compress import drafts
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
 from me2e_compress.graph.external import data_file, external_tensors, settle
@@ -118,8 +118,8 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         # The earlier model keeps its weights until the new one stands in its place.
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
-            os.replace(draft_data, data)
-        os.replace(draft, path)
+            drafts.put(draft_data, data)
+        drafts.put(draft, path)
     for old in earlier:
         old.unlink(missing_ok=True)
 

@@ -6,6 +6,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from me2e_compress import drafts
+
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file all or nothing: a draft in the same folder takes its place.
@@ -20,7 +22,7 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         Path(draft).chmod(0o644)
-        os.replace(draft, path)
+        drafts.put(Path(draft), path)
     except BaseException:
         Path(draft).unlink(missing_ok=True)
         raise

@@ -1,12 +1,11 @@
 """Ranges of every file of a stack, measured while the whole runs."""
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from me2e_compress import recipe
+from me2e_compress import drafts, recipe
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
@@ -160,9 +159,7 @@ def _written(found: Mapping[str, Ranges], output: Path) -> StackCalibrateResult:
         draft.mkdir()
         for label, ranges in found.items():
             ranges.save(draft / f"{label}.json")
-        if output.exists():
-            os.replace(output, Path(scratch) / "before")
-        os.replace(draft, output)
+        drafts.put(draft, output)
     return StackCalibrateResult(
         output,
         {

@@ -2,8 +2,10 @@
 
 One rule for every command: what exists is replaced only if me2e-compress wrote it and
 nobody touched it since, unless forced. The record, :data:`RECORD`, lies in the folder
-of the outputs: their names, and size and time of each as it was left. While a command
-writes, it holds a lock on that record, which the system takes from a process that dies.
+of the outputs: their names, and size and time of each as it was left; while one is
+replaced, also those of the draft that takes its place, so that a kill at any point
+leaves what is known again. While a command writes, it holds a lock on that record,
+which the system takes from a process that dies.
 """
 
 import contextlib
@@ -16,7 +18,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from me2e_compress import documents
+from me2e_compress import documents, drafts
 from me2e_compress.errors import GraphError
 from me2e_compress.workflows.checks import Given, check_output
 
@@ -71,8 +73,11 @@ def check_ours(files: Iterable[Path], *, force: bool = False) -> None:
     Raises:
         GraphError: one is the user's, no regular file, or another process writes it.
     """
-    with writing([file for file in files if file.parent.is_dir()], force=force):
-        return
+    there = [file for file in files if file.parent.is_dir()]
+    check_output(there, ())
+    for file in there:
+        with _opened(file.absolute().parent / RECORD) as record:
+            _Claim(record, file, force=force)
 
 
 def _place_of(folder: Path) -> Path:
@@ -85,16 +90,52 @@ def _place_of(folder: Path) -> Path:
 def _claim(output: Path, *, force: bool) -> Iterator[None]:
     """Lock one output, and write down how it was left."""
     with _opened(output.absolute().parent / RECORD) as record:
+        claim = _Claim(record, output, force=force)
+        with drafts.announced(output, claim.announce):
+            try:
+                yield
+            finally:
+                claim.settle()
+
+
+class _Claim:
+    """One output that this process alone may write.
+
+    Args:
+        record: of its folder; what it says of the output stays until that changes.
+        output: the file or folder.
+        force: take the user's too.
+
+    Raises:
+        GraphError: it is the user's, or another process writes it.
+    """
+
+    def __init__(self, record: "_Record", output: Path, *, force: bool) -> None:
         record.lock(output.name, output)
-        before = _state(output)
-        record.check(output, before, force=force)
-        record.note(output.name, writing=before)
-        try:
-            yield
-        finally:
-            after = _state(output)
-            kept = record.earlier if after == before else after
-            record.note(output.name, left=kept)
+        self._record, self._output = record, output
+        self._found = _state(output)
+        known = record.of(output.name)
+        ours = self._found in (known.get("left"), known.get("next"))
+        if self._found and not ours and not force:
+            raise GraphError(
+                f"{output} is there, and not as me2e-compress left it: choose another"
+                " name, or replace it by --force"
+            )
+        self._left = self._found if ours else None
+        self._next: State = None
+
+    def announce(self, draft: Path) -> None:
+        """Note what is about to stand there, beside what we left there."""
+        if self._next is not None and _state(self._output) == self._next:
+            self._left = self._next
+        self._next = _state(draft, self._output.name)
+        self._record.note(self._output.name, left=self._left, next=self._next)
+
+    def settle(self) -> None:
+        """Note what is there now; what was not written stays as it was known."""
+        now = _state(self._output)
+        left = self._left if now == self._found else now
+        self._record.note(self._output.name, left=left)
 
 
 class _Record:
@@ -107,7 +148,6 @@ class _Record:
 
     def __init__(self, path: Path, handle: int) -> None:
         self.path, self.handle = path, handle
-        self.earlier: State = None
 
     def lock(self, name: str, output: Path) -> None:
         """Take the lock of one output.
@@ -126,45 +166,49 @@ class _Record:
             self.handle = _handle(self.path)
             self.lock(name, output)
 
-    def check(self, output: Path, found: State, *, force: bool) -> None:
-        """Refuse an output that is there and not as we left it."""
-        entry = self._read().get(output.name)
-        known = entry if isinstance(entry, dict) else {}
-        self.earlier = known.get("left")
-        if found is None or found == [] or force:
-            return
-        if "writing" in known:  # a run that was killed
-            return
-        if found != self.earlier:
-            raise GraphError(
-                f"{output} is there, and not as me2e-compress left it: choose another"
-                " name, or replace it by --force"
-            )
+    def of(self, name: str) -> dict[str, object]:
+        """Return what is known of one output."""
+        with _locked(self.handle):
+            entry = self._read().get(name)
+        return entry if isinstance(entry, dict) else {}
 
-    def note(self, name: str, **state: State) -> None:
+    def note(self, name: str, **states: State) -> None:
         """Write what is known of one output; of a missing one, nothing."""
+        known = {key: state for key, state in states.items() if state}
         with _locked(self.handle):
             entries = self._read()
-            entries.pop(name, None)
-            if "writing" in state or state.get("left"):
-                entries[name] = state
-            self._write(entries)
+            if known == entries.pop(name, {}):
+                return
+            self._write(entries | {name: known} if known else entries)
 
     def _read(self) -> dict[str, object]:
-        try:
-            found = documents.from_json(os.pread(self.handle, 1 << 26, 0))
-        except documents.MalformedError:  # new, or cut by a kill
-            return {}
-        return found if isinstance(found, dict) else {}
+        """Return the last record that is whole: a kill may have cut one."""
+        text = os.pread(self.handle, 1 << 26, 0)
+        for each in (text, *reversed(text.splitlines())):
+            try:
+                found = documents.from_json(each)
+            except documents.MalformedError:
+                continue
+            if isinstance(found, dict):
+                return found
+        return {}
 
     def _write(self, entries: dict[str, object]) -> None:
-        text = json.dumps(entries, indent=1, sort_keys=True).encode() + b"\n"
-        os.ftruncate(self.handle, 0)
-        os.pwrite(self.handle, text, 0)
+        """Write a record behind the earlier one, and then in its place.
+
+        The file is never replaced, for the locks are on it; so that one whole record
+        is in it at any time, the copy behind begins after both.
+        """
+        line = json.dumps(entries, sort_keys=True).encode() + b"\n"
+        size = os.fstat(self.handle).st_size
+        between = b"\n" * max(1, len(line) - size)
+        os.pwrite(self.handle, between + line, size)
+        os.pwrite(self.handle, line, 0)
+        os.ftruncate(self.handle, len(line))
 
     def close(self) -> None:
         """Close it, and remove it if it says nothing and nobody else has a lock."""
-        if not self._read() and _try_lock(self.handle, 0, 0):
+        if not self._read() and _try_lock(self.handle, 0, 0) and not self._read():
             self.path.unlink(missing_ok=True)
         os.close(self.handle)
 
@@ -231,12 +275,12 @@ def _locked(handle: int) -> Iterator[None]:
             fcntl.lockf(handle, fcntl.LOCK_UN, 1, 0)
 
 
-def _state(output: Path) -> State:
-    """Return size and time of a file, or of every file of a folder."""
+def _state(output: Path, name: str | None = None) -> State:
+    """Return name, size and time of a file, or of every file of a folder."""
     if not os.path.lexists(output):
         return None
     if not output.is_dir():
-        return [_signature(output, output.name)]
+        return [_signature(output, name or output.name)]
     files = (file for file in sorted(output.rglob("*")) if not file.is_dir())
     return [_signature(file, str(file.relative_to(output))) for file in files]
 

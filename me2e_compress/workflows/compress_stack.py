@@ -1,7 +1,6 @@
 """One compression of a stack of several files: file by file, measured as one model."""
 
 import dataclasses
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +9,7 @@ from time import process_time
 
 import numpy as np
 
+from me2e_compress import drafts
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.part_frames import PartFrames
 from me2e_compress.calibration.sample import Part
@@ -107,9 +107,7 @@ def _drafted(output: Path) -> Iterator[Path]:
             yield draft
         except GraphError as error:
             raise GraphError(str(error).replace(str(draft), str(output))) from error
-        if output.exists():
-            os.replace(output, Path(scratch) / "before")
-        os.replace(draft, output)
+        drafts.put(draft, output)
 
 
 def _compress(

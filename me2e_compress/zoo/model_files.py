@@ -1,9 +1,9 @@
 """Files of models, written all or nothing."""
 
-import os
 import tempfile
 from pathlib import Path
 
+from me2e_compress import drafts
 from me2e_compress.errors import GraphError
 
 
@@ -27,7 +27,7 @@ def write(path: Path, content: bytes) -> Path:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".model-") as folder:
             draft = Path(folder) / path.name
             draft.write_bytes(content)
-            os.replace(draft, path)
+            drafts.put(draft, path)
     except OSError as error:
         raise GraphError(f"{path}: cannot be written: {error.strerror}") from error
     return path

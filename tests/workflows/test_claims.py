@@ -1,12 +1,16 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from me2e_compress import drafts
 from me2e_compress.errors import GraphError
+from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.claims import RECORD, check_ours, writing
 
 THEIRS = "is there, and not as me2e-compress left it"
@@ -60,6 +64,26 @@ def test_a_run_that_failed_owns_what_it_wrote_and_nothing_else(tmp_path: Path) -
         check_ours([tmp_path / "theirs"])
 
 
+def test_looking_first_changes_nothing_of_what_is_known(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("study.json", "tables.md", "report.html")]
+    with writing(files):
+        for file in files:
+            file.write_text(file.name)
+    known = (tmp_path / RECORD).read_text()
+    check_ours(files)
+    assert (tmp_path / RECORD).read_text() == known
+
+
+def test_outputs_that_are_not_written_stay_ours(tmp_path: Path) -> None:
+    files = [tmp_path / "one", tmp_path / "other"]
+    with writing(files):
+        for file in files:
+            file.write_text(file.name)
+    with writing(files):
+        pass
+    check_ours(files)
+
+
 def test_a_run_without_an_output_leaves_no_record(tmp_path: Path) -> None:
     with writing([tmp_path / "out"], folders=[tmp_path / "folder"]):
         pass
@@ -96,10 +120,11 @@ def test_a_device_is_no_output() -> None:
 BUSY = """
 import sys
 from pathlib import Path
+from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.claims import writing
 out = Path(sys.argv[1])
 with writing([out], folders=[out.parent / "results"]):
-    out.write_text("half")
+    write_bytes(out, b"half")
     print("busy", flush=True)
     sys.stdin.read()
 """
@@ -123,7 +148,7 @@ def test_one_writes_at_a_time_and_a_killed_run_is_gone_on_with(tmp_path: Path) -
             pass
         write(tmp_path / "beside")  # another output of the same folder
         other.kill()
-    assert "writing" in json.loads((tmp_path / RECORD).read_text())["out"]
+    assert "next" in json.loads((tmp_path / RECORD).read_text())["out"]
     write(out)
     assert out.read_text() == "ours"
 
@@ -134,3 +159,88 @@ def test_a_record_that_says_nothing_owns_nothing(tmp_path: Path, text: str) -> N
     (tmp_path / "out").write_text("theirs")
     with pytest.raises(GraphError, match=THEIRS):
         write(tmp_path / "out")
+
+
+Kept = Callable[[], None]
+
+
+def kills(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, work: Kept, copies: Path
+) -> list[Path]:
+    """Copy a folder as a kill would leave it: before each write, and in its middle."""
+    made = list[Path]()
+
+    def keep() -> None:
+        made.append(shutil.copytree(folder, copies / str(len(made)), symlinks=True))
+
+    def first(call: Callable[..., object]) -> Callable[..., object]:
+        def kept(*given: object, **options: object) -> object:
+            keep()
+            return call(*given, **options)
+
+        return kept
+
+    def halved(handle: int, content: bytes, place: int) -> int:
+        keep()
+        pwrite(handle, content[: len(content) // 2], place)
+        keep()
+        return pwrite(handle, content, place)
+
+    pwrite = os.pwrite
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", halved)
+        for name in ("replace", "ftruncate", "unlink"):
+            patch.setattr(os, name, first(getattr(os, name)))
+        work()
+    keep()
+    return made
+
+
+@pytest.mark.parametrize("runs_before", [0, 1])
+def test_what_a_kill_leaves_is_gone_on_with_and_what_users_change_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runs_before: int
+) -> None:
+    names = ("study.json", "tables.md")
+    folder = tmp_path / "study"
+    folder.mkdir()
+
+    def run(where: Path = folder, text: str = "written once more") -> None:
+        files = [where / name for name in names]
+        check_ours(files)
+        with writing(files):
+            for file in files:
+                write_bytes(file, text.encode())
+
+    for _ in range(runs_before):
+        run(text="written")
+    copies = kills(monkeypatch, folder, run, tmp_path / "copies")
+    assert len(copies) > 20
+    for copy in copies:
+        check_ours(there := [copy / name for name in names if (copy / name).exists()])
+        for file in there:
+            ours, about = file.read_text(), file.stat()
+            file.write_text("changed by me")
+            with pytest.raises(GraphError, match=THEIRS):
+                check_ours([file])
+            file.write_text(ours)
+            os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
+        run(copy)
+        check_ours([copy / name for name in names])
+
+
+def test_a_folder_that_a_kill_left_half_replaced_is_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    top = tmp_path / "top"
+    top.mkdir()
+
+    def run(where: Path = top) -> None:
+        with writing(trees=[where / "frames"]):
+            (where / "draft").mkdir(exist_ok=True)
+            (where / "draft" / "000000.npz").write_text("ours")
+            drafts.put(where / "draft", where / "frames")
+
+    run()
+    for copy in kills(monkeypatch, top, run, tmp_path / "copies"):
+        run(copy)
+        assert sorted(each.name for each in copy.iterdir()) == [RECORD, "frames"]

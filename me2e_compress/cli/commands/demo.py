@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import console, listening, show
+from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.demo_stack import StackDemo
@@ -61,4 +62,5 @@ def demo(
             found = step(listener)
         show(found)
     with writing([output / PICTURE], force=force):
-        console.save_svg(str(output / PICTURE), title="me2e-compress demo")
+        picture = console.export_svg(title="me2e-compress demo")
+        write_bytes(output / PICTURE, picture.encode())
