@@ -50,7 +50,7 @@ def reading(
         yield
     except OSError as cause:
         raise error(f"{path}: {cause.strerror}") from cause
-    except MalformedError as cause:
+    except (MalformedError, UnicodeDecodeError) as cause:
         raise error(f"{path}: {otherwise}: {cause}") from cause
     except ValidationError as cause:
         first = cause.errors(include_url=False)[0]

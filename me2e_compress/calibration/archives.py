@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
@@ -11,23 +10,10 @@ from typing import IO
 import numpy as np
 
 from me2e_compress.errors import FramesError
-from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.frames import UNREADABLE, Array
 
 LARGEST_BYTES = 2 << 30
 """The most bytes of all arrays of one file. Six full-size camera images have 0.1 GB."""
-
-_UNREADABLE = (
-    OSError,
-    EOFError,
-    ValueError,  # pickled objects, headers that lie
-    SyntaxError,  # or are no Python
-    OverflowError,
-    RecursionError,
-    MemoryError,
-    RuntimeError,  # encrypted, or compressed as zipfile does not know
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +43,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
     try:
         with path.open("rb") as source, zipfile.ZipFile(source) as archive:
             found = [_member(archive, each) for each in archive.infolist()]
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         line = " ".join(str(error).split())[:200]
         raise FramesError(f"{path}: not {what} ({line})") from error
     if len(dict(found)) < len(found):
@@ -85,7 +71,7 @@ def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as content:
             return {name: np.asarray(content[name]) for name in content}
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         line = " ".join(str(error).split())[:200]
         raise FramesError(f"{path}: not {what} ({line})") from error
 

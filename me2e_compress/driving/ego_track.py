@@ -1,5 +1,6 @@
 """Where the ego has been on this route, as its decisions saw it."""
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,7 +41,10 @@ class EgoTrack:
         Between decisions it is interpolated; before the first one the ego stood where
         it then was, at the speed that it had. At least one pose must have been noted.
         """
-        states = np.array(self._states, np.float64)
+        # what is older than all of them is not looked at: a route has thousands
+        first = max(0, bisect_right(self._times_us, float(np.min(times_us))) - 1)
+        states = np.array(self._states[first:], np.float64)
         states[:, 2] = np.unwrap(states[:, 2])
-        columns = [np.interp(times_us, self._times_us, each) for each in states.T]
+        known = self._times_us[first:]
+        columns = [np.interp(times_us, known, each) for each in states.T]
         return np.stack(columns, axis=1)

@@ -1,6 +1,8 @@
 """Frames: what a model sees at one moment."""
 
 import dataclasses
+import zipfile
+import zlib
 from collections.abc import Iterator
 from typing import Protocol, TypeAlias
 
@@ -10,6 +12,20 @@ import numpy.typing as npt
 from me2e_compress.runtime.recorded_future import RecordedFuture
 
 Array: TypeAlias = npt.NDArray[np.generic]
+
+UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,  # pickled objects, headers that lie
+    SyntaxError,  # or are no Python
+    OverflowError,
+    RecursionError,
+    MemoryError,
+    RuntimeError,  # encrypted, or compressed as zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy and zipfile raise of a file of arrays that is none."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -141,7 +141,7 @@ class PlanAdapter(pydantic.BaseModel):
         """
         if self.scores is None:
             raise GraphError(f"nothing names the scores of {self.output}")
-        return int(np.argmax(np.asarray(outputs[self.scores], np.float64)[0]))
+        return int(np.argmax(np.asarray(outputs[self.scores], np.float64).reshape(-1)))
 
     def _laid_out(self, value: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         if self.shape is None:
@@ -176,6 +176,10 @@ class PlanAdapter(pydantic.BaseModel):
 
     def _picked(self, outputs: Arrays, inputs: Arrays, modes: int) -> int:
         if self.scores is not None:
+            if (count := np.size(outputs[self.scores])) != modes:
+                raise GraphError(
+                    f"{self.scores} has {count} scores, and {self.output} {modes} modes"
+                )
             return self.choice(outputs)
         if self.command_input is not None and self.command_input in inputs:
             given: Any = np.asarray(inputs[self.command_input]).reshape(-1)

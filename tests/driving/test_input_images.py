@@ -37,7 +37,9 @@ def images_of(
 ) -> InputImages:
     read = ImageInput.model_validate(table)
     port = ImagePort.of("img", shape, read)
-    return InputImages(read, port, rendered_size("img", read, port), norm)
+    made = InputImages(read, port, rendered_size("img", read, port), norm)
+    made.check("img")
+    return made
 
 
 def test_the_cameras_are_those_of_the_rig() -> None:
@@ -239,6 +241,27 @@ def test_a_wrong_table_is_refused(table: dict[str, Any], words: str) -> None:
         ({"layout": "chw"}, (3, 8, 8), r"has shape \[3, 8, 8\]"),
         ({"size": [9, 8]}, (1, 6, 3, 8, 8), "a size of 9 x 8 does not fit"),
         ({"stitch": True}, (1, 3, 8, 8), "camera_size must say"),
+        (
+            {
+                "cameras": ["FRONT", "BACK"],
+                "stitch": True,
+                "camera_size": [900, 1600],
+                "rendered": [288, 512],
+                "crop": [[0, 0, 100, 299], [0, 2, 100, 301]],
+            },
+            (1, 3, 8, 8),
+            "rendered in 288 x 512, the crops that are stitched have 95 and 96 rows",
+        ),
+        (
+            {
+                "cameras": ["FRONT"],
+                "camera_size": [900, 1600],
+                "rendered": [9, 16],
+                "crop": [[0, 0, 1, 900]],
+            },
+            (1, 3, 8, 8),
+            "rendered in 9 x 16, a crop has no pixel",
+        ),
     ],
 )
 def test_images_that_do_not_fit_the_input_are_refused(

@@ -102,6 +102,8 @@ def test_in_our_axes_the_extrinsics_are_those_of_the_rig() -> None:
         ("command{one_hot=4}", r"numbers \[0, 1, 2, 3, 4, 5\] do not fit one_hot = 4"),
         ("past{steps=0}", "past: 0 steps 0.5 s apart"),
         ("constant{values=[1], shape=[2]}", r"1 values have no shape \[2\]"),
+        ("constant{values=[1, 2], shape=[-1, -2]}", r"no shape \[-1, -2\]"),
+        ("constant{values=[1e300]}", "values must be finite, up to 1e.18"),
         ("velocities", "no input source 'velocities'; there are speed, velocity"),
         ("target-point:middle", "target-point: which: Input should be 'near' or 'far'"),
     ],

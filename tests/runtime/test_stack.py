@@ -1,5 +1,6 @@
 """Files of a stack: how they are joined, and what is said where they do not fit."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -290,6 +291,17 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
         (TWO_PARTS.replace("backbone", "head"), {}, "two parts are called head"),
         (TWO_PARTS + "[egdes]\n", {}, "not a stack of several files: egdes: Extra"),
         ("part = 1", {}, "not a stack of several files: part:"),
+        (
+            TWO_PARTS + "[metadata]\nwhen = 2026-01-01\n",
+            {},
+            "metadata: Value error, when: Object of type date is not JSON",
+        ),
+        (
+            TWO_PARTS + "[metadata]\nmost = inf\n",
+            {},
+            "metadata: Value error, most: Out of range float values",
+        ),
+        (STATE % "cut.npz", {}, "first value cut.npz cannot be read"),
     ],
 )
 def test_files_that_do_not_fit_each_other_are_one_line(
@@ -297,6 +309,10 @@ def test_files_that_do_not_fit_each_other_are_one_line(
 ) -> None:
     path = write_stack(tmp_path, toml, **texts)
     np.save(tmp_path / "wide.npy", np.zeros(5, np.float32))
+    with zipfile.ZipFile(tmp_path / "cut.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("prev_bev.npy", b"\x93NUMPY" * 9)
+    whole = (tmp_path / "cut.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole.replace(whole[42:50], b"\xff" * 8))
 
     with pytest.raises((GraphError, FramesError)) as caught:
         list(replay(open_session(path), ones(True, False)))

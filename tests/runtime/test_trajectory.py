@@ -89,6 +89,13 @@ def test_what_picks_the_mode(
     assert adapter.plan({"way": MODES}, inputs)[0, 0] == mode
 
 
+@pytest.mark.parametrize("shape", [(3,), (1, 3), (1, 1, 3)])
+def test_the_largest_score_picks_the_mode(shape: tuple[int, ...]) -> None:
+    votes = np.array([0.1, 0.2, 0.7]).reshape(shape)
+    adapter = PlanAdapter(output="way", scores="votes")
+    assert adapter.plan({"way": MODES, "votes": votes}, {})[0, 0] == 2
+
+
 @pytest.mark.parametrize(
     ("adapter", "message"),
     [
@@ -98,11 +105,12 @@ def test_what_picks_the_mode(
             PlanAdapter(output="way", command_input="go", command_modes=(0,)),
             "command_modes names no mode of command 5",
         ),
+        (PlanAdapter(output="way", scores="few"), "few has 2 scores, and way 3 modes"),
     ],
 )
 def test_a_mode_that_nothing_picks(adapter: PlanAdapter, message: str) -> None:
     with pytest.raises(GraphError, match=message):
-        adapter.plan({"way": MODES}, {"go": np.array([5])})
+        adapter.plan({"way": MODES, "few": np.ones((1, 2))}, {"go": np.array([5])})
 
 
 @pytest.mark.parametrize(

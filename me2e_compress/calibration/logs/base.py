@@ -207,7 +207,7 @@ def matrix_of(value: object, shape: tuple[int, ...], what: str) -> Floats:
     """
     try:
         found = np.array(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FramesError(f"{what}: no {list(shape)} of numbers") from error
     if found.shape != shape:
         raise FramesError(f"{what}: has shape {list(found.shape)}, not {list(shape)}")

@@ -121,7 +121,7 @@ class _Clip(Sequence[Moment]):
             raise FramesError(f"{path}: is not named by its number")
         try:
             return self._of(about, path, number)
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             line = " ".join(str(error).split())[:100]
             said = f"{path}: not an annotation of Bench2Drive ({line})"
             raise FramesError(said) from error
@@ -203,13 +203,14 @@ def _command(near: object, path: Path) -> int:
 def _agents(boxes: Sequence[Mapping[str, Any]], path: Path) -> list[Agent]:
     """Read the road users; the first box is the ego."""
     ego, *others = boxes
+    _, _, road = matrix_of(ego["location"], (3,), f"{path}: ego's location").tolist()
     found = list[Agent]()
     for box in others:
         if box["class"] not in ROAD_USERS:
             continue
         what = f"{path}: box {box.get('id')}"
         x, y, z = matrix_of(box["center"], (3,), what).tolist()
-        if abs(z - ego["location"][2]) > STOREY_M:
+        if abs(z - road) > STOREY_M:
             continue
         half_length, half_width, _ = matrix_of(box["extent"], (3,), what).tolist()
         heading = -math.radians(matrix_of(box["rotation"], (3,), what).tolist()[-1])

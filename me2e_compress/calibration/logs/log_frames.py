@@ -195,8 +195,12 @@ def _fed(array: Array, form: InputForm, name: str) -> Array:
         return array.reshape(lead + array.shape)
     missing = len(form.shape) - array.ndim
     sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]
-    fits = len(sides) == len(form.shape) and all(
-        want in (None, have) for have, want in zip(sides, form.shape, strict=True)
+    fits = (
+        array.size == math.prod(sides)
+        and len(sides) == len(form.shape)
+        and all(
+            want in (None, have) for have, want in zip(sides, form.shape, strict=True)
+        )
     )
     if not fits:
         raise FramesError(

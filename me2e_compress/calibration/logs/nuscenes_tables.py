@@ -20,6 +20,8 @@ ROAD_USERS = ("vehicle.", "human.")
 """Categories that a plan collides with, as UniAD and VAD take them."""
 NAMES = ("token", "name", "next", "channel")
 TIMES = ("timestamp", "utime")
+LATEST_US = 1 << 62
+"""Of a time, microseconds."""
 PIECE = 1 << 22
 """Characters that are read at once; no row is larger."""
 _SPACE = " \t\r\n,"
@@ -47,7 +49,9 @@ def _check(row: Row, name: str, index: int) -> None:
     if name not in row:
         raise documents.MalformedError(f"row {index} has no {name}")
     kind = int if name in TIMES else str if name.endswith(NAMES) else object
-    if not isinstance(row[name], kind):
+    found = row[name]
+    late = isinstance(found, int) and kind is int and abs(found) > LATEST_US
+    if late or not isinstance(found, kind):
         raise documents.MalformedError(f"row {index}: {name} is {row[name]!r:.40}")
 
 

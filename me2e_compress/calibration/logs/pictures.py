@@ -56,7 +56,7 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
     if found is None:
         raise FramesError(f"{path}: not a readable picture")
     height, width = found.shape[:2]
-    rows = round(height * columns / width)
+    rows = max(1, round(height * columns / width))
     if (rows, columns) != (height, width):
         found = cv2.resize(found, (columns, rows))
     above = max(0, rows - pixels.rows)

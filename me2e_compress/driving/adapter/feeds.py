@@ -13,6 +13,9 @@ from me2e_compress.runtime.frames import Array
 
 Levels = float | tuple[float, ...]
 
+LARGEST = 1e30
+"""The largest mean or std: within float32."""
+
 
 @dataclass(frozen=True)
 class FeedPart:
@@ -137,7 +140,10 @@ class Feed(BaseModel):
 def _levels(name: str, value: Any) -> Levels:
     numbers = value if isinstance(value, list) else [value]
     if not numbers or not all(
-        isinstance(each, int | float) and not isinstance(each, bool) for each in numbers
+        isinstance(each, int | float)
+        and not isinstance(each, bool)
+        and abs(each) <= LARGEST
+        for each in numbers
     ):
-        raise ValueError(f"{name} must be a number, or a list of numbers")
+        raise ValueError(f"{name} must be a finite number, or a list of such")
     return tuple(map(float, value)) if isinstance(value, list) else float(value)

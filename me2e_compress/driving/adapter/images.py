@@ -5,7 +5,13 @@ from typing import Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+)
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
@@ -27,13 +33,20 @@ class ImageNormalization(BaseModel):
         scale: What pixels are multiplied by before that.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     input: str = "img"
     mean: Triple
     std: Triple
     order: Literal["rgb", "bgr"]
-    scale: float = 1.0
+    scale: float = Field(default=1.0, gt=0.0)
+
+    @field_validator("std")
+    @classmethod
+    def _divides(cls, std: Triple) -> Triple:
+        if not all(std):
+            raise ValueError("std is zero")
+        return std
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> Self:

@@ -13,7 +13,7 @@ from me2e_compress.driving.adapter.image_inputs import (
     ImagePort,
 )
 from me2e_compress.driving.adapter.images import ImageNormalization
-from me2e_compress.errors import MissingExtraError
+from me2e_compress.errors import EvaluationError, MissingExtraError
 from me2e_compress.runtime.frames import Array
 
 Bytes = npt.NDArray[np.uint8]
@@ -58,6 +58,27 @@ class InputImages:
             )
             for left, top, right, bottom in crops
         )
+
+    def check(self, name: str) -> None:
+        """Check that what is taken is there, and can be joined.
+
+        Args:
+            name: Of the input.
+
+        Raises:
+            EvaluationError: A crop of the rendered pictures has no pixel, or those that
+                are stitched have different heights.
+        """
+        rows, columns = self.rendered
+        said = f"input {name}: of cameras rendered in {rows} x {columns}"
+        if not all(a < c and b < d for a, b, c, d in self.windows):
+            raise EvaluationError(f"{said}, a crop has no pixel")
+        heights = sorted({bottom - top for _, top, _, bottom in self.windows})
+        if self.table.stitch and len(heights) > 1:
+            raise EvaluationError(
+                f"{said}, the crops that are stitched have {heights[0]} and"
+                f" {heights[-1]} rows: choose crops or a rendered size that divide"
+            )
 
     @property
     def size(self) -> tuple[int, int]:

@@ -193,7 +193,11 @@ def feeds_by_input(
 def images_by_input(
     session: AnySession, adapter: Adapter, tables: Mapping[str, ImageInput]
 ) -> tuple[dict[str, InputImages], tuple[int, int]]:
-    """Return the image inputs, and the size in which the cameras are rendered."""
+    """Return the image inputs, and the size in which the cameras are rendered.
+
+    Raises:
+        EvaluationError: One cannot be made so, or its normalisation is not known.
+    """
     ports = {
         name: ImagePort.of(name, session.inputs[name].shape, table)
         for name, table in tables.items()
@@ -210,6 +214,7 @@ def images_by_input(
                 usual = ImageNormalization.of(session.metadata)
             norm = table.normalization(name, usual)
         found[name] = InputImages(table, ports[name], rendered, norm)
+        found[name].check(name)
     return found, rendered
 
 

@@ -1,6 +1,6 @@
 """What a graph's outputs say, as a policy's answer."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -14,6 +14,9 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
+
+COMMAND = "command"
+"""What the navigator's command is called beside the inputs."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class ModelOutputs:
             if fusion is None:
                 return cls(adapter, None, control, None)
         plan = plan_of(adapter.plan, session.metadata, outputs)
+        check_command(plan, session.inputs)
         return cls(adapter, plan, control, fusion)
 
     def reset(self) -> None:
@@ -73,7 +77,7 @@ class ModelOutputs:
         if self.plan is None:
             return None
         command = np.array([observation.command])
-        points = self.plan.plan(outputs, {**feeds, "command": command})
+        points = self.plan.plan(outputs, {**feeds, COMMAND: command})
         return self.plan.trajectory(self.adapter.to_ego(points))
 
     def answer(
@@ -120,6 +124,20 @@ def check_control(control: ControlAdapter, outputs: Sequence[str]) -> None:
                 f"no output {name}, which the adapter names as {what}; there are "
                 f"{', '.join(outputs)}"
             )
+
+
+def check_command(plan: PlanAdapter, inputs: Collection[str]) -> None:
+    """Check that what picks the plan's mode is there: an input, or the command.
+
+    Raises:
+        EvaluationError: It is not.
+    """
+    if plan.command_input not in (None, COMMAND, *inputs):
+        raise EvaluationError(
+            f"no input {plan.command_input}, which picks the plan's mode"
+            f" (command_input); there are {COMMAND}, the navigator's, and"
+            f" {', '.join(inputs)}"
+        )
 
 
 def plan_of(

@@ -10,6 +10,9 @@ from me2e_compress.driving.input_sources.base import InputSource, Observed
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 
+LARGEST = 1e18
+"""The largest value: within int64."""
+
 
 @dataclass(frozen=True)
 class Constant(InputSource):
@@ -20,7 +23,7 @@ class Constant(InputSource):
         shape: Their shape; empty for one row of them.
 
     Raises:
-        EvaluationError: The shape has not as many.
+        EvaluationError: The shape has not as many, or one is not finite.
     """
 
     name: ClassVar[str] = "constant"
@@ -29,7 +32,10 @@ class Constant(InputSource):
 
     def __post_init__(self) -> None:
         """Check the shape."""
-        if self.shape and math.prod(self.shape) != len(self.values):
+        if not all(abs(each) <= LARGEST for each in self.values):
+            raise EvaluationError(f"constant: values must be finite, up to {LARGEST:g}")
+        sides = self.shape or (len(self.values),)
+        if min(sides) < 0 or math.prod(sides) != len(self.values):
             raise EvaluationError(
                 f"constant: {len(self.values)} values have no shape {list(self.shape)}"
             )

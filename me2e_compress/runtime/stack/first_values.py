@@ -1,12 +1,11 @@
 """First values of recurrent inputs, from files."""
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from me2e_compress.errors import GraphError
-from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.frames import UNREADABLE, Array
 from me2e_compress.runtime.recurrence import SessionPort
 from me2e_compress.runtime.stack.part_graph import misfit, told
 
@@ -30,7 +29,7 @@ def read_value(path: Path, name: str, where: str) -> Array:
             return np.asarray(held[name])
     except KeyError as error:
         raise GraphError(f"{where} holds no array {name}") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         line = " ".join(str(error).split())
         raise GraphError(f"{where} cannot be read: {line}") from error
 

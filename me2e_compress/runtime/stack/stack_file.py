@@ -94,6 +94,16 @@ class StackFile(pydantic.BaseModel):
     )
     metadata: dict[str, Any] = pydantic.Field(default_factory=dict)
 
+    @pydantic.field_validator("metadata")
+    @classmethod
+    def _as_json(cls, metadata: dict[str, Any]) -> dict[str, Any]:
+        for key, value in metadata.items():
+            try:
+                json.dumps(value, allow_nan=False)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{key}: {error}") from error
+        return metadata
+
     @pydantic.model_validator(mode="after")
     def _once(self) -> Self:
         names = [each.name for each in self.part]

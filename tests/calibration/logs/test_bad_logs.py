@@ -118,6 +118,18 @@ NAN = float("nan")
             table("sample", lambda found: found[0].update(next="?")),
             "scene-0001 breaks off at '\\?'",
         ),
+        (
+            table("sample", lambda found: found[0].update(timestamp=10**400)),
+            "row 0: timestamp is 1000",
+        ),
+        (
+            table("ego_pose", lambda f: f[0].update(translation=[0, 10**400, 0])),
+            r"scene-0001-0 LIDAR_TOP: translation: no \[3\] of numbers",
+        ),
+        (
+            lambda root: (root / "v1.0-mini/scene.json").write_bytes(b"[\xff]"),
+            "scene.json: not a table of nuScenes: .*can't decode byte 0xff",
+        ),
         (without(FRONT), "CAM_FRONT/scene-0001-0.png: No such file"),
         (cut(FRONT), "scene-0001-0.png: the picture breaks off, or is no JPEG or PNG"),
     ],
@@ -161,6 +173,11 @@ def annotation(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], N
         ),
         (annotation(lambda a: a.update(command_near=7)), "command_near 7 is none of"),
         (annotation(lambda a: a.update(bounding_boxes=[])), "not an annotation"),
+        (annotation(lambda a: a.update(x=10**400)), "not an annotation of Bench2Drive"),
+        (
+            annotation(lambda a: a["bounding_boxes"][0].update(location=[1, 2])),
+            r"ego's location: has shape \[2\], not \[3\]",
+        ),
         (without(f"{CLIP}/camera/rgb_back/00000.jpg"), "rgb_back/00000.jpg: No such"),
         (cut(f"{CLIP}/camera/rgb_front/00000.jpg"), "rgb_front/00000.jpg: the picture"),
     ],

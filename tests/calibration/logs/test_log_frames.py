@@ -326,6 +326,10 @@ def test_it_goes_on_with_a_scene(tmp_path: Path) -> None:
         ({"img": InputForm((1, 6, 3, 64, 80), np.dtype(np.uint8))}, "img is uint8"),
         ({"img": InputForm((6, 3, 64, 80), F32), "width": 99}, "99 columns .* img: 80"),
         ({"l2g_t": InputForm((1, 4), F32)}, r"l2g_t takes \[1, 4\], a log gives \[3\]"),
+        (
+            {"lidar2img": InputForm((4, 4), F32)},
+            r"lidar2img takes \[4, 4\], a log gives \[6, 4, 4\]",
+        ),
     ],
 )
 def test_what_a_log_cannot_feed_is_named(

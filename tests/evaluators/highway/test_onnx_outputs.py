@@ -116,6 +116,10 @@ def test_a_control_out_of_its_range_ends_the_route(
         ("[plan]\noutput = 'plan'\nstep_s = 0", "plan.step_s: Input should be greater"),
         ("[plan]\noutput = 'plan'\nshape = [6, 0]", "every side is 1 or more"),
         ("[plan]\noutput = 'plan'\ncommand_modes = [0]", "without command_input"),
+        (
+            "[plan]\noutput = 'plan'\ncommand_input = 'comand'",
+            "no input comand, which picks the plan's mode (command_input); there are",
+        ),
     ],
 )
 def test_what_does_not_fit_is_one_line(tmp_path: Path, toml: str, message: str) -> None:
