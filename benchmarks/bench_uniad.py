@@ -109,7 +109,7 @@ def _torch(given: argparse.Namespace) -> dict[str, object]:
             outputs = model(*(torch.from_numpy(feeds[name]) for name in spec.inputs))
         return dict(zip(spec.outputs, (x.numpy() for x in outputs), strict=True))
 
-    state = _drive(given, "torch", run)
+    state = drive(given, "torch", run)
     return {"tracks": int((state["prev_track_obj_idxes"] > 0).sum())}
 
 
@@ -117,11 +117,11 @@ def _onnxruntime(given: argparse.Namespace) -> dict[str, object]:
     from me2e_compress.runtime.session import Session
 
     session = Session(_model(given))
-    _drive(given, "onnxruntime", session.run)
+    drive(given, "onnxruntime", session.run)
     return {}
 
 
-def _drive(
+def drive(
     given: argparse.Namespace, runtime: str, run: Callable[[Outputs], Outputs]
 ) -> Outputs:
     """Run the frames one after another, each fed the state of the one before."""
@@ -137,7 +137,7 @@ def _drive(
             _save(path, named)
         state = {name: named[answer] for name, answer in spec.recurrent.items()}
         if runtime == "onnxruntime":
-            _note(given.out, _errors(given.out, spec, index + 1))
+            _note(given.out, errors_of(given.out, spec, index + 1))
     return state
 
 
@@ -175,7 +175,7 @@ def _truth(given: argparse.Namespace) -> dict[str, object]:
     return {"nodes": len(hits), "placed_right": round(share, 5), "gmacs": macs}
 
 
-def _errors(out: Path, spec: Stack, frames: int) -> list[dict[str, object]]:
+def errors_of(out: Path, spec: Stack, frames: int) -> list[dict[str, object]]:
     """Return the output that is furthest off in every frame, and by how much."""
     found = []
     for index in range(frames):

@@ -9,14 +9,19 @@ import pytest
 
 from me2e_compress.zoo.uniad.config import CONFIGS
 
+FRAMES = 10
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stack", CONFIGS)
 def test_onnxruntime_agrees_with_torch(stack: str, tmp_path: Path) -> None:
-    command = ["-m", "benchmarks.bench_uniad", str(tmp_path), "--stack", stack]
+    command = [sys.executable, "-m", "benchmarks.bench_uniad", str(tmp_path)]
+    options = ["--stack", stack, "--frames", str(FRAMES)]
     done = subprocess.run(
-        [sys.executable, *command], check=True, text=True, stdout=subprocess.PIPE
+        [*command, *options], check=True, text=True, stdout=subprocess.PIPE
     )
     exported, *_, errors = done.stdout.splitlines()
     assert json.loads(exported.removeprefix("export: "))["peak_gb"] < 8
-    assert max(frame["error"] for frame in json.loads(errors)) < 1e-4
+    found = [frame["error"] for frame in json.loads(errors)]
+    assert len(found) == FRAMES
+    assert max(found) < 1e-4
