@@ -70,6 +70,7 @@ class VariantOutcome:
             "policy": prepared.variant.policy,
             "pipeline": prepared.pipeline or None,
             "model_sha256": prepared.sha256,
+            "weights": prepared.weights,
             "size": measure_json(self.size_mb),
             "fidelity": self.fidelity.to_json(),
             "latency": {

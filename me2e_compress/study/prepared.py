@@ -20,8 +20,9 @@ from me2e_compress.study.workspace import Workspace
 from me2e_compress.version import __version__
 from me2e_compress.workflows.compress import CompressOptions, compress
 from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_try import try_file
+from me2e_compress.workflows.first_try import load_interface, try_file
 from me2e_compress.workflows.listener import Listener
+from me2e_compress.zoo.weights_record import named_weights
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class PreparedVariant:
         sha256: Of the model.
         size_bytes: Of the model with its weights.
         failure: Why there is no model that can drive; empty if there is one.
+        weights: The checkpoint that the model was made of, in a line; empty: not known.
     """
 
     variant: Variant
@@ -47,6 +49,7 @@ class PreparedVariant:
     sha256: str | None = None
     size_bytes: int | None = None
     failure: str = ""
+    weights: str = ""
 
 
 def prepare_all(
@@ -108,8 +111,10 @@ def prepare_variant(
     origin = source.name, to_text(variant.passes)
     if not variant.passes:
         origin = _reported_beside(model, sha256) or origin
+    weights = named_weights(load_interface(model).metadata_props)
+    size = graph.file_bytes(model)
     return PreparedVariant(
-        variant, driver, model, *origin, sha256, graph.file_bytes(model)
+        variant, driver, model, *origin, sha256, size, weights=weights
     )
 
 

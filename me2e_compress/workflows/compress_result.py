@@ -19,6 +19,7 @@ from me2e_compress.workflows.compress_verdict import (
 )
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.result import Result, Table, megabytes
+from me2e_compress.zoo.weights_record import named_weights
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -54,6 +55,11 @@ class CompressResult(Result):
         return beside(self.output, "report")
 
     @property
+    def weights(self) -> str:
+        """The checkpoint that the graph was made of, in a line; empty: not known."""
+        return named_weights(self.report.model.metadata_props)
+
+    @property
     def headline(self) -> str:
         """File, size, report."""
         share = self.output_bytes / self.source_bytes
@@ -74,7 +80,8 @@ class CompressResult(Result):
 
     def lines(self) -> tuple[str, ...]:
         """Return the verdict: size, int8, how far outputs and plan moved, time."""
-        return (*verdict(self.report, self.int8, self.loss), self._time, self.headline)
+        said = (*verdict(self.report, self.int8, self.loss), self._time, self.headline)
+        return (*said, *filter(None, [self.weights]))
 
     def alerts(self) -> tuple[str, ...]:
         """Return what must not be overlooked: no int8, or quality below the floor."""
@@ -170,7 +177,8 @@ def write_result(
     graph.save(with_own_domains(report.model), output)
     if plan is not None:
         save_plan(plan, beside(output, "plan"))
-    record = report.record(source, output) | loss_record(report, int8, loss)
+    weights = {"weights": named_weights(report.model.metadata_props)}
+    record = report.record(source, output) | weights | loss_record(report, int8, loss)
     write_json(beside(output, "report"), record, indent=2)
     sizes = graph.file_bytes(source), graph.file_bytes(output)
     return CompressResult(source, output, report, record, *sizes, int8, loss, seconds)

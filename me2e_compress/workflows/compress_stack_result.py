@@ -66,8 +66,10 @@ class StackCompressResult(Result):
         return tuple(each for file in self.files.values() for each in file.tables())
 
     def lines(self) -> tuple[str, ...]:
-        """Return the verdict: how far outputs and plan moved, time, size."""
-        return (*self._fidelity(), f"took {self.seconds:.0f} CPU s", self.headline)
+        """Return the verdict: how far outputs and plan moved, time, size, weights."""
+        said = (*self._fidelity(), f"took {self.seconds:.0f} CPU s", self.headline)
+        weights = dict.fromkeys(each.weights for each in self.files.values())
+        return (*said, *filter(None, weights))
 
     def alerts(self) -> tuple[str, ...]:
         """Return what must not be overlooked in a file, or in the whole."""

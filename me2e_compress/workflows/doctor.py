@@ -21,9 +21,18 @@ from me2e_compress.workflows.result import Result, Table, table
 _EXTRAS = (
     ("torch", "zoo", "export the reference stacks, train the driver"),
     ("highway_env", "highway", "drive models in closed loop"),
+    ("cv2", "logs", "make frames of recorded driving (frames --from)"),
     ("tensorrt_rtx", "trt-check", "parse and build for TensorRT without a GPU"),
     ("onnxslim", "bench", "compare with onnxslim in the benchmarks"),
 )
+
+_OPENCV = (
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+)
+"""Packages that bring cv2, each alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,9 +107,16 @@ def _packages() -> list[Checkup]:
             advice = f"{purpose}: pip install 'me2e-compress[{extra}]'"
             found.append(Checkup(module, None, advice))
         else:
-            name = module.replace("_", "-")
-            found.append(Checkup(module, importlib.metadata.version(name)))
+            found.append(Checkup(module, _version(module)))
     return found
+
+
+def _version(module: str) -> str:
+    """Return the version of the package that brings a module."""
+    for package in _OPENCV if module == "cv2" else (module.replace("_", "-"),):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            return importlib.metadata.version(package)
+    return "of unknown version"
 
 
 def _kernels() -> Checkup:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import pydantic
 
 from me2e_compress.documents import MalformedError, from_json
+from me2e_compress.zoo.stacks import STACKS
 
 RECORD = "me2e.weights"
 """Key of the metadata that says which checkpoint a graph was made of."""
@@ -60,14 +61,19 @@ class WeightsRecord:
 
 
 def named_weights(metadata: Mapping[str, str]) -> str:
-    """Return the line that names the checkpoint of a graph; empty if nothing does.
+    """Return the line that names the checkpoint of a graph; empty if nothing is known.
+
+    A stack that was exported without one has random weights.
 
     Args:
         metadata: Of the graph, by key.
     """
     text = metadata.get(RECORD)
     if text is None:
-        return ""
+        stack = STACKS.get(metadata.get("me2e.stack", ""))
+        if stack is None or stack.trained:
+            return ""
+        return f"weights: random, as {stack.name} is exported: no {RECORD} names others"
     try:
         record = pydantic.TypeAdapter(WeightsRecord).validate_python(from_json(text))
     except (MalformedError, pydantic.ValidationError):

@@ -184,3 +184,4 @@ def test_doctor_names_the_versions(
     assert faults("doctor", document) == []
     found = {item["what"]: item["found"] for item in document["checkups"]}
     assert found["onnxruntime"]
+    assert found["cv2"]

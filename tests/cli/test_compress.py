@@ -38,6 +38,19 @@ def test_the_pipeline_of_a_report_repeats_the_run(
     assert (files / "a.onnx").read_bytes() == (files / "b.onnx").read_bytes()
 
 
+def test_the_checkpoint_is_named(
+    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = graph.load(files / "in.onnx")
+    model.metadata_props["me2e.weights"] = '{"file": "a.pth", "sha256": "ab"}'
+    graph.save(model, files / "in.onnx")
+    words = ("--passes", ABLATE, "--map", files / "map.toml")
+    command("compress", files / "in.onnx", *words, "-o", files / "out.onnx")
+    line = "weights: a.pth, sha256 ab"
+    assert json.loads((files / "out.report.json").read_text())["weights"] == line
+    assert line in capsys.readouterr().out
+
+
 def test_a_shipped_recipe_by_name(command: Command, files: Path) -> None:
     output = ("-r", "exact", "-o", files / "out.onnx")
     assert command("compress", files / "in.onnx", *output) == 0

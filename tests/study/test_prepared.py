@@ -67,6 +67,16 @@ def test_passes_make_a_model_of_their_own(study: Study, tmp_path: Path) -> None:
     assert source.read_bytes() == before
 
 
+def test_the_checkpoint_of_a_model_is_kept(study: Study, tmp_path: Path) -> None:
+    source = Path(study.variants[0].policy)
+    model = graph.load(source)
+    model.metadata_props["me2e.weights"] = '{"file": "a.pth", "sha256": "ab"}'
+    graph.save(model, source)
+    plain = dataclasses.replace(study, variants=(Variant("minus-occ", str(source)),))
+
+    assert made(plain, tmp_path).weights == "weights: a.pth, sha256 ab"
+
+
 def test_the_same_is_made_once(
     study: Study, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

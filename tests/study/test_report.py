@@ -77,6 +77,15 @@ def test_a_preview_is_named_so_in_every_title(page: str) -> None:
     assert all("(preview: 2 of 220 routes)" in f"{a}{b}" for a, b in titles)
 
 
+def test_the_checkpoint_stands_where_a_variant_was_made(found: StudyResult) -> None:
+    first, *others = found.variants
+    of_file = dataclasses.replace(first.prepared, weights="weights: a.pth")
+    first = dataclasses.replace(first, prepared=of_file)
+    named = dataclasses.replace(found, variants=(first, *others))
+
+    assert "; weights: a.pth</code>" in html(named)
+
+
 def test_every_section_is_there(page: str) -> None:
     titles = re.findall(r"<h2>(.*?)</h2>", page)
 

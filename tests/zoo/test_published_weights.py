@@ -27,6 +27,7 @@ from me2e_compress.zoo.state_dict import read_state_dict
 from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.tcp.stack import Tcp
 from me2e_compress.zoo.vad.stack import VadTiny
+from me2e_compress.zoo.weights_record import named_weights
 from tests.zoo.published_files import (
     Tensors,
     averaged,
@@ -101,6 +102,21 @@ def test_published_files_fit_at_full_size(
 ) -> None:
     path = saved(tmp_path / "a.pth", mmcv(thin(layout)))
     assert not mismatch(stack, path, heads=heads)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "line"),
+    [
+        ({}, ""),
+        ({"me2e.stack": "highway"}, ""),
+        ({"me2e.stack": "tcp"}, "weights: random, as tcp is exported"),
+    ],
+)
+def test_a_file_without_a_record_is_random_if_export_made_it(
+    metadata: dict[str, str], line: str
+) -> None:
+    assert named_weights(metadata).startswith(line)
+    assert bool(named_weights(metadata)) == bool(line)
 
 
 def test_the_record_names_file_digest_and_count(

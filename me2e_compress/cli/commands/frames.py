@@ -27,7 +27,9 @@ Log = Annotated[
 def frames(
     stack: Annotated[
         str,
-        typer.Argument(help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway or M.onnx"),
+        typer.Argument(
+            help="vad-tiny, uniad-tiny, uniad-trt, tcp, highway, M.onnx or STACK.toml"
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="the folder")],
     count: given.Count = 256,
@@ -42,8 +44,9 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    A synthetic world is drawn for stacks; for highway, or any ONNX file that
-    keeps the policy contract (--adapter), the expert drives fresh routes. With
+    A synthetic world is drawn for stacks of the zoo; for highway, or any ONNX file or
+    stack of files (STACK.toml) that keeps the policy contract (--adapter), the expert
+    drives fresh routes. With
     --from, recorded driving of nuScenes or Bench2Drive is laid out as either takes it.
     """
     options = workflow.FramesOptions(

@@ -139,6 +139,8 @@ def _recipe(name: str, outcome: StudyResult) -> tuple[str, str, str]:
     made_of = prepared.source or prepared.variant.policy
     if prepared.pipeline:
         made_of = f"{made_of} → {prepared.pipeline}"
+    if prepared.weights:
+        made_of = f"{made_of}; {prepared.weights}"
     return name, made_of, (prepared.sha256 or "")[:12]
 
 
