@@ -22,7 +22,7 @@ def run_and_report(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     records: Path | None = None,
-    weigh: Path | None = None,
+    weigh: Sequence[Path] = (),
     *,
     force: bool = False,
 ) -> tuple[StudyResult | PaperResult, tuple[Path, ...]]:
@@ -36,7 +36,7 @@ def run_and_report(
         listener: Is called with progress and warnings.
         records: Folder of finished drives that the paper's tables are made of, and
             nothing is driven.
-        weigh: Folder of another stack's files, counted in the paper's table 4.
+        weigh: Folders of other stacks' files, counted in the paper's table 4.
         force: Replace a report that is not as we left it, too.
 
     Returns:
@@ -47,14 +47,14 @@ def run_and_report(
         Me2eError: See `run_study` and `run_paper`.
     """
     if study.report == "comparison":
-        if records is not None or weigh is not None:
+        if records is not None or weigh:
             option = "--weigh" if records is None else "--records"
             raise StudyError(f"{option} is for a study with the paper's tables")
         found = run_study(study, folder, engine, listener, force=force)
         written = write_study(found, folder, command, force=force)
         return found, (written.report, written.tables, written.record)
     if records is not None:
-        read = read_paper(study, records)
+        read = read_paper(study, records, weigh)
         return read, write_paper(read, folder, command, force=force)
 
     def land(so_far: PaperResult) -> None:

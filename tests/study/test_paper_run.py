@@ -185,6 +185,19 @@ def test_what_a_block_or_a_recording_cannot_be() -> None:
         FramesToRecord(0, 4)
 
 
+def test_other_stacks_are_counted_beside_records(
+    driven: Path, models: Path, tmp_path: Path
+) -> None:
+    stacks = [tmp_path / "one", tmp_path / "two"]
+    for each in stacks:
+        each.mkdir()
+        (each / "exact.onnx").write_bytes((models / "slow.onnx").read_bytes())
+
+    found = read_paper(ASKED, driven / "records", stacks)
+
+    assert [each.variant for each in found.facts][-2:] == ["one exact", "two exact"]
+
+
 def test_models_are_timed_and_weighed(models: Path, tmp_path: Path) -> None:
     slow = Variant("slow", str(models / "slow.onnx"))
     study = Study(

@@ -21,8 +21,8 @@ Records = Annotated[
     typer.Option(help="the paper's tables from finished drives: drives nothing"),
 ]
 Weigh = Annotated[
-    Path | None,
-    typer.Option(help="another stack's exact.onnx, full.onnx, ...: for table 4"),
+    list[Path] | None,
+    typer.Option(help="a stack's exact.onnx, full.onnx, ...: for table 4; once each"),
 ]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="count drives and hours, drive nothing")
@@ -67,7 +67,7 @@ def study(
         ("--routes", routes),
         ("--tables", tables),
         ("--records", records),
-        ("--weigh", weigh),
+        *(("--weigh", each) for each in weigh or ()),
         ("--provider", provider),
         *(("--plugins", each) for each in plugins or ()),
     ]
@@ -78,7 +78,9 @@ def study(
     with listening() as listener:
         chosen_engine = engine_of(engine, workers, address)
         found, files = run_and_report(
-            asked, output, words, chosen_engine, listener, records, weigh, force=force
+            *(asked, output, words, chosen_engine, listener, records),
+            weigh or (),
+            force=force,
         )
     show(found, as_json)
     if not as_json:

@@ -46,7 +46,7 @@ def run_paper(
     engine: Engine | None = None,
     listener: Listener = SILENT,
     on_block: Callable[[PaperResult], None] = lambda result: None,
-    weigh: Path | None = None,
+    weigh: Sequence[Path] = (),
     *,
     force: bool = False,
 ) -> PaperResult:
@@ -62,7 +62,7 @@ def run_paper(
         engine: Where routes are driven; None for one process of this machine.
         listener: Is called with progress and warnings.
         on_block: Is called with all there is after each block.
-        weigh: Folder of another stack's files, counted in table 4.
+        weigh: Folders of other stacks' files, counted in table 4.
         force: Replace a report that is not as we left it, too.
 
     Raises:
@@ -73,20 +73,24 @@ def run_paper(
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
-        others = () if weigh is None else weighed(weigh)
+        others = tuple(found for each in weigh for found in weighed(each))
         started = _begun(study, folder, engine or LocalEngine(), listener, others)
         return _all_driven(*started, on_block)
 
 
-def read_paper(study: Study, records: str | Path) -> PaperResult:
+def read_paper(
+    study: Study, records: str | Path, weigh: Sequence[Path] = ()
+) -> PaperResult:
     """Read what was driven before, here or elsewhere; nothing is made or driven.
 
     Args:
         study: Whose blocks are the paper's tables.
         records: Folder of finished cells, as ``records/`` of a run.
+        weigh: Folders of other stacks' files, counted in table 4 beside those that
+            were counted then.
 
     Raises:
-        StudyError: It holds no such files, or one that cannot be read.
+        StudyError: One holds no such files, or one that cannot be read.
     """
     folder = Path(records)
     about, facts = load_facts(folder / FILE)
@@ -96,6 +100,7 @@ def read_paper(study: Study, records: str | Path) -> PaperResult:
     if not isinstance(scale, float | int):
         raise StudyError(f"{folder / FILE}: no device_scale")
     names = [each.name for each in study.variants]
+    facts |= {found.variant: found for each in weigh for found in weighed(each)}
     weighed_too = (each for each in facts.values() if each.of_another_stack)
     return PaperResult(
         _of_these_routes(study, found, folder),
