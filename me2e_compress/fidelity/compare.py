@@ -178,7 +178,12 @@ def _compare(
 
 
 def common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, str]:
-    """Return how the plan of both is read; else None and the reason."""
+    """Return how the plan of both is read; else None and the reason.
+
+    Raises:
+        GraphError: the metadata of the first is malformed, or its plan has several
+            modes and nothing picks one.
+    """
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"
@@ -188,7 +193,14 @@ def common_adapter(a: AnySession, b: AnySession) -> tuple[PlanAdapter | None, st
     for needed in (adapter.output, adapter.scores):
         if needed is not None and needed not in b.outputs:
             return None, f"the second model has no output {needed}"
+    sides = shape if adapter.shape is None else (1, *adapter.shape)
+    if len(sides) == MODES_RANK and isinstance(modes := sides[1], int):
+        adapter.check_modes(modes)
     return adapter, ""
+
+
+MODES_RANK = 4
+"""Of a plan with modes: [1, modes, n, 2]."""
 
 
 class _Tally:

@@ -133,6 +133,20 @@ class PlanAdapter(pydantic.BaseModel):
         times = np.round(first + step * np.arange(len(points)), 6)
         return Trajectory.ahead(points, times)
 
+    def check_modes(self, modes: int) -> None:
+        """Check that something picks one of the modes.
+
+        Raises:
+            GraphError: nothing does, and there are several.
+        """
+        picks = self.default_mode, self.command_input, self.scores
+        if modes > 1 and all(each is None for each in picks):
+            raise GraphError(
+                f"{self.output} has {modes} modes and nothing picks one: name"
+                f" command_input, scores or default_mode, in the metadata {PLAN} or in"
+                " an adapter's [plan]"
+            )
+
     def choice(self, outputs: Arrays) -> int:
         """Return the mode that the scores pick: their largest, the first of equals.
 
@@ -185,11 +199,7 @@ class PlanAdapter(pydantic.BaseModel):
             given: Any = np.asarray(inputs[self.command_input]).reshape(-1)
             command = int(given[0] if len(given) == 1 else np.argmax(given))
             return self._mode_of(command)
-        if self.default_mode is None and self.command_input is None and modes > 1:
-            raise GraphError(
-                f"{self.output} has {modes} modes and nothing picks one: name"
-                " command_input, scores or default_mode"
-            )
+        self.check_modes(modes)
         return self.default_mode or 0
 
     def _mode_of(self, command: int) -> int:

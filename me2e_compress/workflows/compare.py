@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import Fidelity, common_adapter
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.matched_sets import SetFidelity
@@ -117,7 +118,8 @@ def compare(
         provider: what runs both.
 
     Raises:
-        GraphError: no such model, or onnxruntime cannot run it.
+        GraphError: no such model, onnxruntime cannot run it, or its plan has several
+            modes and nothing picks one.
         FramesError: a frame fits one of the graphs not.
         ProviderError: the provider is not there.
         EvaluationError: no output in common, or one that is not finite.
@@ -140,7 +142,10 @@ def compare(
         ),
         open_session(paths[1], stock=as_it_stands, release=True, provider=provider),
     )
-    adapter, reason = common_adapter(left, right)
+    try:
+        adapter, reason = common_adapter(left, right)
+    except GraphError as error:
+        raise GraphError(f"{paths[0]}: {error}") from error
     tally = None if adapter is None else OpenLoopTally(adapter)
     watch = None if tally is None else tally.add
     fidelity = measure(left, right, map(reported, recording), watch)

@@ -78,6 +78,14 @@ class ExportOptions:
             )
 
 
+_IMAGES = (
+    "images are normalised as hustvl/VAD has it (RGB, ImageNet's); NVIDIA's DL4AGX runs"
+    " its VAD-tiny with BGR, mean (103.53, 116.28, 123.675), std 1: for such weights"
+    " give those by an adapter (docs/weights.md)"
+)
+"""What would be silently wrong with a checkpoint of VAD-tiny."""
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class ExportResult(Result):
     """A stack that was written.
@@ -103,7 +111,8 @@ class ExportResult(Result):
     def lines(self) -> tuple[str, ...]:
         """Return the headline, the checkpoint, and what became of the rest of it."""
         said = () if self.weights is None else self.weights.lines()
-        return (self.headline, *said)
+        images = (_IMAGES,) if said and self.stack == "vad-tiny" else ()
+        return (self.headline, *said, *images)
 
     def tables(self) -> tuple[Table, ...]:
         """Return none: the lines say it."""

@@ -1,16 +1,20 @@
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import Displacement, compare
 from me2e_compress.fidelity.reaction import plan_reaction
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.compare import compare as compare_files
+from tests.cli.conftest import write_frames
 
 SCALED = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -99,6 +103,16 @@ def test_the_plan_moves_in_metres(
     assert found.plan.mean_m == pytest.approx(mean)
     assert found.plan.max_m == pytest.approx(largest)
     assert found.plan_reason == ""
+
+
+def test_modes_that_nothing_picks_from_name_the_file(tmp_path: Path) -> None:
+    model = ir.from_onnx_text(PLANNER % 0)
+    model.metadata_props["me2e.plan"] = json.dumps({"output": "modes"})
+    graph.save(model, tmp_path / "vad.onnx")
+    write_frames(tmp_path / "frames", **modes().arrays)
+
+    with pytest.raises(GraphError, match=r"vad.onnx: modes has 3 modes and nothing"):
+        compare_files(tmp_path / "vad.onnx", tmp_path / "vad.onnx", tmp_path / "frames")
 
 
 @pytest.mark.parametrize(

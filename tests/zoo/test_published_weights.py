@@ -27,7 +27,7 @@ from me2e_compress.zoo.state_dict import read_state_dict
 from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.tcp.stack import Tcp
 from me2e_compress.zoo.vad.stack import VadTiny
-from me2e_compress.zoo.weights_record import named_weights
+from me2e_compress.zoo.weights_record import WeightsRecord, named_weights
 from tests.zoo.published_files import (
     Tensors,
     averaged,
@@ -102,6 +102,17 @@ def test_published_files_fit_at_full_size(
 ) -> None:
     path = saved(tmp_path / "a.pth", mmcv(thin(layout)))
     assert not mismatch(stack, path, heads=heads)
+
+
+def test_a_checkpoint_of_vad_is_told_how_its_images_are_normalised(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "v.onnx").write_bytes(b"")
+    record = WeightsRecord("vad.pth", "ab")
+    lines = ExportResult("vad-tiny", tmp_path / "v.onnx", 17, record).lines()
+
+    assert "NVIDIA's DL4AGX" in lines[-1]
+    assert "docs/weights.md" in lines[-1]
 
 
 @pytest.mark.parametrize(
