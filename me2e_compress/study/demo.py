@@ -101,9 +101,14 @@ class DriverDemo:
         check_folder(self.out, ())
 
     @property
-    def steps(self) -> tuple[Callable[[Listener], Result], ...]:
-        """What is done, in order."""
-        return self.compress, self.weigh, self.compare, self.drive
+    def steps(self) -> dict[str, Callable[[Listener], Result]]:
+        """What is done, by name, in order."""
+        return {
+            "compress": self.compress,
+            "weigh": self.weigh,
+            "compare": self.compare,
+            "drive": self.drive,
+        }
 
     def compress(self, listener: Listener) -> CompressResult:
         """Copy the driver, let it see routes, make it small.

@@ -143,9 +143,14 @@ class StackDemo:
         check_folder(self.out, ())
 
     @property
-    def steps(self) -> tuple[Callable[[Listener], Result], ...]:
-        """What is done, in order."""
-        return self.compress, self.weigh, self.compare, self.time
+    def steps(self) -> dict[str, Callable[[Listener], Result]]:
+        """What is done, by name, in order."""
+        return {
+            "compress": self.compress,
+            "weigh": self.weigh,
+            "compare": self.compare,
+            "time": self.time,
+        }
 
     def compress(self, listener: Listener) -> CompressResult:
         """Export the stack, write its frames, make it small."""

@@ -6,8 +6,10 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.study import demo
+from me2e_compress.workflows.module_changes import ModuleChanges
 from me2e_compress.zoo import shipped
 from tests.cli.conftest import Command
+from tests.docs.documents import faults
 from tests.stand_in import write_shipped
 from tests.study.conftest import Here
 
@@ -54,6 +56,24 @@ def test_the_demo_compresses_drives_and_reports(
     assert record["routes"] == {"driven": 1, "set": 220}
     assert (out / "report.html").read_text().startswith("<!doctype html>")
     assert "<svg" in (out / "demo.svg").read_text()
+
+
+def test_all_its_steps_are_one_document(
+    command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = ModuleChanges((), ())
+    names = ("compress", "weigh", "compare", "drive")
+    steps = {name: lambda listener: found for name in names}
+    monkeypatch.setattr(demo.DriverDemo, "steps", property(lambda self: steps))
+
+    assert command("demo", "--out", tmp_path / "out", "--json") == 0
+
+    document = json.loads(capsys.readouterr().out)
+    assert faults("demo", document) == []
+    assert document["drive"] == {"before": [], "after": []}
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,10 @@ from me2e_compress.cli.console import console, listening, show
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows.claims import check_ours, writing
+from me2e_compress.workflows.demo_result import DemoResult
 from me2e_compress.workflows.demo_stack import StackDemo
 from me2e_compress.workflows.extras import need_closed_loop
+from me2e_compress.workflows.result import Result
 from me2e_compress.zoo.shipped import SHIPPED
 
 Output = Annotated[
@@ -41,6 +43,7 @@ def demo(
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
+    as_json: given.Json = False,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
 
@@ -57,10 +60,15 @@ def demo(
         steps = StackDemo(stack, output, scheme, rounds, threads, runs, force).steps
     output.mkdir(parents=True, exist_ok=True)
     check_ours([output / PICTURE], force=force)
-    for step in steps:
+    found = dict[str, Result]()
+    for name, step in steps.items():
         with listening() as listener:
-            found = step(listener)
-        show(found)
+            found[name] = step(listener)
+        if not as_json:
+            show(found[name])
+    if as_json:
+        show(DemoResult(found), as_json)
+        return
     with writing([output / PICTURE], force=force):
         picture = console.export_svg(title="me2e-compress demo")
         write_bytes(output / PICTURE, picture.encode())
