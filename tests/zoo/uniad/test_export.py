@@ -13,9 +13,9 @@ import torch
 
 from me2e_compress.errors import GraphError
 from me2e_compress.modules import ModuleMap, assign
-from me2e_compress.operators import fused_nodes
+from me2e_compress.operators import expand, fused_nodes, import_domains
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.export import ExportOptions, export_stack
+from me2e_compress.workflows.export import ExportOptions, export_stack, in_dialect
 from me2e_compress.zoo.bev.sizes import Sampling
 from me2e_compress.zoo.export import trace
 from me2e_compress.zoo.stacks import UNIAD_TINY, UNIAD_TRT, Stack
@@ -133,11 +133,28 @@ def test_tensorrt_takes_every_node(traced: onnx.ModelProto) -> None:
     assert list(TARGETS.parse("tensorrt").lint(ir.from_proto(traced))) == []
 
 
+@pytest.fixture(scope="module")
+def fused() -> onnx.ModelProto:
+    return trace(small_spec(), small_uniad("fused"), 17)
+
+
 @pytest.mark.slow
-def test_every_deformable_attention_is_one_node() -> None:
+def test_every_deformable_attention_is_one_node(fused: onnx.ModelProto) -> None:
     """Twice in an encoder layer, once in every other."""
-    fused = ir.from_proto(trace(small_spec(), small_uniad("fused"), 17))
-    assert len(fused_nodes(fused)) == 2 + 2 + 2 + 2 + 3
+    assert len(fused_nodes(ir.from_proto(fused))) == 2 + 2 + 2 + 2 + 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dialect", ["tensorrt", "dl4agx-uniad"])
+def test_a_plugin_says_what_standard_operators_say(
+    fused: onnx.ModelProto, dialect: str
+) -> None:
+    model = in_dialect(ir.from_proto(fused), dialect)
+    for each in fused_nodes(model):
+        expand(each.node, opset=each.opset, by="test", names=each.names)
+    import_domains(model)
+    for errors in errors_of(ir.to_proto(model), 3):
+        assert {name: e for name, e in errors.items() if e > 1e-4} == {}
 
 
 @pytest.mark.parametrize("stack", [UNIAD_TINY, UNIAD_TRT], ids=lambda each: each.name)
