@@ -51,8 +51,8 @@ def main() -> None:
         done = subprocess.run([*command, "--step", step], check=True, text=True,
                               stdout=subprocess.PIPE)  # fmt: skip
         print(f"{step}: {done.stdout.strip()}")
-    if "onnxruntime" in given.steps.split(","):
-        print((given.out / "errors.json").read_text().strip())
+    if "onnxruntime" in given.steps.split(",") or given.resume:
+        print(json.dumps(_noted(given.out, find(given.stack), given.frames)))
 
 
 def _measured(run: Callable[[], dict[str, object]]) -> None:
@@ -137,7 +137,7 @@ def drive(
             _save(path, named)
         state = {name: named[answer] for name, answer in spec.recurrent.items()}
         if runtime == "onnxruntime":
-            _note(given.out, errors_of(given.out, spec, index + 1))
+            _noted(given.out, spec, index + 1)
     return state
 
 
@@ -152,8 +152,10 @@ def _save(path: Path, named: Mapping[str, np.ndarray]) -> None:
     half.rename(path)
 
 
-def _note(out: Path, errors: list[dict[str, object]]) -> None:
+def _noted(out: Path, spec: Stack, frames: int) -> list[dict[str, object]]:
+    errors = errors_of(out, spec, frames)
     (out / "errors.json").write_text(json.dumps(errors) + "\n")
+    return errors
 
 
 def _truth(given: argparse.Namespace) -> dict[str, object]:

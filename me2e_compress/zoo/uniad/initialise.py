@@ -26,14 +26,15 @@ GAINS = Gains(
         (r"occ_head\.dense_decoder\.layers\.\d\.up", 0.3),
         (r"out_proj", 1.5),
         (r"in_proj_weight", 1.2),
-        (r"decoder\..*attentions\.1\.output_proj", 1.5),
+        (r"decoder\..*attentions\.1\.output_proj", 1.0),
         (r"attentions\.0\.output_proj", 1.0),
-        (r"decoder\..*value_proj", 1.0),
+        (r"decoder\..*value_proj", 0.7),
         (r"value_proj", 2.0),
         (r"attentions\.1\.output_proj", 2.5),
         (r"sampling_offsets", 0.6),
         (r"attention_weights|reference_points", 1.2),
-        (r"pts_bbox_head\.reg_branches\.\d\.4|seg_head\.reg_branches\.\d\.4", 0.015),
+        (r"pts_bbox_head\.reg_branches\.\d\.4", 0.05),
+        (r"seg_head\.reg_branches\.\d\.4", 0.015),
         (r"traj_reg_branches\.\d\.4", 0.1),
         (r"ffns\.0\.layers\.1", 0.7),
         (r"planning_head\.reg_branch\.2", 1.0),
@@ -44,18 +45,21 @@ GAINS = Gains(
     last_norm=r"bn3\.weight$",
 )
 """Found by trial: the tests state what they must achieve. Strong regressions would move
-reference points by whole cells at the least noise, which grows from layer to layer: a
-cell of the map head is a two-hundredth. So theirs are small, as are those of logits
-whose inputs are strong: a sharp softmax or sigmoid tells rounding errors apart."""
-
-STRIDE = 4
-"""Every fourth pixel is enough for the statistics of a channel."""
+reference points by whole cells at the least noise, so theirs are small, as are those of
+logits whose inputs are strong: a sharp softmax or sigmoid tells rounding errors
+apart."""
 
 BEGINNING = 0.03
 """Part of the queries that find something in a first frame."""
 
 OWN_MOTION = 0.2
 """Part of its motion in what the vehicle sees: another speed is not another world."""
+
+CENTRE = [0, 1, 4]
+"""Of a box: x, y and z."""
+
+STEADY = 0.1
+"""Part of the move of a centre that is left."""
 
 AGENTS = 8
 
@@ -71,8 +75,7 @@ def build_uniad(
     config = CONFIGS[spec.name]
     model = UniadTiny(config, sampling, dead=dead).requires_grad_(False).eval()
     (frame,) = frames(spec, 1, seed)
-    step = STRIDE if len(config.hws) > 1 else 1
-    images = torch.from_numpy(frame["img"])[0, ..., ::step, ::step]
+    images = torch.from_numpy(frame["img"])[0]
     initialise(model, images, torch.from_numpy(frame["lidar2img"]), seed)
     return model
 
@@ -88,8 +91,9 @@ def initialise(
 
     Args:
         model: Of any size.
-        images: [6, 3, H, W], normalised, of any size.
-        lidar2img: [1, 6, 4, 4] for the size of the model.
+        images: [6, 3, H, W], normalised. Smaller ones would not do: what features have
+            in common differs by scale, and with it the number of tracks.
+        lidar2img: [1, 6, 4, 4].
         seed: Of everything.
         beginning: Part of the queries that find something in what these cameras see.
     """
@@ -97,6 +101,7 @@ def initialise(
     norm = model.pts_bbox_head.transformer.can_bus_mlp.get_submodule("norm")
     for parameter in norm.parameters():
         parameter.mul_(OWN_MOTION)
+    _hold_centres(model)
     _open_masks(model)
     with one_thread():
         take_statistics(model.img_backbone, images)
@@ -105,6 +110,17 @@ def initialise(
         _balance_classes(model, view, beginning)
         noise = torch.Generator().manual_seed(seed)
         take_statistics(_Occupancy(model, noise), model.enlarged(view))
+
+
+def _hold_centres(model: UniadTiny) -> None:
+    """Let the layers move the centre of a box a little.
+
+    Where a query reads depends on where it stands, and that on what it read: of centres
+    that move by whole cells the last bit grows from layer to layer and frame to frame.
+    """
+    for branch in model.pts_bbox_head.reg_branches:
+        for parameter in branch.get_submodule("4").parameters():
+            parameter[CENTRE] *= STEADY
 
 
 def _open_masks(model: UniadTiny) -> None:
