@@ -4,7 +4,8 @@
     python -m benchmarks.bench_paper OUT/records     # keeps them here, writes the page
     python -m benchmarks.bench_paper                 # writes the page of what is kept
 
-Nothing is driven. What is kept, ``benchmarks/paper/``, is a line a route.
+Nothing is driven. What is kept, ``benchmarks/paper/``, is a line a route, and the
+latencies that were charged (``traces/``).
 """
 
 import argparse
@@ -18,9 +19,11 @@ from me2e_compress.study import load_study
 from me2e_compress.study.paper.model_facts import FILE
 from me2e_compress.study.paper.paper_run import read_paper
 from me2e_compress.study.paper.questions import Verdict
+from me2e_compress.study.workspace import Workspace
 
 ROOT = Path(__file__).parents[1]
 KEPT, PAGE = ROOT / "benchmarks" / "paper", ROOT / "docs" / "paper.md"
+TRACES = KEPT / "traces"
 HEAD = """\
 # The paper, re-tested
 
@@ -63,10 +66,19 @@ def page(records: Path) -> str:
 
 
 def keep(records: Path) -> None:
-    """Copy finished drives beside this file."""
-    KEPT.mkdir(exist_ok=True)
+    """Copy the paper's finished drives, and the latencies of its models."""
+    TRACES.mkdir(parents=True, exist_ok=True)
+    study = load_study("paper")
+    asked = {
+        f"{Workspace.drive(variant, each)}.jsonl"
+        for each in study.conditions
+        for variant in study.driven_under(each)
+    }
     for path in sorted((*records.glob("*.jsonl"), *records.glob("*.json"))):
-        shutil.copyfile(path, KEPT / path.name)
+        if path.suffix == ".json" or path.name in asked:
+            shutil.copyfile(path, KEPT / path.name)
+    for path in sorted((records.parent / TRACES.name).glob("*.json")):
+        shutil.copyfile(path, TRACES / path.name)
 
 
 def main() -> None:

@@ -161,6 +161,12 @@ class DriveRecord:
         taken = sum(each.latency_sum_us for each in self.routes)
         return round(taken / decisions) if decisions else None
 
+    @property
+    def decisions_a_second(self) -> float:
+        """How many were taken, over the time driven; of routes of no length 0."""
+        time_us = sum(each.duration_us for each in self.routes)
+        return 1e6 * sum(each.decisions for each in self.routes) / max(time_us, 1)
+
     def save(self, path: Path) -> None:
         """Write it as JSON lines: what made it, then a line a route.
 
