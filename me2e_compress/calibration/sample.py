@@ -13,7 +13,7 @@ from me2e_compress.runtime.frames import Frame
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class FrameSubset:
     """Some of the frames of a recording, in its order; the first starts a scene.
 
     Attributes:
@@ -53,7 +53,7 @@ class Part:
         return (self[index] for index in range(len(self)))
 
 
-def draw(whole: CalibrationSet, count: int, seed: int) -> Part:
+def draw(whole: CalibrationSet, count: int, seed: int) -> FrameSubset:
     """Draw ``count`` frames, scene by scene without replacement.
 
     Scenes stay whole, since recurrent state grows along them; only the last one drawn
@@ -73,10 +73,10 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> Part:
     scenes = _scenes(whole)
     order = np.random.default_rng(seed).permutation(len(scenes)).tolist()
     drawn = [place for at in order for place in scenes[at]]
-    return Part(whole, tuple(sorted(drawn[:count])))
+    return FrameSubset(whole, tuple(sorted(drawn[:count])))
 
 
-def hold_out(whole: CalibrationSet, most: int) -> tuple[Part, Part]:
+def hold_out(whole: CalibrationSet, most: int) -> tuple[FrameSubset, FrameSubset]:
     """Split a recording: frames to calibrate on, and frames to measure on.
 
     A quarter of the frames is measured on, ``most`` of them at most and one at least.
@@ -92,19 +92,19 @@ def hold_out(whole: CalibrationSet, most: int) -> tuple[Part, Part]:
     """
     frames = len(whole)
     if frames == 1:
-        return Part(whole, (0,)), Part(whole, (0,))
+        return FrameSubset(whole, (0,)), FrameSubset(whole, (0,))
     count = max(1, min(most, frames // 4))
     cut = frames - count
     scene = max(start for start in whole.scenes if start <= cut)
     if scene >= frames / 2:
         cut = scene
     return (
-        Part(whole, tuple(range(cut))),
-        Part(whole, tuple(range(cut, cut + count))),
+        FrameSubset(whole, tuple(range(cut))),
+        FrameSubset(whole, tuple(range(cut, cut + count))),
     )
 
 
-def shard(part: Part, number: int, count: int) -> Part:
+def shard(part: FrameSubset, number: int, count: int) -> FrameSubset:
     """Return one of ``count`` parts with about as many scenes each.
 
     Args:
@@ -129,7 +129,7 @@ def shard(part: Part, number: int, count: int) -> Part:
         )
     mine = np.array_split(np.arange(len(scenes)), count)[number - 1].tolist()
     places = tuple(place for at in mine for place in scenes[at])
-    return Part(part.whole, places, Share(number, count, part.places))
+    return FrameSubset(part.whole, places, Share(number, count, part.places))
 
 
 def _scenes(whole: CalibrationSet) -> list[range]:

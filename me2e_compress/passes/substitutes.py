@@ -149,9 +149,8 @@ def zeros_like(
         PreconditionError: the shape is not static, or the value is itself a shape.
     """
     shape, dtype = layout_of(value)
-    size = rewrite.add_constant(where, np.array(shape, np.int64), f"{value.name}_shape")
     zero = ir.tensor(np.zeros(1, dtype), name="zero")
-    node = ir.node("ConstantOfShape", [size], {"value": zero})
+    node = ir.node("ConstantOfShape", [_size(where, shape, value)], {"value": zero})
     provenance.inherit(node, readers, by=by)
     return finished(where, node, shape, value, f"{value.name}_zeros")
 
@@ -179,8 +178,7 @@ def shaped_like(
     shaped = reshaped(where, new, padded, readers, by)
     if padded == want:
         return shaped
-    size = rewrite.add_constant(where, np.array(want, np.int64), f"{old.name}_shape")
-    node = ir.node("Expand", [shaped, size])
+    node = ir.node("Expand", [shaped, _size(where, want, old)])
     provenance.inherit(node, readers, by=by)
     return finished(where, node, want, new, f"{new.name}_repeated")
 
@@ -195,10 +193,14 @@ def reshaped(
     """Reshape a value for some readers, unless it has that shape."""
     if graph.static_shape(value) == shape:
         return value
-    size = rewrite.add_constant(where, np.array(shape, np.int64), f"{value.name}_shape")
-    node = ir.node("Reshape", [value, size])
+    node = ir.node("Reshape", [value, _size(where, shape, value)])
     provenance.inherit(node, readers, by=by)
     return finished(where, node, shape, value, f"{value.name}_reshaped")
+
+
+def _size(where: ir.Graph, shape: tuple[int, ...], of: ir.Value) -> ir.Value:
+    """Add a shape as a constant, named after a value."""
+    return rewrite.add_constant(where, np.array(shape, np.int64), f"{of.name}_shape")
 
 
 def finished(

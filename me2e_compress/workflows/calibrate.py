@@ -18,7 +18,7 @@ from me2e_compress.calibration.exchange import (
 )
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.sample import Part, draw, shard
+from me2e_compress.calibration.sample import FrameSubset, draw, shard
 from me2e_compress.calibration.statistics import Statistics, merge
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.passes.fix_shapes import with_sizes
@@ -207,7 +207,7 @@ def _inputs(
     return (source, frames, *named, *options.merge)
 
 
-def _part(loaded: ir.Model, folder: Path, options: CalibrateOptions) -> Part:
+def _part(loaded: ir.Model, folder: Path, options: CalibrateOptions) -> FrameSubset:
     """Draw frames that fit the model, or one shard of those."""
     recording = CalibrationSet(folder)
     recording.check(loaded)

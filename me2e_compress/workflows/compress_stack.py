@@ -12,7 +12,7 @@ import numpy as np
 from me2e_compress import drafts
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.part_frames import PartFrames
-from me2e_compress.calibration.sample import Part
+from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import (
     EvaluationError,
@@ -205,7 +205,7 @@ def _of_part(
         return PartFrames(whole, label, frames, options.provider)
 
     calibration = None if split.calibration is None else fed(split.calibration)
-    if not isinstance(split.measured, Part):
+    if not isinstance(split.measured, FrameSubset):
         return SplitFrames(calibration, None, split.kind)
     try:
         measured: Frames = tuple(fed(split.measured))

@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.sample import Part
+from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.errors import FramesError, GraphError, RecipeError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Session, replay
@@ -172,4 +172,4 @@ def test_a_file_that_holds_no_ranges_is_refused(tmp_path: Path, content: str) ->
 
 def test_no_frames_are_an_error(frames: CalibrationSet) -> None:
     with pytest.raises(FramesError, match="no frames to calibrate on"):
-        Calibrator(threads=1).run(conv_attention(), ["a"], Part(frames, ()))
+        Calibrator(threads=1).run(conv_attention(), ["a"], FrameSubset(frames, ()))

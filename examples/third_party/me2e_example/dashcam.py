@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from me2e_compress.calibration.logs import DriveLog, LogScene, Moment
+from me2e_compress.calibration.logs import DriveLog, LogMoment, LogScene
 from me2e_compress.errors import FramesError
 
 HEIGHT_M = 1.3
@@ -59,7 +59,7 @@ class Dashcam(DriveLog):
 
     def _moment(
         self, ride: Path, at: int, x: float, y: float, heading: float
-    ) -> Moment:
+    ) -> LogMoment:
         cos, sin = math.cos(heading), math.sin(heading)
         ego_to_world = np.array(
             [[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, 0], [0, 0, 0, 1.0]]
@@ -69,7 +69,7 @@ class Dashcam(DriveLog):
         can_bus = np.zeros(18)
         can_bus[:3] = x, y, 0.0
         can_bus[16], can_bus[17] = heading, math.degrees(heading)
-        return Moment(
+        return LogMoment(
             time_us=500_000 * at,
             pictures={"CAM_FRONT": ride / f"{at:04d}.jpg"},
             lidar_to_image={"CAM_FRONT": lens @ LOOKS},

@@ -3,11 +3,11 @@
 To add a data set: write its class, then add it to this table.
 """
 
-from me2e_compress.calibration.logs.base import Agent, DriveLog, LogScene, Moment
+from me2e_compress.calibration.logs.base import Agent, DriveLog, LogMoment, LogScene
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import Registry
 
-__all__ = ["LOGS", "Agent", "DriveLog", "LogScene", "Moment"]
+__all__ = ["LOGS", "Agent", "DriveLog", "LogMoment", "LogScene"]
 
 _HERE = "me2e_compress.calibration.logs"
 

@@ -51,7 +51,7 @@ class Agent:
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class LogMoment:
     """What was recorded at one moment.
 
     Attributes:
@@ -81,7 +81,7 @@ class Moment:
     command: int | None
 
 
-LogScene: TypeAlias = Sequence[Moment]
+LogScene: TypeAlias = Sequence[LogMoment]
 """Moments in order; what is not asked for need not be read."""
 
 
@@ -140,7 +140,7 @@ class DriveLog(ABC):
     def command_of(self, right_m: float) -> int:
         """Return the command of a route that ends so far to the right in 3 s.
 
-        Asked where `Moment.command` is None.
+        Asked where `LogMoment.command` is None.
         """
 
     def chosen(self) -> tuple[str, ...]:

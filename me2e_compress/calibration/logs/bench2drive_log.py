@@ -20,7 +20,7 @@ from me2e_compress.calibration.logs.base import (
     Agent,
     DriveLog,
     Floats,
-    Moment,
+    LogMoment,
     heading_of,
     intrinsics,
     matrix_of,
@@ -81,7 +81,7 @@ class Bench2DriveLog(DriveLog):
             raise FramesError(f"{self.root}: holds no clip: a folder with anno/ in it")
         return found
 
-    def scene(self, name: str) -> Sequence[Moment]:
+    def scene(self, name: str) -> Sequence[LogMoment]:
         """Return the moments of a clip, read when they are asked for."""
         return _Clip(self.root / name, self.seen)
 
@@ -90,7 +90,7 @@ class Bench2DriveLog(DriveLog):
         return 3
 
 
-class _Clip(Sequence[Moment]):
+class _Clip(Sequence[LogMoment]):
     """A clip, whose annotations are read when they are asked for, each once."""
 
     def __init__(self, folder: Path, cameras: Sequence[str]) -> None:
@@ -98,23 +98,23 @@ class _Clip(Sequence[Moment]):
         self.files = sorted((folder / "anno").glob("*.json.gz"))
         if not self.files:
             raise FramesError(f"{folder / 'anno'}: holds no .json.gz")
-        self._read: dict[int, Moment] = {}
+        self._read: dict[int, LogMoment] = {}
 
     def __len__(self) -> int:
         return len(self.files)
 
     @overload
-    def __getitem__(self, index: int) -> Moment: ...
+    def __getitem__(self, index: int) -> LogMoment: ...
     @overload
-    def __getitem__(self, index: slice) -> Sequence[Moment]: ...
-    def __getitem__(self, index: int | slice) -> Moment | Sequence[Moment]:
+    def __getitem__(self, index: slice) -> Sequence[LogMoment]: ...
+    def __getitem__(self, index: int | slice) -> LogMoment | Sequence[LogMoment]:
         if isinstance(index, slice):
             return [self[at] for at in range(*index.indices(len(self)))]
         if index not in self._read:
             self._read[index] = self._moment(self.files[index])
         return self._read[index]
 
-    def _moment(self, path: Path) -> Moment:
+    def _moment(self, path: Path) -> LogMoment:
         about = _annotation(path)
         number = path.name.partition(".")[0]
         if not number.isdigit():
@@ -126,7 +126,7 @@ class _Clip(Sequence[Moment]):
             said = f"{path}: not an annotation of Bench2Drive ({line})"
             raise FramesError(said) from error
 
-    def _of(self, about: Mapping[str, Any], path: Path, number: str) -> Moment:
+    def _of(self, about: Mapping[str, Any], path: Path, number: str) -> LogMoment:
         sensors = about["sensors"]
         world_to_lidar = _matrix(sensors["LIDAR_TOP"], "world2lidar", path)
         lidar_to_ego = _matrix(sensors["LIDAR_TOP"], "lidar2ego", path)
@@ -141,7 +141,7 @@ class _Clip(Sequence[Moment]):
             to_image[camera] = inside @ _inverse(looks) @ lidar_to_ego
             view = camera.lower().replace("cam_", "rgb_", 1)
             pictures[camera] = self.folder / "camera" / view / f"{number}.jpg"
-        return Moment(
+        return LogMoment(
             time_us=int(number) * PERIOD_US,
             pictures=pictures,
             lidar_to_image=to_image,

@@ -9,8 +9,8 @@ from me2e_compress.calibration.logs.base import (
     Agent,
     DriveLog,
     Floats,
+    LogMoment,
     LogScene,
-    Moment,
     heading_of,
 )
 from me2e_compress.runtime.recorded_future import (
@@ -69,7 +69,7 @@ def command_at(log: DriveLog, scene: LogScene, at: int) -> int:
     return log.command_of(right)
 
 
-def _later(scene: LogScene, at: int, step: int, half_second: int) -> Moment | None:
+def _later(scene: LogScene, at: int, step: int, half_second: int) -> LogMoment | None:
     """Return the moment so many half seconds later; None where the log has none."""
     index = at + step * half_second
     if index >= len(scene):
@@ -84,7 +84,7 @@ def _place(to_ground: Floats) -> Point:
 
 
 def _agents(
-    later: Sequence[Moment | None], from_world: Floats
+    later: Sequence[LogMoment | None], from_world: Floats
 ) -> tuple[tuple[Box, ...], ...] | None:
     known = [each.agents for each in later if each is not None]
     if not known or None in known:

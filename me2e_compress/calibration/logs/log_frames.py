@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from me2e_compress.calibration.logs.base import DriveLog, Floats, LogScene, Moment
+from me2e_compress.calibration.logs.base import DriveLog, Floats, LogMoment, LogScene
 from me2e_compress.calibration.logs.futures import command_at, recorded_future
 from me2e_compress.calibration.logs.pictures import read_picture
 from me2e_compress.calibration.pixels import PixelInput
@@ -137,7 +137,7 @@ def log_frames(
             return
 
 
-def _ground(model: LoggedInputs, now: Moment) -> Floats:
+def _ground(model: LoggedInputs, now: LogMoment) -> Floats:
     return now.lidar_to_ego if model.forward_left else np.eye(4)
 
 
@@ -174,7 +174,7 @@ def _arrays(
     return {name: _fed(made[name], form, name) for name, form in model.forms.items()}
 
 
-def _changes(now: Moment, before: Moment | None) -> Floats:
+def _changes(now: LogMoment, before: LogMoment | None) -> Floats:
     """Turn position and heading into what they changed by since the frame before.
 
     As UniAD and VAD do between the frames that they are shown; zero at the first.

@@ -14,7 +14,7 @@ from me2e_compress.calibration.logs.base import (
     CAN_BUS_SIZE,
     DriveLog,
     Floats,
-    Moment,
+    LogMoment,
     intrinsics,
     matrix_of,
 )
@@ -79,7 +79,7 @@ class NuScenesLog(DriveLog):
         """List the scenes of the version."""
         return tuple(row["name"] for row in self._tables.scenes)
 
-    def scene(self, name: str) -> Sequence[Moment]:
+    def scene(self, name: str) -> Sequence[LogMoment]:
         """Return the key frames of a scene."""
         tables = self._tables
         row = next(each for each in tables.scenes if each["name"] == name)
@@ -97,7 +97,7 @@ class NuScenesLog(DriveLog):
     def _tables(self) -> NuScenesTables:
         return NuScenesTables(_version_folder(self.root, self.version), self.scenes)
 
-    def _moment(self, sample: Row, messages: Sequence[Row]) -> Moment:
+    def _moment(self, sample: Row, messages: Sequence[Row]) -> LogMoment:
         data = self._tables.data[sample["token"]]
         where = f"{self._tables.folder}: sample {sample['token']}"
         for channel in (LIDAR, *self.seen):
@@ -114,7 +114,7 @@ class NuScenesLog(DriveLog):
             to_image[camera] = inside @ to_camera @ lidar_to_world
         to_ego = np.array(lidar_to_car)
         to_ego[:2, 3] = -CENTRE_M * (lidar_to_car[:2, :2] @ [0.0, 1.0])
-        return Moment(
+        return LogMoment(
             time_us=int(sample["timestamp"]),
             pictures={c: self.root / data[c]["filename"] for c in self.seen},
             lidar_to_image=to_image,

@@ -31,6 +31,6 @@ INPUT_SOURCES: Registry[InputSource] = Registry(
         "lidar2img": f"{_HERE}.camera_geometry:LidarToImage",
         "lidar2cam": f"{_HERE}.camera_geometry:LidarToCamera",
         "intrinsics": f"{_HERE}.camera_geometry:Intrinsics",
-        "constant": f"{_HERE}.constant:Constant",
+        "constant": f"{_HERE}.constant:ConstantInput",
     },
 )

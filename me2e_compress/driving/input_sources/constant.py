@@ -15,7 +15,7 @@ LARGEST = 1e18
 
 
 @dataclass(frozen=True)
-class Constant(InputSource):
+class ConstantInput(InputSource):
     """The same numbers at every decision.
 
     Attributes:

@@ -39,7 +39,7 @@ class BrokenRecordingError(ValueError):
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedRoute:
     """One recording in our conventions: x east, y north, turns counter-clockwise.
 
     Attributes:
@@ -175,7 +175,7 @@ def _usual(interval_s: float) -> float | None:
     return nearest if abs(np.log(nearest / interval_s)) < _EQUALS else None
 
 
-def read_recording(raw: object) -> Recording:
+def read_recording(raw: object) -> RecordedRoute:
     """Read a ``metric_info.json``.
 
     Args:
@@ -194,7 +194,7 @@ def read_recording(raw: object) -> Recording:
     location = _column(raw, _LOCATION, 3)
     ahead, aside, push = forward[:, :2], right[:, :2], acceleration[:, :2]
     mirror = np.array([1.0, -1.0])  # CARLA's y points right
-    return Recording(
+    return RecordedRoute(
         np.array([int(key) for key in raw], np.int64),
         location[:, :2] * mirror,
         push * mirror,

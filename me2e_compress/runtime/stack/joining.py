@@ -10,7 +10,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.recurrence import RECURRENT, SessionPort, recurrence
 from me2e_compress.runtime.stack.first_values import fitted, read_value
-from me2e_compress.runtime.stack.joints import Joints, Names, Source, two_givers
+from me2e_compress.runtime.stack.joints import FeedSource, Joints, Names, two_givers
 from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
 from me2e_compress.runtime.stack.stack_file import ZEROS, StackFile, StateEntry
 
@@ -170,15 +170,15 @@ class _Joiner:
         name: str,
         *,
         first: bool,
-    ) -> Source:
+    ) -> FeedSource:
         key = taker.part, name
         if key in self.edges:
             return self.edges[key]
         if key in self.state:
             given = self._given_first(self.state[key]) if first else None
-            return given or Source("", name)
+            return given or FeedSource("", name)
         if taker.recurrent().get(name) is not None:
-            return Source("", name)
+            return FeedSource("", name)
         givers = [
             part
             for part, each in graphs.items()
@@ -186,12 +186,12 @@ class _Joiner:
         ]
         if len(givers) > 1:
             raise two_givers(f"{taker.label}.{name}", name, givers)
-        return Source(givers[0] if givers else "", name)
+        return FeedSource(givers[0] if givers else "", name)
 
-    def _given_first(self, entry: StateEntry) -> Source | None:
+    def _given_first(self, entry: StateEntry) -> FeedSource | None:
         """Return the output that is a first value; None where it is something else."""
         part, _, name = entry.first.partition(".")
-        return Source(part, name) if part in self.names.givers(name) else None
+        return FeedSource(part, name) if part in self.names.givers(name) else None
 
     def _array(self, text: str, name: str, where: str) -> Array:
         path = self.folder / text

@@ -9,7 +9,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.runtime.stack.part_graph import PartGraph, misfit, told
 
 
-class Source(NamedTuple):
+class FeedSource(NamedTuple):
     """What feeds an input.
 
     Attributes:
@@ -21,7 +21,7 @@ class Source(NamedTuple):
     name: str
 
 
-Sources = Mapping[str, Mapping[str, Source]]
+Sources = Mapping[str, Mapping[str, FeedSource]]
 """By part and input, what feeds it."""
 
 
@@ -74,7 +74,7 @@ class Joints:
 
 
 def _check(
-    graphs: Mapping[str, PartGraph], taker: PartGraph, name: str, source: Source
+    graphs: Mapping[str, PartGraph], taker: PartGraph, name: str, source: FeedSource
 ) -> None:
     giver = graphs.get(source.part)
     if giver is None:
@@ -130,7 +130,7 @@ class Names:
         """Name an output of the stack: by its part where two have one of that name."""
         return output if len(self.givers(output)) == 1 else f"{part}.{output}"
 
-    def output(self, text: str, where: str) -> Source:
+    def output(self, text: str, where: str) -> FeedSource:
         """Find the output that a text names: ``PART.NAME``, or what one part gives.
 
         Raises:
@@ -140,10 +140,10 @@ class Names:
         if len(givers) > 1:
             raise two_givers(where, text, givers)
         if givers:
-            return Source(givers[0], text)
+            return FeedSource(givers[0], text)
         part, _, name = text.partition(".")
         if part in self.givers(name):
-            return Source(part, name)
+            return FeedSource(part, name)
         there = [
             f"{each}.{output}"
             for each in self.parts()

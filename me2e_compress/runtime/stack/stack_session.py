@@ -11,7 +11,7 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.recurrence import SessionPort, not_fed_back
 from me2e_compress.runtime.session import Session, zeros
-from me2e_compress.runtime.stack.joints import Joints, Source
+from me2e_compress.runtime.stack.joints import FeedSource, Joints
 from me2e_compress.runtime.stack.split_stack import SplitStack, is_stack
 
 
@@ -163,7 +163,7 @@ class StackSession:
             GraphError: a node failed on these inputs.
         """
         joints = self._joints(first=first)
-        values = dict[Source, Array]()
+        values = dict[FeedSource, Array]()
         for part in joints.order:
             if parts is not None and part not in parts:
                 continue
@@ -178,7 +178,7 @@ class StackSession:
                 found = session.run(fed)
             except (FramesError, GraphError) as error:
                 raise type(error)(f"{label}: {error}") from error
-            values |= {Source(part, name): value for name, value in found.items()}
+            values |= {FeedSource(part, name): value for name, value in found.items()}
             yield PartRun(label, fed, found)
 
     def _joints(self, *, first: bool) -> Joints:

@@ -1,6 +1,6 @@
 """Six pinhole cameras over the painted road: images, and what each pixel shows."""
 
-from me2e_compress.simulator.cameras.birdseye import BevGrid, bev_classes
+from me2e_compress.simulator.cameras.birdseye import BirdseyeGrid, bev_classes
 from me2e_compress.simulator.cameras.classes import PixelClass
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.cameras.rig import CAMERA_NAMES, CameraRig
@@ -13,7 +13,7 @@ from me2e_compress.simulator.cameras.weather import CLEAR, Weather
 __all__ = [
     "CAMERA_NAMES",
     "CLEAR",
-    "BevGrid",
+    "BirdseyeGrid",
     "CameraRig",
     "Cameras",
     "GroundTexture",

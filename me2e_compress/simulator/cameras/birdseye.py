@@ -20,7 +20,7 @@ SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class BevGrid:
+class BirdseyeGrid:
     """A grid in the ego frame: row 0 is farthest ahead, column 0 farthest left.
 
     Cell (r, c) covers x from front_m - (r + 1) * cell_m to front_m - r * cell_m and y
@@ -57,7 +57,7 @@ class BevGrid:
         return np.stack([self.left_m - y, self.front_m - x], axis=-1) / self.cell_m
 
 
-def bev_classes(scene: Scene, texture: GroundTexture, grid: BevGrid) -> Bytes:
+def bev_classes(scene: Scene, texture: GroundTexture, grid: BirdseyeGrid) -> Bytes:
     """Return the `PixelClass` at the centre of each cell, uint8 [rows, columns].
 
     Signals have no extent on the ground and are left out; the ego is drawn last.
@@ -69,7 +69,7 @@ def bev_classes(scene: Scene, texture: GroundTexture, grid: BevGrid) -> Bytes:
     return labels
 
 
-def ground_classes(ego: Ego, texture: GroundTexture, grid: BevGrid) -> Bytes:
+def ground_classes(ego: Ego, texture: GroundTexture, grid: BirdseyeGrid) -> Bytes:
     """Return the class of the ground at the centre of each cell, actors left out.
 
     Args:
@@ -102,7 +102,7 @@ def ground_classes(ego: Ego, texture: GroundTexture, grid: BevGrid) -> Bytes:
     )
 
 
-def covered(actors: Sequence[Actor], ego: Ego, grid: BevGrid) -> Flags:
+def covered(actors: Sequence[Actor], ego: Ego, grid: BirdseyeGrid) -> Flags:
     """Return whether each cell is touched by an actor: bool [rows, columns].
 
     Args:
@@ -128,7 +128,7 @@ def _footprint(box: Actor | Ego, ego: Ego) -> Floats:
     return np.asarray(corners @ rotation + centre)
 
 
-def _fill(labels: Bytes, corners: Floats, value: int, grid: BevGrid) -> None:
+def _fill(labels: Bytes, corners: Floats, value: int, grid: BirdseyeGrid) -> None:
     scaled = (grid.cells(corners) - 0.5) * (1 << SUBPIXEL_BITS)
     polygon = np.rint(scaled).astype(np.int32)
     cv2.fillConvexPoly(labels, polygon, (int(value),), cv2.LINE_8, SUBPIXEL_BITS)

@@ -96,7 +96,7 @@ def _tensorrt() -> Any:
 def _log(trt: Any) -> Any:
     """Return a logger that keeps errors and says nothing."""
 
-    class Log(trt.ILogger):  # type: ignore[misc]
+    class Messages(trt.ILogger):  # type: ignore[misc]
         def __init__(self) -> None:
             trt.ILogger.__init__(self)
             self.lines: list[str] = []
@@ -105,7 +105,7 @@ def _log(trt: Any) -> Any:
             if severity <= trt.ILogger.Severity.ERROR:
                 self.lines.append(" ".join(message.split()))
 
-    return Log()
+    return Messages()
 
 
 def _load_plugins(trt: Any, log: Any, libraries: Sequence[Path]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.evaluators.highway.reentry import in_ego_frame
-from me2e_compress.simulator.cameras import BevGrid, PixelClass
+from me2e_compress.simulator.cameras import BirdseyeGrid, PixelClass
 from me2e_compress.simulator.cameras.birdseye import covered
 from me2e_compress.simulator.cameras.classes import ACTOR_CLASSES
 from me2e_compress.simulator.plane_geometry import Floats
@@ -18,7 +18,7 @@ AGENT_COLUMNS = 10
 FUTURE_STEPS, FUTURE_US = 6, 500_000
 REACH_M = ((-16.0, 48.0), (-24.0, 24.0))
 """Where the centre of an agent may be: x and y in the ego frame."""
-GRID = BevGrid(front_m=48.0, left_m=24.0, cell_m=1.0, rows=64, columns=48)
+GRID = BirdseyeGrid(front_m=48.0, left_m=24.0, cell_m=1.0, rows=64, columns=48)
 CLASSES = {
     PixelClass.VEHICLE: 0.0,
     PixelClass.BICYCLE: 1.0,

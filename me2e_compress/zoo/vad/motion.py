@@ -18,15 +18,15 @@ from me2e_compress.zoo.vad.config import (
     Heads,
 )
 from me2e_compress.zoo.vad.perception import (
-    Agents,
-    Map,
+    AgentOutputs,
+    MapOutputs,
     PerceptionHead,
     classifier,
     regressor,
 )
 
 
-class Motion(NamedTuple):
+class MotionOutputs(NamedTuple):
     """Forecasts of every agent."""
 
     steps: Tensor  # [3, 1, 300, 6, 12], metres a step
@@ -89,7 +89,7 @@ class MotionHead(PerceptionHead):
         self.traj_branches = nn.ModuleList([regressor(STEPS * 2, 2 * EMBED)])
         self.traj_cls_branches = nn.ModuleList([classifier(1, 2 * EMBED)])
 
-    def lanes(self, vectors: Map) -> tuple[Tensor, Tensor]:
+    def lanes(self, vectors: MapOutputs) -> tuple[Tensor, Tensor]:
         """Return one query [1, 100, 256] and one position [1, 100, 2] a map vector."""
         with region("map"):
             return self.lane_encoder(vectors.queries), nearest_points(
@@ -97,8 +97,8 @@ class MotionHead(PerceptionHead):
             )
 
     def forecast(
-        self, agents: Agents, vectors: Map, lanes: tuple[Tensor, Tensor]
-    ) -> Motion:
+        self, agents: AgentOutputs, vectors: MapOutputs, lanes: tuple[Tensor, Tensor]
+    ) -> MotionOutputs:
         """Predict the motion of all agents in all modes."""
         with region("motion"):
             query = agents.queries.unsqueeze(2) + self.motion_mode_query.weight
@@ -112,7 +112,7 @@ class MotionHead(PerceptionHead):
             both = both.view(1, AGENTS, AGENT_MODES, 2 * EMBED)
             steps = self.traj_branches[0](both)
             scores = self.traj_cls_branches[0](both).squeeze(-1)
-            return Motion(
+            return MotionOutputs(
                 steps.unsqueeze(0).repeat(LAYERS, 1, 1, 1, 1),
                 scores.unsqueeze(0).repeat(LAYERS, 1, 1, 1),
                 both,
@@ -122,7 +122,7 @@ class MotionHead(PerceptionHead):
         self,
         query: Tensor,
         centres: Tensor,
-        vectors: Map,
+        vectors: MapOutputs,
         lanes: tuple[Tensor, Tensor],
     ) -> Tensor:
         """Let each agent-mode attend to the likely map vectors near it.

@@ -21,7 +21,7 @@ from me2e_compress.zoo.vad.config import (
 from me2e_compress.zoo.vad.transformer import PerceptionTransformer
 
 
-class Agents(NamedTuple):
+class AgentOutputs(NamedTuple):
     """Outputs of detection, with queries and positions of the last layer."""
 
     scores: Tensor  # [3, 1, 300, classes], logits
@@ -30,7 +30,7 @@ class Agents(NamedTuple):
     centres: Tensor  # [1, 300, 2], 0..1
 
 
-class Map(NamedTuple):
+class MapOutputs(NamedTuple):
     """Outputs of the map decoder, with queries and points of the last layer."""
 
     scores: Tensor  # [3, 1, 100, classes], logits
@@ -83,7 +83,7 @@ class PerceptionHead(nn.Module):
 
     def perceive(
         self, features: Tensor, lidar2img: Tensor, can_bus: Tensor, prev_bev: Tensor
-    ) -> tuple[Tensor, Agents, Map]:
+    ) -> tuple[Tensor, AgentOutputs, MapOutputs]:
         """Map camera features [cameras, 256, h, w] to BEV, boxes and map vectors."""
         with region("bev_encoder"):
             cells = self.bev_embedding.weight.unsqueeze(0), self.positional_encoding()
@@ -110,17 +110,19 @@ class PerceptionHead(nn.Module):
 
     def _agents(
         self, queries: list[Tensor], raw: list[Tensor], at: list[Tensor]
-    ) -> Agents:
+    ) -> AgentOutputs:
         scores = [
             branch(query)
             for branch, query in zip(self.cls_branches, queries, strict=True)
         ]
         boxes = [in_metres(r, a, GRID) for r, a in zip(raw, at, strict=True)]
-        return Agents(
+        return AgentOutputs(
             torch.stack(scores), torch.stack(boxes), queries[-1], at[-1][..., :2]
         )
 
-    def _map(self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]) -> Map:
+    def _map(
+        self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]
+    ) -> MapOutputs:
         grouped = [q.view(1, VECTORS, VECTOR_POINTS, EMBED) for q in queries]
         scores = [
             branch(query.mean(2))
@@ -128,7 +130,7 @@ class PerceptionHead(nn.Module):
         ]
         points = [a.view(1, VECTORS, VECTOR_POINTS, 2) for a in at]
         boxes = [_enclosing(p) for p in points]
-        return Map(
+        return MapOutputs(
             torch.stack(scores), torch.stack(boxes), torch.stack(points), grouped[-1]
         )
 

@@ -7,8 +7,8 @@ from me2e_compress.zoo.bev.decoder import Interaction
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.vad.config import AGENT_MODES, STEPS, Heads
-from me2e_compress.zoo.vad.motion import Motion, MotionHead
-from me2e_compress.zoo.vad.perception import Agents, regressor
+from me2e_compress.zoo.vad.motion import MotionHead, MotionOutputs
+from me2e_compress.zoo.vad.perception import AgentOutputs, regressor
 
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -55,7 +55,7 @@ class PlanningHead(MotionHead):
         )
 
     def plan(
-        self, agents: Agents, motion: Motion, lanes: tuple[Tensor, Tensor]
+        self, agents: AgentOutputs, motion: MotionOutputs, lanes: tuple[Tensor, Tensor]
     ) -> Tensor:
         """Return [1, modes, 6, 2]: metres a step of 0.5 s, for every command."""
         with region("planner"):

@@ -3,7 +3,7 @@ import pytest
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import (
-    BevGrid,
+    BirdseyeGrid,
     CameraRig,
     Cameras,
     GroundTexture,
@@ -17,7 +17,7 @@ from me2e_compress.simulator.cameras.birdseye import (
 from me2e_compress.simulator.scene import ActorKind, Scene
 from tests.simulator.cameras import town
 
-GRID = BevGrid(front_m=40.0, left_m=20.1, cell_m=0.2, rows=300, columns=201)
+GRID = BirdseyeGrid(front_m=40.0, left_m=20.1, cell_m=0.2, rows=300, columns=201)
 
 
 def at(texture: GroundTexture, scene: Scene, x: float, y: float) -> PixelClass:
@@ -87,7 +87,7 @@ def test_ground_classes_of_camera_and_grid_agree(
 
 def test_an_empty_grid_is_refused() -> None:
     with pytest.raises(EvaluationError, match=r"grid of 0 x 200 cells .* positive"):
-        BevGrid(rows=0)
+        BirdseyeGrid(rows=0)
 
 
 def test_the_ground_is_what_lies_under_the_ego(texture: GroundTexture) -> None:
