@@ -20,6 +20,15 @@ def inverse_sigmoid(x: Tensor) -> Tensor:
     return torch.log(torch.maximum(x, EPSILON) / torch.maximum(1 - x, EPSILON))
 
 
+def precise_sigmoid(x: Tensor) -> Tensor:
+    """Return 1 / (1 + exp(-x)), exact to its last digits however small it is.
+
+    onnxruntime's Sigmoid is exact to 8e-8 whatever it returns: beside 1e-5, where
+    `inverse_sigmoid` ends, that moves the logit by 8e-3.
+    """
+    return torch.reciprocal(1 + torch.exp(-x))
+
+
 def in_metres(raw: Tensor, at: Tensor, grid: BevGrid) -> Tensor:
     """Return boxes [..., 10]: raw ones whose refined centres (0..1) are in metres."""
     x0, y0, z0, x1, y1, z1 = grid.pc_range
@@ -59,13 +68,28 @@ class DecoderLayer(nn.Module):
 
 
 class Decoder(nn.Module):
-    """`DecoderLayer`s with a regression branch after each."""
+    """`DecoderLayer`s with a regression branch after each.
+
+    Args:
+        hw: Cells of the BEV.
+        layers: How many.
+        sampling: How attention is exported.
+        height: References have a third coordinate.
+        precise: For references that are fed back as logits, from frame to frame.
+    """
 
     def __init__(
-        self, hw: tuple[int, int], layers: int, sampling: Sampling, *, height: bool
+        self,
+        hw: tuple[int, int],
+        layers: int,
+        sampling: Sampling,
+        *,
+        height: bool,
+        precise: bool = False,
     ) -> None:
         super().__init__()
         self.height = height
+        self.sigmoid = precise_sigmoid if precise else torch.sigmoid
         self.layers = nn.ModuleList(DecoderLayer(hw, sampling) for _ in range(layers))
 
     def forward(
@@ -99,7 +123,7 @@ class Decoder(nn.Module):
             moves = raw[..., :2]
             if self.height:
                 moves = torch.cat([moves, raw[..., 4:5]], -1)
-            reference = (moves + inverse_sigmoid(reference)).sigmoid()
+            reference = self.sigmoid(moves + inverse_sigmoid(reference))
             queries.append(query)
             regressions.append(raw)
             references.append(reference)

@@ -6,7 +6,12 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.zoo.bev.can_bus import CanBusEncoder
-from me2e_compress.zoo.bev.decoder import Decoder, in_metres, inverse_sigmoid
+from me2e_compress.zoo.bev.decoder import (
+    Decoder,
+    in_metres,
+    inverse_sigmoid,
+    precise_sigmoid,
+)
 from me2e_compress.zoo.bev.encoder import BevEncoder, GridPosition
 from me2e_compress.zoo.bev.reference_points import cell_positions, ego_shift, turn
 from me2e_compress.zoo.bev.sizes import (
@@ -64,7 +69,7 @@ class TrackTransformer(nn.Module):
             config.grid, config.image_hw, config.hws, config.encoder_layers, sampling
         )
         self.decoder = Decoder(
-            config.grid.hw, config.decoder_layers, sampling, height=True
+            config.grid.hw, config.decoder_layers, sampling, height=True, precise=True
         )
         self.register_buffer("cells", cell_positions(config.grid), False)
 
@@ -117,7 +122,7 @@ class TrackTransformer(nn.Module):
             bev = self.bev(levels, *cells, motions)
         with region("track"):
             pos, content = queries.query.chunk(2, 2)
-            reference = queries.reference.sigmoid()
+            reference = precise_sigmoid(queries.reference)
             found = self.decoder(content, pos, bev, reference, branches, queries.ignore)
         return bev, found
 

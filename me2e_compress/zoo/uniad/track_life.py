@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.zoo.bev.decoder import inverse_sigmoid
+from me2e_compress.zoo.bev.decoder import inverse_sigmoid, precise_sigmoid
 from me2e_compress.zoo.uniad.config import UniadConfig
 
 BEGINS = torch.tensor(0.4)
@@ -121,7 +121,7 @@ class VelocityUpdate(nn.Module):
 
         The world turns back by the transpose, which of a rotation is the inverse.
         """
-        points = ref_pts.sigmoid() * self.extent + self.low
+        points = precise_sigmoid(ref_pts) * self.extent + self.low
         seconds = now.seconds - before.seconds
         moved = torch.cat([velocity, torch.zeros_like(velocity[:, :1])], 1) * seconds
         world = torch.matmul(points + moved, before.rotation[0]) + before.position
