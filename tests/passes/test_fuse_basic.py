@@ -300,6 +300,24 @@ ACTIVATIONS: list[tuple[int, str, dict[str, Any], list[str]]] = [
         {"u": UNIT},
         ["Sigmoid"],
     ),
+    (  # a Sigmoid would lose the digits that the Log shows
+        17,
+        body(
+            "a = Neg(x) b = Exp(a) c = Add(b, u) d = Reciprocal(c)",
+            "e = Sub(u, d) f = Div(d, e) y = Log(f)",
+        ),
+        {"u": UNIT},
+        ["Neg", "Exp", "Add", "Reciprocal", "Sub", "Div", "Log"],
+    ),
+    (  # behind a layer they are lost anyway
+        17,
+        body(
+            "a = Neg(x) b = Exp(a) c = Add(b, u) d = Reciprocal(c)",
+            "e = Softmax(d) y = Log(e)",
+        ),
+        {"u": UNIT},
+        ["Sigmoid", "Softmax", "Log"],
+    ),
     (17, body("a = Exp(x) b = Add(a, u) y = Log(b)"), {"u": UNIT}, ["Softplus"]),
     (
         17,
