@@ -111,7 +111,8 @@ def from_toml(text: bytes | str) -> dict[str, Any]:
 
 
 def _decoded(text: bytes | str) -> str:
-    return text if isinstance(text, str) else text.decode("utf-8")
+    # editors of Windows put a byte order mark before it
+    return text if isinstance(text, str) else text.decode("utf-8-sig")
 
 
 def _line(error: ValueError) -> str:

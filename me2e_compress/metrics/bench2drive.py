@@ -18,14 +18,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.metrics.efficiency import CHECKPOINTS, OUTLIER_PERCENT, PERCENT
+from me2e_compress.metrics.efficiency import (
+    CHECKPOINTS,
+    DONE_PERCENT,
+    OUTLIER_PERCENT,
+    PERCENT,
+)
 from me2e_compress.metrics.episode import EgoFrame, Episode
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.measure import Measure
 
 BLOCK_FRAMES = 20
 DELTA_S = 0.1
-DONE_PERCENT = 95.0
 SUCCESSES = ("Completed", "Perfect")
 
 Floats = npt.NDArray[np.float64]

@@ -8,6 +8,8 @@ from me2e_compress.metrics.measure import Measure
 
 CHECKPOINTS = 20
 OUTLIER_PERCENT = 1000.0
+DONE_PERCENT = 95.0
+"""Beyond this much of a route Bench2Drive reports the speed over what is left of it."""
 PERCENT = "%"
 
 
@@ -31,13 +33,15 @@ def efficiency(episode: Episode) -> Measure:
 def speed_ratios(episode: Episode) -> tuple[float, ...]:
     """Return the ratio at each check point that saw moving traffic, in percent.
 
-    Ratios that the simulator reported itself come first: of its last two, which
-    Bench2Drive writes twice, one is kept.
+    Ratios that the simulator reported itself come first: that of the last stretch,
+    which Bench2Drive writes twice where more than 95 % of the route was passed, is kept
+    once.
     """
     if episode.speed_ratios_percent is not None:
         given = episode.speed_ratios_percent
-        twice = len(given) > 1 and given[-1] == given[-2]
-        return given[:-1] if twice and episode.completion_percent >= 100.0 else given
+        done = episode.completion_percent > DONE_PERCENT
+        twice = done and len(given) > 1 and given[-1] == given[-2]
+        return given[:-1] if twice else given
     ratios = (_ratio_percent(stretch) for stretch in _stretches(episode))
     return tuple(ratio for ratio in ratios if ratio is not None)
 

@@ -116,3 +116,12 @@ def test_given_ratios_are_taken_and_their_repetition_known() -> None:
 
     assert efficiency(episode).value == 80.0
     assert bench2drive.efficiency(episode).value == 70.0
+
+
+@pytest.mark.parametrize(("completion", "value"), [(95.0, 70.0), (95.1, 80.0)])
+def test_beyond_95_percent_the_last_ratio_stands_twice(
+    completion: float, value: float
+) -> None:
+    episode = drive(completion=completion, ratios=(80.0, 120.0, 40.0, 40.0))
+
+    assert efficiency(episode).value == value

@@ -9,9 +9,11 @@ from typing import ClassVar
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.bench2drive.drive_recordings import DriveRecordings
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
     BrokenRecordingError,
+    RecordedRoute,
     read_recording,
 )
 from me2e_compress.evaluators.bench2drive.records import RouteRecord
@@ -112,6 +114,8 @@ class Bench2DriveResults:
         found = find_files(self.folder)
         if self.metrics is not None:
             found.recordings += find_files(self.metrics).recordings
+        by_place = {path.resolve(): path for path in found.recordings}
+        found.recordings = list(by_place.values())
         if not any(file.records for file in found.results):
             raise EvaluationError(f"{self.folder}: {_nothing(found)}")
         return _Collection(found).results()
@@ -143,8 +147,11 @@ class _Collection:
 
     def results(self) -> CollectedResults:
         records = self._one_each()
-        recorded = _Recordings(self.found.recordings, self.found.results)
+        recorded = DriveRecordings(self.found.recordings, self.found.results)
         episodes = tuple(self._with_frames(each, recorded) for each in records)
+        if others := recorded.of_none:
+            more = f" and {len(others) - 1} others" if len(others) > 1 else ""
+            self.notes.insert(0, f"{others[0]}{more}: of no record")
         numbers = [each.number for each in records]
         route_set = likely_set(numbers)
         whole = ROUTE_SETS[route_set] if route_set else frozenset[str]()
@@ -200,66 +207,37 @@ class _Collection:
             self.contradictory.append(route)
         return min(drives or distinct, key=_lowest_first)
 
-    def _with_frames(self, record: RouteRecord, recorded: "_Recordings") -> Episode:
-        episode = record.episode
-        path = recorded.of(record)
-        if path is None:
+    def _with_frames(self, record: RouteRecord, recorded: DriveRecordings) -> Episode:
+        episode, paths = record.episode, recorded.of(record)
+        if not paths:
             self.unrecorded.append(episode.route)
-            return episode
+        for path in paths:
+            recording = self._read(path)
+            if recording is None:
+                continue
+            if len(paths) > 1:
+                self.notes.append(f"{path}: one of {len(paths)} of the same drive")
+            if not recording.in_order:
+                self.notes.append(f"{path}: steps out of order: comfort is of no drive")
+            interval_s = recording.interval_s(record.duration_s)
+            if interval_s != TICK_S:
+                self.off_rate[episode.route] = interval_s
+            return dataclasses.replace(episode, frames=recording.frames(interval_s))
+        return episode
+
+    def _read(self, path: Path) -> RecordedRoute | None:
+        """Return a recording; one that is not whole is named."""
         try:
             raw = documents.from_json(documents.content(path), finite=False)
-            recording = read_recording(raw)
+            return read_recording(raw)
         except OSError as error:
             self.broken[str(path)] = str(error.strerror)
-            return episode
         except (documents.MalformedError, BrokenRecordingError) as error:
             self.broken[str(path)] = str(error)
-            return episode
-        interval_s = recording.interval_s(record.duration_s)
-        if interval_s != TICK_S:
-            self.off_rate[episode.route] = interval_s
-        return dataclasses.replace(episode, frames=recording.frames(interval_s))
+        return None
 
 
 def _lowest_first(record: RouteRecord) -> tuple[float, bool, str]:
     given = record.episode.given
     composed = given.composed_percent if given else 0.0
     return composed, record.episode.succeeded, record.content
-
-
-class _Recordings:
-    """Finds the recording of a record."""
-
-    def __init__(self, paths: Sequence[Path], results: Sequence[ResultFile]) -> None:
-        self.paths = paths
-        alone = Counter(file.path.parent for file in results)
-        self.beside = {
-            record.content: file.path.parent
-            for file in results
-            if alone[file.path.parent] == 1 and len(file.records) == 1
-            for record in file.records
-        }
-
-    def of(self, record: RouteRecord) -> Path | None:
-        """Return the file whose folder is named after the record.
-
-        The name ends in the time of the drive, so another drive of the same route has
-        another. Agents may put the name of the routes' file before it. A recording
-        that lies beside the only record of a folder is that record's.
-        """
-        name = record.recording
-        if name is not None:
-            named = [path for path in self.paths if _is_named(path, name)]
-            exact = [path for path in named if name in (path.parent.name, path.stem)]
-            if named:
-                return (exact or named)[0]
-        where = self.beside.get(record.content)
-        beside = [path for path in self.paths if path.parent == where]
-        return beside[0] if len(beside) == 1 else None
-
-
-def _is_named(path: Path, name: str) -> bool:
-    return any(
-        each == name or each.endswith(f"_{name}")
-        for each in (path.parent.name, path.stem)
-    )

@@ -60,6 +60,11 @@ class RecordedRoute:
     along_mps2: Floats
     left_mps2: Floats
 
+    @property
+    def in_order(self) -> bool:
+        """Whether the steps follow each other as they were driven."""
+        return bool((np.diff(self.steps) > 0).all())
+
     def frames(self, interval_s: float) -> tuple[EgoFrame, ...]:
         """Return a frame a step.
 

@@ -1,13 +1,15 @@
 """The files below a folder of results, found by what they hold, not by their names."""
 
+import codecs
+import math
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
@@ -16,11 +18,14 @@ from me2e_compress.evaluators.bench2drive.records import (
     RouteRecord,
     read_record,
 )
+from me2e_compress.metrics.episode import LARGEST
 
 _CHECKPOINT = b'"_checkpoint"'
 _STEP = re.compile(rb'\s*\{\s*"-?\d+"\s*:\s*\{\s*"\w+"\s*:\s*\[')
 _PARTS = (b'"angular_velocity"', b'"forward_vector"')
 _BEGUN = b"begun"
+_RECORDING = "metric_info.json"
+"""What Bench2Drive's agents call it: one that says nothing else must be named, too."""
 _HEAD_BYTES = 4096
 _PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".bin"}
 
@@ -33,7 +38,8 @@ class ResultFile:
         path: Of the file.
         records: Those that could be read, in the order of the file.
         broken: Why others could not, by their place in the file.
-        stated: What a merged file says of itself; empty of a checkpoint.
+        stated: What a merged file says of itself, NaN where that is no number; empty
+            of a checkpoint.
     """
 
     path: Path
@@ -105,7 +111,9 @@ def _kind(path: Path) -> bytes | None:
     """Look at the beginning of a file, at all of it where that does not tell."""
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+            head = file.read(_HEAD_BYTES).removeprefix(codecs.BOM_UTF8)
+            if path.name == _RECORDING:
+                return _PARTS[0]
             if _is_begun(head) and path.suffix == ".json":
                 return _BEGUN
             if not head.lstrip().startswith(b"{"):
@@ -116,7 +124,8 @@ def _kind(path: Path) -> bytes | None:
                 return _PARTS[0] if all(part in head for part in _PARTS) else None
             if path.stat().st_size > documents.LARGEST_BYTES:
                 return None
-            return _CHECKPOINT if _CHECKPOINT in file.read() else None
+            rest = head[-len(_CHECKPOINT) :] + file.read()
+            return _CHECKPOINT if _CHECKPOINT in rest else None
     except OSError:
         return None
 
@@ -143,16 +152,28 @@ def _read(path: Path) -> ResultFile:
     return ResultFile(path, tuple(records), broken, checked.stated())
 
 
+def _number(value: object) -> float | None:
+    """Return NaN for what is no number: it must not cost the file its records."""
+    if value is None:
+        return None
+    if isinstance(value, (int, float)) and abs(value) <= LARGEST:
+        return float(value)
+    return math.nan
+
+
+_Stated = Annotated[float | None, BeforeValidator(_number)]
+
+
 class _Checkpoint(BaseModel):
     records: list[Any]
 
 
 class _Document(BaseModel):
-    model_config = ConfigDict(allow_inf_nan=False, extra="ignore")
+    model_config = ConfigDict(extra="ignore")
     checkpoint: _Checkpoint = Field(alias="_checkpoint")
-    driving_score: float | None = Field(None, alias="driving score")
-    success_rate: float | None = Field(None, alias="success rate")
-    eval_num: float | None = Field(None, alias="eval num")
+    driving_score: _Stated = Field(None, alias="driving score")
+    success_rate: _Stated = Field(None, alias="success rate")
+    eval_num: _Stated = Field(None, alias="eval num")
 
     def stated(self) -> dict[str, float]:
         """Return what merging wrote of the whole."""

@@ -1,5 +1,8 @@
+import codecs
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -185,6 +188,7 @@ def test_no_folder(tmp_path: Path) -> None:
     [
         f"{GOOD['save_name']}/metric_info.json",
         f"deep/bench2drive220_{GOOD['save_name']}/metric_info.json",
+        f"{GOOD['save_name']}/saved/metric_info.json",
         f"{GOOD['save_name']}.json",
         "metric_info.json",  # beside the only record of the folder
     ],
@@ -207,6 +211,75 @@ def test_the_recording_of_another_drive_is_not_taken(tmp_path: Path) -> None:
     write(tmp_path / earlier / "metric_info.json", recording())
 
     assert collect(tmp_path).unrecorded == ("RouteScenario_1711_rep0",)
+
+
+def test_a_recording_of_no_record_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    stray = write(tmp_path / "saved" / "7" / "metric_info.json", recording())
+
+    assert collect(tmp_path).notes == (f"{stray}: of no record",)
+
+
+def test_of_two_recordings_one_counts_and_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    first = write(tmp_path / "a" / GOOD["save_name"] / "m.json", recording(30))
+    write(tmp_path / "b" / GOOD["save_name"] / "m.json", recording(40))
+
+    assert collect(tmp_path).notes == (f"{first}: one of 2 of the same drive",)
+
+
+def test_a_whole_recording_stands_in_for_a_broken_one(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    write(tmp_path / "a" / GOOD["save_name"] / "metric_info.json", {})
+    write(tmp_path / "b" / GOOD["save_name"] / "metric_info.json", recording(40))
+
+    assert len(collect(tmp_path).episodes[0].frames) == 40
+
+
+@pytest.mark.parametrize("content", [{}, [], {"0": None}, {"note": 1, **recording(3)}])
+def test_a_metric_info_that_is_no_recording_is_named(
+    tmp_path: Path, content: object
+) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    file = write(tmp_path / GOOD["save_name"] / "metric_info.json", content)
+
+    assert list(collect(tmp_path).broken) == [str(file)]
+
+
+def test_steps_out_of_order_are_named(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    steps = recording(30)
+    as_text = {step: steps[step] for step in sorted(steps)}
+    file = write(tmp_path / GOOD["save_name"] / "metric_info.json", as_text)
+
+    assert collect(tmp_path).notes == (
+        f"{file}: steps out of order: comfort is of no drive",
+    )
+
+
+def test_a_byte_order_mark_hides_nothing(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    write(tmp_path / GOOD["save_name"] / "m.json", recording(40))
+    for file in tmp_path.rglob("*.json"):
+        file.write_bytes(codecs.BOM_UTF8 + file.read_bytes())
+
+    assert len(collect(tmp_path).episodes[0].frames) == 40
+
+
+@pytest.mark.parametrize("said", [math.nan, "37.7", [], 10**400])
+def test_what_a_merged_file_says_costs_no_record(tmp_path: Path, said: Any) -> None:
+    write(tmp_path / "m.json", merged(GOOD, said={"driving score": said}))
+
+    assert len(collect(tmp_path).episodes) == 1
+
+
+def test_recordings_in_both_folders_are_one(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    write(tmp_path / "metric_info.json", recording(25))
+
+    found = Bench2DriveResults(tmp_path, tmp_path).collect()
+
+    assert len(found.episodes[0].frames) == 25
 
 
 def test_recordings_may_lie_apart(tmp_path: Path) -> None:
