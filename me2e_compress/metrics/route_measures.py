@@ -52,7 +52,8 @@ def route_measures(
 
     A frame of the paper's joules a frame is an inference (its window is 100 of them),
     so a route costs joules a frame times its decisions: frames of the world in which
-    the policy was not asked cost nothing.
+    the policy was not asked cost nothing. A real run without a log of decisions has one
+    for each step that the agent recorded, as Bench2Drive's agents do both in one.
 
     A driver that never passed the first 5 % of a route, or ended it within 20 frames,
     has no efficiency or comfort to average (equations 6 and 7 leave the route out);
@@ -89,9 +90,11 @@ def _comfort(episode: Episode) -> float:
 
 
 def _joules(episode: Episode, j_per_frame: float | None) -> float:
-    if j_per_frame is None or not (episode.decisions or episode.failure):
+    recorded = len(episode.frames) if episode.given is not None else 0
+    inferences = len(episode.decisions) or recorded
+    if j_per_frame is None or not (inferences or episode.failure):
         return math.nan
-    return j_per_frame * len(episode.decisions)
+    return j_per_frame * inferences
 
 
 def _recorded(episode: Episode) -> bool:

@@ -188,6 +188,9 @@ def test_the_reader_of_real_results_takes_what_is_left(
 
     assert (found.unrecorded, dict(found.off_rate), dict(found.broken)) == ((), {}, {})
     assert len(found.episodes[0].frames) == 60
+    # 200 ms skip three decisions
+    decided_us = [one.time_us for one in found.episodes[0].decisions]
+    assert decided_us == list(range(0, 3_000_000, 200_000))
 
 
 def test_an_agent_without_a_cheap_part_has_its_steps_counted(

@@ -17,7 +17,7 @@ from me2e_compress.metrics.eer import (
     rankings,
     scale_of,
 )
-from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.episode import Ending, Given
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from tests.metrics.drives import cruise, drive, infraction
@@ -167,6 +167,16 @@ def test_joules_of_a_route_are_those_of_its_decisions() -> None:
     assert found.energy_j.tolist() == [2.5]  # a drive by hand has one decision
     assert found.efficiency.tolist() == pytest.approx([200.0])
     assert found.comfort.tolist() == [1.0]
+
+
+def test_without_a_log_of_decisions_a_recorded_step_of_a_real_run_is_one() -> None:
+    real = dataclasses.replace(
+        drive(driven=cruise()[:8]),
+        decisions=(),
+        given=Given("Completed", 100.0, 1.0, 100.0),
+    )
+
+    assert route_measures([real], 2.5).energy_j.tolist() == [20.0]
 
 
 def test_no_counter_no_joules() -> None:

@@ -10,6 +10,10 @@ from typing import ClassVar
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.drive_recordings import DriveRecordings
+from me2e_compress.evaluators.bench2drive.logged_decisions import (
+    DECISIONS,
+    decisions_beside,
+)
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
     BrokenRecordingError,
@@ -28,7 +32,7 @@ from me2e_compress.evaluators.bench2drive.route_sets import (
     by_number,
     likely_set,
 )
-from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.episode import Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
 
 
@@ -222,8 +226,20 @@ class _Collection:
             interval_s = recording.interval_s(record.duration_s)
             if interval_s != TICK_S:
                 self.off_rate[episode.route] = interval_s
-            return dataclasses.replace(episode, frames=recording.frames(interval_s))
+            return dataclasses.replace(
+                episode,
+                frames=recording.frames(interval_s),
+                decisions=self._decisions(path),
+            )
         return episode
+
+    def _decisions(self, recording: Path) -> tuple[InferenceRecord, ...]:
+        """Return the decisions noted beside a recording; a broken log is named."""
+        try:
+            return decisions_beside(recording)
+        except (OSError, documents.MalformedError, BrokenRecordingError) as error:
+            self.broken[str(recording.with_name(DECISIONS))] = str(error)
+        return ()
 
     def _read(self, path: Path) -> RecordedRoute | None:
         """Return a recording; one that is not whole is named."""

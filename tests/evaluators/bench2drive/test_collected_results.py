@@ -246,6 +246,15 @@ def test_a_metric_info_that_is_no_recording_is_named(
     assert list(collect(tmp_path).broken) == [str(file)]
 
 
+def test_a_log_of_decisions_that_is_cut_off_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    write(tmp_path / GOOD["save_name"] / "metric_info.json", recording(40))
+    log = tmp_path / GOOD["save_name"] / "decisions.jsonl"
+    log.write_text('{"frame": 0, "latency_us": 90000}\n{"frame": 1, "late')
+
+    assert collect(tmp_path).broken == {str(log): "line 2 is no decision"}
+
+
 def test_steps_out_of_order_are_named(tmp_path: Path) -> None:
     write(tmp_path / "r.json", checkpoint(GOOD))
     steps = recording(30)

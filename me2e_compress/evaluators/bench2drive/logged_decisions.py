@@ -1,0 +1,47 @@
+"""The decisions that `RealTimeAgent` noted beside a recording, a line each."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from me2e_compress import documents
+from me2e_compress.evaluators.bench2drive.recordings import (
+    TICK_S,
+    BrokenRecordingError,
+)
+from me2e_compress.metrics.episode import LARGEST, InferenceRecord
+
+DECISIONS = "decisions.jsonl"
+
+_Count = Annotated[int, Field(ge=0, le=LARGEST)]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore")
+    frame: _Count
+    latency_us: _Count
+
+
+def decisions_beside(recording: Path) -> tuple[InferenceRecord, ...]:
+    """Return the decisions of a drive; none without such a log.
+
+    Args:
+        recording: Its ``metric_info.json``.
+
+    Raises:
+        BrokenRecordingError: A line is not whole.
+        OSError: It cannot be read.
+    """
+    path = recording.with_name(DECISIONS)
+    if not path.exists():
+        return ()
+    found = list[InferenceRecord]()
+    for number, line in enumerate(documents.content(path).splitlines(), 1):
+        try:
+            noted = _Line.model_validate(documents.from_json(line))
+        except (documents.MalformedError, ValidationError) as error:
+            raise BrokenRecordingError(f"line {number} is no decision") from error
+        time_us = round(1e6 * TICK_S * noted.frame)
+        found.append(InferenceRecord(time_us, noted.latency_us))
+    return tuple(found)
