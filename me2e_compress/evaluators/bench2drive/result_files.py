@@ -153,7 +153,7 @@ def _read(path: Path) -> ResultFile:
 
 
 def _number(value: object) -> float | None:
-    """Return NaN for what is no number: the records are read all the same."""
+    """Return NaN for anything but a number: the records are read all the same."""
     if value is None:
         return None
     if isinstance(value, (int, float)) and abs(value) <= LARGEST:
