@@ -13,6 +13,7 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.workflows.eer_weights import Kind, SavedWeights
+from me2e_compress.workflows.paired_drives import UNPAIRED, paired_drives
 from me2e_compress.workflows.result import Table, number, table
 
 HEADS: Mapping[Kind, str] = {
@@ -148,11 +149,14 @@ def score_eer(
     if not asked:
         asked["measured"] = {}
     scales = _scales(options.weights, asked)
-    types, found = _types(folders), dict[Kind, EerResult]()
+    paired, others = paired_drives(folders)
+    types, found = _types(paired), dict[Kind, EerResult]()
     orders = dict[Kind, dict[str, tuple[str, ...]]]()
     for kind, joules in asked.items():
-        variants = _variants(folders, kind, joules)
-        found[kind] = eer(variants, scales.get(kind), types=types)
+        variants = _variants(paired, kind, joules)
+        result = eer(variants, scales.get(kind), types=types)
+        left_out = {UNPAIRED: others, **result.left_out} if others else result.left_out
+        found[kind] = dataclasses.replace(result, left_out=left_out)
         orders[kind] = {str(n): order for n, order in rankings(variants).items()}
     if options.save_weights is not None:
         _save(Path(options.save_weights), found)
@@ -196,24 +200,15 @@ def joules_named(words: Sequence[str]) -> dict[str, str | float]:
 def _variants(
     folders: Mapping[str, Sequence[Episode]], kind: Kind, joules: Joules
 ) -> dict[str, RouteMeasures]:
-    """Return the measures of every folder, routes in the order of the first."""
+    """Return the measures of every folder."""
     named = {
         _folder(name, folders): _joules(name, kind, each)
         for name, each in joules.items()
     }
-    order = [episode.route for episode in next(iter(folders.values()), ())]
-    found = dict[str, RouteMeasures]()
-    for name, episodes in folders.items():
-        by_route = {episode.route: episode for episode in episodes}
-        unpaired = sorted({*by_route} ^ {*order})
-        if unpaired:
-            raise EvaluationError(
-                f"{name}: route {unpaired[0]} is in one of the folders only: EER_AV "
-                "compares the same routes"
-            )
-        ordered = [by_route[route] for route in order]
-        found[name] = route_measures(ordered, named.get(name))
-    return found
+    return {
+        name: route_measures(episodes, named.get(name))
+        for name, episodes in folders.items()
+    }
 
 
 def _folder(name: str, folders: Mapping[str, Sequence[Episode]]) -> str:

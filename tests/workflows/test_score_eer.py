@@ -13,7 +13,7 @@ from me2e_compress.cli.commands.score import score as command
 from me2e_compress.errors import EnergyError, EvaluationError
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.evaluators.highway.worker import Driven
-from me2e_compress.metrics.episode import Episode, InferenceRecord
+from me2e_compress.metrics.episode import Episode, Given, InferenceRecord
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.workflows.score_eer import EerOptions, joules_named, score_eer
@@ -151,6 +151,21 @@ def test_spoiled_weights_are_one_line(
 
     with pytest.raises(EvaluationError, match=re.escape(said)):
         score_eer(FOLDERS, EerOptions(joules, weights=file))
+
+
+def test_what_one_real_run_lacks_is_left_out_of_all() -> None:
+    given = Given("Completed", 100.0, 1.0, 100.0)
+    real = {
+        name: [dataclasses.replace(each, given=given) for each in episodes]
+        for name, episodes in FOLDERS.items()
+    }
+    real["runs/slow"].append(dataclasses.replace(real["runs/slow"][0], route="c"))
+
+    found = score_eer(real, EerOptions({"fast": 2.0, "slow": 3.0}))
+
+    assert found is not None
+    assert found.found["measured"].left_out == {"a drive in each": 1}
+    assert found.found["measured"].scores["runs/slow"].n == 2
 
 
 def test_no_joules_no_score() -> None:
