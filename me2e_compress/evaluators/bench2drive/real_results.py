@@ -207,9 +207,10 @@ class _Collection:
         drives = [each for each in distinct if not each.crashed]
         if drives and len(drives) < len(distinct):
             self.rerun.append(route)
-        if len(drives) > 1:
+        counted = drives or distinct
+        if len(counted) > 1:
             self.contradictory.append(route)
-        return min(drives or distinct, key=_lowest_first)
+        return min(counted, key=_lowest_first)
 
     def _with_frames(self, record: RouteRecord, recorded: DriveRecordings) -> Episode:
         episode, paths = record.episode, recorded.of(record)

@@ -99,7 +99,12 @@ def _kinds(folder: Path) -> Iterator[tuple[Path, bytes | None]]:
     """Yield every file with what tells its kind; None of those that are neither."""
     if folder.is_file():
         yield folder, _kind(folder)
-    for where, folders, names in os.walk(folder):
+    seen = set[str]()
+    for where, folders, names in os.walk(folder, followlinks=True):
+        if (place := os.path.realpath(where)) in seen:  # links may go round in circles
+            folders.clear()
+            continue
+        seen.add(place)
         folders.sort()
         for name in sorted(names):
             path = Path(where, name)

@@ -52,6 +52,17 @@ def test_files_are_found_by_what_they_hold(tmp_path: Path) -> None:
     assert found.missing[0] == "1773"
 
 
+def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> None:
+    write(tmp_path / "elsewhere" / "r.json", checkpoint(GOOD))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "run")
+
+    found = collect(tmp_path / "run")
+
+    assert (routes(found), found.repeated) == (["1711"], ())
+
+
 def test_the_evaluator_keeps_its_promises(tmp_path: Path) -> None:
     write(tmp_path / "merged.json", merged(OTHER, GOOD))
     write(tmp_path / "metrics" / GOOD["save_name"] / "metric_info.json", recording(372))
@@ -109,6 +120,16 @@ def test_a_crash_gives_way_to_the_drive_that_followed(tmp_path: Path) -> None:
     assert found.rerun == ("RouteScenario_1711_rep0",)
     assert (found.contradictory, found.crashed) == ((), ())
     assert found.episodes[0].succeeded
+
+
+def test_crashes_with_different_results_are_a_contradiction(tmp_path: Path) -> None:
+    further = {**CRASHED["scores"], "score_route": 30.0, "score_composed": 30.0}
+    write(tmp_path / "r.json", checkpoint({**CRASHED, "scores": further}, CRASHED))
+
+    found = collect(tmp_path)
+
+    assert found.contradictory == ("RouteScenario_2084_rep0",)
+    assert found.episodes[0].completion_percent == 0.0
 
 
 def test_repetitions_are_other_drives(tmp_path: Path) -> None:
