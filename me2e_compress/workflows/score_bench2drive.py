@@ -15,6 +15,7 @@ from me2e_compress.evaluators.bench2drive.records import number_of
 from me2e_compress.metrics import scores as metrics
 from me2e_compress.metrics.ability_rules import MEAN, RULES, Rules, ability_rates
 from me2e_compress.metrics.comfort import stood_most
+from me2e_compress.metrics.episode import LARGEST
 from me2e_compress.metrics.leaderboard_scores import (
     LeaderboardScores,
     Quotients,
@@ -245,8 +246,8 @@ def _junctions(path: str | Path | None, routes: Sequence[str]) -> dict[str, floa
     if not isinstance(found, Mapping):
         raise EvaluationError(f"{path}: not an object of shares by route")
     for route, share in found.items():
-        if type(share) not in (int, float) or not share > 0.0:
-            raise EvaluationError(f"{path}: {route}: {share!r} is not a share")
+        if type(share) not in (int, float) or not 0.0 < share <= LARGEST:
+            raise EvaluationError(f"{path}: {route}: {share!r:.60} is not a share")
     places = {route: found.get(route, found.get(number_of(route))) for route in routes}
     return {route: float(each) for route, each in places.items() if each is not None}
 

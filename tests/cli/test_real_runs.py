@@ -141,7 +141,9 @@ def test_wrong_words_are_one_line(
         run(results, *words)
 
 
-@pytest.mark.parametrize("places", [[], {"2050": "far"}, {"2050": float("nan")}])
+@pytest.mark.parametrize(
+    "places", [[], {"2050": "far"}, {"2050": float("nan")}, {"2050": 10**400}]
+)
 def test_a_bad_file_of_junctions(run: Run, results: Path, places: object) -> None:
     file = write(results.parent / "j.json", places)
 
