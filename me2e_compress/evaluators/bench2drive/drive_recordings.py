@@ -17,7 +17,7 @@ class DriveRecordings:
     lies beside the only record of a folder is that record's.
 
     Args:
-        paths: Of all recordings.
+        paths: Of all recordings; or of all logs, which are found alike.
         results: All results files.
     """
 

@@ -1,4 +1,4 @@
-"""The decisions that `RealTimeAgent` noted beside a recording, a line each."""
+"""The decisions that `RealTimeAgent` noted of a drive, a line each."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,8 +12,6 @@ from me2e_compress.evaluators.bench2drive.recordings import (
 )
 from me2e_compress.metrics.episode import LARGEST, InferenceRecord
 
-DECISIONS = "decisions.jsonl"
-
 _Count = Annotated[int, Field(ge=0, le=LARGEST)]
 
 
@@ -23,19 +21,14 @@ class _Line(BaseModel):
     latency_us: _Count
 
 
-def decisions_beside(recording: Path) -> tuple[InferenceRecord, ...]:
-    """Return the decisions of a drive; none without such a log.
-
-    Args:
-        recording: Its ``metric_info.json``.
+def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
+    """Read a ``decisions.jsonl``.
 
     Raises:
         BrokenRecordingError: A line is not whole.
+        MalformedError: It is no text file.
         OSError: It cannot be read.
     """
-    path = recording.with_name(DECISIONS)
-    if not path.exists():
-        return ()
     found = list[InferenceRecord]()
     for number, line in enumerate(documents.content(path).splitlines(), 1):
         try:

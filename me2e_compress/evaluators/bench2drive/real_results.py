@@ -10,10 +10,7 @@ from typing import ClassVar
 from me2e_compress import documents
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.drive_recordings import DriveRecordings
-from me2e_compress.evaluators.bench2drive.logged_decisions import (
-    DECISIONS,
-    decisions_beside,
-)
+from me2e_compress.evaluators.bench2drive.logged_decisions import read_decisions
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
     BrokenRecordingError,
@@ -117,12 +114,18 @@ class Bench2DriveResults:
         """
         found = find_files(self.folder)
         if self.metrics is not None:
-            found.recordings += find_files(self.metrics).recordings
-        by_place = {path.resolve(): path for path in found.recordings}
-        found.recordings = list(by_place.values())
+            apart = find_files(self.metrics)
+            found.recordings += apart.recordings
+            found.decisions += apart.decisions
+        found.recordings = _once(found.recordings)
+        found.decisions = _once(found.decisions)
         if not any(file.records for file in found.results):
             raise EvaluationError(f"{self.folder}: {_nothing(found)}")
         return _Collection(found).results()
+
+
+def _once(paths: Sequence[Path]) -> list[Path]:
+    return list({path.resolve(): path for path in paths}.values())
 
 
 def _nothing(found: FoundFiles) -> str:
@@ -152,7 +155,14 @@ class _Collection:
     def results(self) -> CollectedResults:
         records = self._one_each()
         recorded = DriveRecordings(self.found.recordings, self.found.results)
-        episodes = tuple(self._with_frames(each, recorded) for each in records)
+        logs = DriveRecordings(self.found.decisions, self.found.results)
+        episodes = tuple(
+            dataclasses.replace(
+                self._with_frames(each, recorded),
+                decisions=self._decisions(logs.of(each)),
+            )
+            for each in records
+        )
         if others := recorded.of_none:
             more = f" and {len(others) - 1} others" if len(others) > 1 else ""
             self.notes.insert(0, f"{others[0]}{more}: of no record")
@@ -227,19 +237,16 @@ class _Collection:
             interval_s = recording.interval_s(record.duration_s)
             if interval_s != TICK_S:
                 self.off_rate[episode.route] = interval_s
-            return dataclasses.replace(
-                episode,
-                frames=recording.frames(interval_s),
-                decisions=self._decisions(path),
-            )
+            return dataclasses.replace(episode, frames=recording.frames(interval_s))
         return episode
 
-    def _decisions(self, recording: Path) -> tuple[InferenceRecord, ...]:
-        """Return the decisions noted beside a recording; a broken log is named."""
-        try:
-            return decisions_beside(recording)
-        except (OSError, documents.MalformedError, BrokenRecordingError) as error:
-            self.broken[str(recording.with_name(DECISIONS))] = str(error)
+    def _decisions(self, paths: Sequence[Path]) -> tuple[InferenceRecord, ...]:
+        """Return the decisions of a drive; a log that is not whole is named."""
+        for path in paths:
+            try:
+                return read_decisions(path)
+            except (OSError, documents.MalformedError, BrokenRecordingError) as error:
+                self.broken[str(path)] = str(error)
         return ()
 
     def _read(self, path: Path) -> RecordedRoute | None:

@@ -26,6 +26,8 @@ _PARTS = (b'"angular_velocity"', b'"forward_vector"')
 _BEGUN = b"begun"
 _RECORDING = "metric_info.json"
 """What Bench2Drive's agents call it: one that says nothing else must be named, too."""
+_DECISIONS = "decisions.jsonl"
+"""What `agents.RealTimeAgent` calls its log."""
 _HEAD_BYTES = 4096
 _PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".bin"}
 
@@ -55,11 +57,13 @@ class FoundFiles:
     Attributes:
         results: In the order of their paths.
         recordings: Files of recorded steps, in the order of their paths.
+        decisions: Logs of decisions, in the order of their paths.
         broken: Results files that are not whole, with the reason.
     """
 
     results: list[ResultFile] = field(default_factory=list)
     recordings: list[Path] = field(default_factory=list)
+    decisions: list[Path] = field(default_factory=list)
     broken: dict[Path, str] = field(default_factory=dict)
 
 
@@ -78,6 +82,8 @@ def find_files(folder: Path) -> FoundFiles:
         raise EvaluationError(f"{folder}: no such folder")
     found = FoundFiles()
     for path, kind in _kinds(folder):
+        if path.name == _DECISIONS:
+            found.decisions.append(path)
         if kind is None:
             continue
         if kind == _BEGUN:

@@ -13,6 +13,7 @@ from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
     CollectedResults,
 )
+from me2e_compress.metrics.episode import InferenceRecord
 from me2e_compress.testing import check_evaluator
 from tests.evaluators.bench2drive.files import (
     RAMMED,
@@ -265,6 +266,18 @@ def test_a_metric_info_that_is_no_recording_is_named(
     file = write(tmp_path / GOOD["save_name"] / "metric_info.json", content)
 
     assert list(collect(tmp_path).broken) == [str(file)]
+
+
+def test_decisions_may_be_noted_in_another_folder(tmp_path: Path) -> None:
+    write(tmp_path / "r.json", checkpoint(GOOD))
+    write(tmp_path / "saved" / GOOD["save_name"] / "metric_info.json", recording(40))
+    noted = {"frame": 3, "latency_us": 90_000}
+    log = write(tmp_path / "logs" / GOOD["save_name"] / "decisions.jsonl", noted)
+    log.write_text(json.dumps(noted))
+
+    (episode,) = collect(tmp_path).episodes
+
+    assert episode.decisions == (InferenceRecord(150_000, 90_000),)
 
 
 def test_a_log_of_decisions_that_is_cut_off_is_named(tmp_path: Path) -> None:
