@@ -1,6 +1,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import onnx
 import onnx_ir as ir
 import pytest
 
@@ -8,7 +9,8 @@ from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime import first_opening
 from me2e_compress.zoo import truth
-from me2e_compress.zoo.export import export
+from me2e_compress.zoo.export import build, export
+from me2e_compress.zoo.stacks import find
 
 DRIVER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -66,6 +68,8 @@ def vad_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def vad_truth() -> truth.Truth:
+def vad_truth(vad_tiny: Path) -> truth.Truth:
     """What its trace knew: the module of every node, and torch's own MACs."""
-    return truth.record("vad-tiny")
+    spec, model = find("vad-tiny"), build("vad-tiny")
+    plain = onnx.load(vad_tiny, load_external_data=False)
+    return truth.truth_of(spec, model, plain=plain)

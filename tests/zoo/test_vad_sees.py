@@ -1,3 +1,5 @@
+"""What VAD-tiny's random weights see, at the published size."""
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,8 @@ from torch import Tensor
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame
 from me2e_compress.zoo.vad.stack import VadTiny
+
+pytestmark = pytest.mark.slow
 
 COMMAND = VAD_TINY.heads["nuscenes"]
 SHAPES = {
