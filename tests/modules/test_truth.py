@@ -16,7 +16,7 @@ from me2e_compress.passes.import_normalize import ImportNormalize
 if TYPE_CHECKING:
     from tests.modules.conftest import Reference
 
-pytestmark = pytest.mark.xdist_group("vad-truth")
+pytestmark = pytest.mark.xdist_group("vad")
 
 PUBLISHED = {
     "backbone": 23_508_032,

@@ -33,7 +33,7 @@ from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import frames as drive
 from tests.frames import record
 
-pytestmark = pytest.mark.xdist_group("vad-run")
+pytestmark = pytest.mark.xdist_group("vad")
 
 WEIGHT_MB = 159.5
 """39,865,999 float32 parameters."""

@@ -21,7 +21,7 @@ from me2e_compress.zoo.vad.stack import VadTiny
 
 TINY = replace(VAD_TINY, name="tiny", inputs={"x": (1,)}, outputs=("y",))
 
-pytestmark = pytest.mark.xdist_group("vad-run")
+pytestmark = pytest.mark.xdist_group("vad")
 
 
 @pytest.fixture(scope="module")

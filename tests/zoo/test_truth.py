@@ -15,7 +15,7 @@ from me2e_compress.zoo.regions import listening, region
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.truth import NOT_COMPUTE, Truth
 
-pytestmark = pytest.mark.xdist_group("vad-truth")
+pytestmark = pytest.mark.xdist_group("vad")
 
 MODULES = ["backbone", "bev_encoder", "det", "map", "motion", "neck", "planner"]
 

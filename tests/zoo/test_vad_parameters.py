@@ -8,6 +8,8 @@ from torch import nn
 from me2e_compress.zoo.vad.config import HeadsName
 from me2e_compress.zoo.vad.stack import VadTiny
 
+pytestmark = pytest.mark.xdist_group("vad")
+
 PARTS = {
     "backbone": ("img_backbone.",),
     "neck": ("img_neck.",),
