@@ -15,7 +15,7 @@ SCHEMES = ("exact", "feature-ext", "prediction", "full")
 FPS = (20, 10, 5, 2, 1)
 FLOAT_MEDIAN_S = 0.43
 """Median latency of the float driver on the device imagined."""
-MEDIANS_S = (0.25, 0.35, FLOAT_MEDIAN_S, 0.5, 0.6)
+MEDIANS_S = (0.25, 0.35, FLOAT_MEDIAN_S, 0.5)
 """The same on devices of other speeds, some on each side of a multiple of 50 ms."""
 LATENCY_SAMPLES = 300
 IDEAL = Condition("ideal", "none")
