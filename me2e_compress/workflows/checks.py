@@ -110,7 +110,8 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             or named twice, or its folder does not exist.
     """
     named = dict[Path, Path]()
-    read = [Path(each) for each in inputs if each is not None]
+    # a model may be named by many variants, and is loaded to find its weights
+    read = dict.fromkeys(Path(each) for each in inputs if each is not None)
     for output in filter(None, outputs):
         if not output.parent.is_dir():
             raise GraphError(f"{output}: no such folder {output.parent}")

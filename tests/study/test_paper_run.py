@@ -91,6 +91,14 @@ def test_a_finished_cell_needs_no_frames_to_go_on(driven: Path) -> None:
     assert engine.driven == []
 
 
+def test_a_run_that_drives_nothing_lands_nothing_between(driven: Path) -> None:
+    landed = list[int]()
+
+    run_paper(ASKED, driven, Here(), on_block=lambda found: landed.append(1))
+
+    assert landed == []
+
+
 def test_tables_follow_from_the_records_alone(driven: Path) -> None:
     run = run_paper(ASKED, driven, Here())
 

@@ -61,7 +61,7 @@ def run_paper(
         folder: Where models, traces and results go.
         engine: Where routes are driven; None for one process of this machine.
         listener: Is called with progress and warnings.
-        on_block: Is called with all there is after each block.
+        on_block: Is called with all there is after each block that was driven now.
         weigh: Folders of other stacks' files, counted in table 4.
         force: Replace a report that is not as we left it, too.
 
@@ -151,11 +151,14 @@ def _all_driven(
     result: PaperResult,
     on_block: Callable[[PaperResult], None],
 ) -> PaperResult:
+    records = setup.workspace.folder / "records"
     for block in setup.study.blocks:
+        finished = set(records.glob("*.jsonl"))
         result = _driven(block, setup, prepared, result)
         if result.accident is None:
             result = replace(result, accident=_accident(setup, prepared, result))
-        on_block(result)
+        if not finished.issuperset(records.glob("*.jsonl")):
+            on_block(result)
     return result
 
 
