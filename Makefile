@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
+# tests run side by side: threads of one would spin while the other's work
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup
 
 .PHONY: coverage demo docs test test-slow check fix clean
 
@@ -10,13 +12,13 @@ demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
 	$(BIN)/me2e-compress demo -o out
 
 test: check  ## lint, types, layers, tests
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup
+	$(PYTEST)
 
 test-slow: $(VENV)/.test  ## what takes minutes: TensorRT-RTX builds of whole stacks, training killed and resumed, 2 GB
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup -m slow
+	$(PYTEST) -m slow
 
 coverage: $(VENV)/.test  ## the same tests, with branch coverage and its floor
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup --cov --cov-report=term:skip-covered
+	$(PYTEST) --cov --cov-report=term:skip-covered
 
 docs: $(VENV)/.docs  ## the API reference, from the docstrings
 	$(BIN)/python docs/make_api.py out/api

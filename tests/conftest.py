@@ -1,5 +1,6 @@
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import onnx
 import onnx_ir as ir
@@ -11,6 +12,9 @@ from me2e_compress.runtime import first_opening
 from me2e_compress.zoo import truth
 from me2e_compress.zoo.export import build, export
 from me2e_compress.zoo.stacks import find
+
+if TYPE_CHECKING:
+    from me2e_compress.zoo.vad.stack import VadTiny
 
 DRIVER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -68,8 +72,17 @@ def vad_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def vad_truth(vad_tiny: Path) -> truth.Truth:
+def vad_torch() -> "VadTiny":
+    """The same in torch."""
+    from me2e_compress.zoo.vad.stack import VadTiny
+
+    model = build("vad-tiny")
+    assert isinstance(model, VadTiny)
+    return model
+
+
+@pytest.fixture(scope="session")
+def vad_truth(vad_tiny: Path, vad_torch: "VadTiny") -> truth.Truth:
     """What its trace knew: the module of every node, and torch's own MACs."""
-    spec, model = find("vad-tiny"), build("vad-tiny")
     plain = onnx.load(vad_tiny, load_external_data=False)
-    return truth.truth_of(spec, model, plain=plain)
+    return truth.truth_of(find("vad-tiny"), vad_torch, plain=plain)

@@ -1,34 +1,18 @@
 """One export and one torch model for all tests of the zoo."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from me2e_compress.zoo.export import build
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame, frames
-
-if TYPE_CHECKING:
-    from me2e_compress.zoo.vad.stack import VadTiny
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> None:
     """Tests run side by side; torch's threads wait for each other by spinning."""
     torch.set_num_threads(1)
-
-
-@pytest.fixture(scope="session")
-def vad_torch() -> "VadTiny":
-    """The same in torch."""
-    from me2e_compress.zoo.vad.stack import VadTiny
-
-    model = build("vad-tiny")
-    assert isinstance(model, VadTiny)
-    return model
 
 
 @pytest.fixture(scope="session")

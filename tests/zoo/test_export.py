@@ -38,7 +38,7 @@ def drives(
 ) -> list[dict[str, float]]:
     """Relative error of every output, for a first frame and for the one after it."""
     options = ort.SessionOptions()
-    options.intra_op_num_threads = 2
+    options.intra_op_num_threads = 1
     session = ort.InferenceSession(
         str(vad_tiny), options, providers=["CPUExecutionProvider"]
     )
