@@ -22,8 +22,8 @@ GRID = BevGrid((100, 100), RANGE, (100.0, 100.0))
 
 
 @dataclass(frozen=True)
-class Labels:
-    """What differs between the data sets.
+class DatasetClasses:
+    """Classes of a data set, and what else differs between them.
 
     Attributes:
         groups: Of every class of objects, the group whose motion anchors it has.
@@ -43,12 +43,12 @@ class Labels:
         return len(self.groups)
 
 
-BENCH2DRIVE = Labels((0, 0, 0, 1, 0, 0, 0, 2, 0), (0, 1, 2, 3, 4, 6, 7), 6, 6)
+BENCH2DRIVE = DatasetClasses((0, 0, 0, 1, 0, 0, 0, 2, 0), (0, 1, 2, 3, 4, 6, 7), 6, 6)
 """Car, van, truck, bicycle, sign, cone, light, pedestrian, others; the groups are
 vehicles (and whatever has no group of its own), bicycles, pedestrians. Its tiny
 configuration leaves the vehicles at nuScenes' default."""
 
-NUSCENES = Labels((0, 0, 0, 0, 0, 3, 1, 1, 2, 3), (0, 1, 2, 3, 4, 6, 7), 3, 3)
+NUSCENES = DatasetClasses((0, 0, 0, 0, 0, 3, 1, 1, 2, 3), (0, 1, 2, 3, 4, 6, 7), 3, 3)
 """Car, truck, construction vehicle, bus, trailer, barrier, motorcycle, bicycle,
 pedestrian, cone."""
 
@@ -79,7 +79,7 @@ class UniadConfig:
     strides: tuple[int, ...] = (8, 16, 32, 64)
     grid: BevGrid = GRID
     upsampled: int = 2
-    labels: Labels = BENCH2DRIVE
+    labels: DatasetClasses = BENCH2DRIVE
     queries: int = 901
     tracks: int = 249
     encoder_layers: int = 3

@@ -23,7 +23,7 @@ Goals = tuple[Tensor, Tensor, Tensor]
 """A goal as the agent sees it, along the axes of the ego, and from the ego."""
 
 
-class Intent(NamedTuple):
+class ModeIntent(NamedTuple):
     """Where the modes of the agents are going, [A, 6, 256] each."""
 
     static: Tensor  # what the anchors say, the same in all layers
@@ -65,7 +65,7 @@ class MotionFormer(nn.Module):
         self,
         layer: int,
         query: Tensor,
-        intent: Intent,
+        intent: ModeIntent,
         agents: tuple[Tensor, Tensor, Tensor],
         lanes: Tensor,
         bev: Tensor,
@@ -193,7 +193,7 @@ class MotionHead(nn.Module):
         trajectories, scores = [], []
         for layer in range(LAYERS):
             at = offsets + frames.centre
-            intent = Intent(static, goals)
+            intent = ModeIntent(static, goals)
             query = self.motionformer(layer, query, intent, read, lanes, bev, at)
             steps = self.traj_reg_branches[layer](query)
             steps = steps.unflatten(2, (AGENT_STEPS, OUTPUTS))

@@ -19,9 +19,9 @@ from me2e_compress.zoo.uniad.planner import PlanningHead
 from me2e_compress.zoo.uniad.track_life import (
     SAVE_PERIOD,
     SLEEPS,
-    Pose,
+    LidarPose,
     TrackLife,
-    Tracks,
+    TrackSlots,
     VelocityUpdate,
 )
 from me2e_compress.zoo.uniad.tracking import MemoryBank, QueryInteraction
@@ -124,14 +124,14 @@ class UniadTiny(nn.Module):
             prev_l2g_r_mat: Of the last frame, as are the next two.
             prev_l2g_t: [1, 3].
             prev_timestamp: [1].
-            prev_tracks: The fields of `Tracks`.
+            prev_tracks: The fields of `TrackSlots`.
 
         Returns:
             The answers to all that is remembered, then the other outputs of the stack.
         """
-        before = Pose(prev_l2g_r_mat, prev_l2g_t, prev_timestamp)
-        tracks = Tracks(*prev_tracks)
-        now = Pose(l2g_r_mat, l2g_t, timestamp)
+        before = LidarPose(prev_l2g_r_mat, prev_l2g_t, prev_timestamp)
+        tracks = TrackSlots(*prev_tracks)
+        now = LidarPose(l2g_r_mat, l2g_t, timestamp)
         with region("backbone"):
             stages = self.img_backbone(img.flatten(0, 1))
         with region("neck"):
@@ -185,7 +185,9 @@ class UniadTiny(nn.Module):
         image = functional.interpolate(image, self.config.head_hw, mode="nearest")
         return image.flatten(2).transpose(1, 2)
 
-    def _queries(self, tracks: Tracks, before: Pose, now: Pose) -> Queries:
+    def _queries(
+        self, tracks: TrackSlots, before: LidarPose, now: LidarPose
+    ) -> Queries:
         """Return new queries, the last of them the ego's, and the tracks' behind."""
         new = self.query_embedding.weight
         at = self.reference_points(new[:, :EMBED])
@@ -198,8 +200,8 @@ class UniadTiny(nn.Module):
         )
 
     def _track(
-        self, found: Found, query: Tensor, before: Tracks
-    ) -> tuple[Seen, Tracks]:
+        self, found: Found, query: Tensor, before: TrackSlots
+    ) -> tuple[Seen, TrackSlots]:
         """Decide what is tracked, and make the queries of the next frame."""
         new = self.config.queries
         last, boxes = found.scores[-1, 0], found.boxes[-1, 0]
@@ -221,7 +223,7 @@ class UniadTiny(nn.Module):
         less = (period - 1) * (period > 0).to(torch.int64)
         period = torch.where(due, period + SAVE_PERIOD, less)
         asked = self.query_interact(query[:, chosen], track[None], (ids == 0)[None])
-        return seen, Tracks(
+        return seen, TrackSlots(
             asked[0],
             found.reference[chosen],
             ids,

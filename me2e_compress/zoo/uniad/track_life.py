@@ -27,7 +27,7 @@ SAVE_PERIOD = 3
 """Frames between two embeddings that the memory keeps."""
 
 
-class Tracks(NamedTuple):
+class TrackSlots(NamedTuple):
     """Slots for tracks, from frame to frame; all zeros hold none."""
 
     query: Tensor  # [slots, 512], position then content
@@ -50,7 +50,7 @@ class Lives(NamedTuple):
     max_obj_id: Tensor  # [1] int64
 
 
-class Pose(NamedTuple):
+class LidarPose(NamedTuple):
     """Where the lidar frame is, and when."""
 
     rotation: Tensor  # [1, 3, 3]: rows are the axes of the lidar frame in the world
@@ -82,7 +82,7 @@ class TrackLife(nn.Module):
     none: Tensor
     may_begin: Tensor
 
-    def forward(self, scores: Tensor, before: Tracks) -> Lives:
+    def forward(self, scores: Tensor, before: TrackSlots) -> Lives:
         """Map scores [queries] and the slots of the last frame to those of this."""
         ids = torch.cat([self.none, before.obj_idxes])
         missed = torch.cat([self.none, before.disappear_time])
@@ -115,7 +115,7 @@ class VelocityUpdate(nn.Module):
     extent: Tensor
 
     def forward(
-        self, ref_pts: Tensor, velocity: Tensor, before: Pose, now: Pose
+        self, ref_pts: Tensor, velocity: Tensor, before: LidarPose, now: LidarPose
     ) -> Tensor:
         """Map logits [slots, 3] and metres a second [slots, 2] to logits [slots, 3].
 

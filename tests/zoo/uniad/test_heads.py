@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from me2e_compress.zoo.uniad.motion import Agents, Forecasts, Intent
+from me2e_compress.zoo.uniad.motion import Agents, Forecasts, ModeIntent
 from me2e_compress.zoo.uniad.occ import OccHead
 from me2e_compress.zoo.uniad.stack import UniadTiny
 from tests.zoo.uniad.small import SMALL, small_uniad
@@ -94,7 +94,7 @@ def test_what_is_due_is_remembered_as_the_newest(uniad: UniadTiny) -> None:
 def test_an_empty_slot_changes_no_agent(uniad: UniadTiny) -> None:
     former, lanes = uniad.motion_head.motionformer, noise(1, 5, 256)
     query, at = noise(AGENTS, 6, 256), noise(AGENTS, 6, 12, 2)
-    intent = Intent(query, (query, query, query))
+    intent = ModeIntent(query, (query, query, query))
     empty = torch.tensor([[False, False, False, True]])
     track, pos, bev = noise(1, AGENTS, 256), noise(1, AGENTS, 256), noise(1, CELLS, 256)
     other = track.clone()

@@ -6,10 +6,10 @@ import torch
 
 from me2e_compress.zoo.uniad.config import RANGE, UniadConfig
 from me2e_compress.zoo.uniad.track_life import (
+    LidarPose,
     Lives,
-    Pose,
     TrackLife,
-    Tracks,
+    TrackSlots,
     VelocityUpdate,
 )
 
@@ -17,9 +17,11 @@ CONFIG = UniadConfig(queries=4, tracks=3)
 """Three queries and the ego's, three slots."""
 
 
-def tracks(ids: list[int], missed: list[int] | None = None, newest: int = 9) -> Tracks:
+def tracks(
+    ids: list[int], missed: list[int] | None = None, newest: int = 9
+) -> TrackSlots:
     nothing = torch.zeros(3)
-    return Tracks(
+    return TrackSlots(
         nothing,
         nothing,
         torch.tensor(ids),
@@ -32,7 +34,7 @@ def tracks(ids: list[int], missed: list[int] | None = None, newest: int = 9) -> 
     )
 
 
-def live(new: list[float], old: list[float], before: Tracks) -> Lives:
+def live(new: list[float], old: list[float], before: TrackSlots) -> Lives:
     lives: Lives = TrackLife(CONFIG)(torch.tensor([*new, *old]), before)
     return lives
 
@@ -73,11 +75,11 @@ def parts(metres: list[float]) -> torch.Tensor:
     return ((torch.tensor([metres]) - low) / (high - low)).logit()
 
 
-def pose(yaw: float, x: float, y: float, seconds: float) -> Pose:
+def pose(yaw: float, x: float, y: float, seconds: float) -> LidarPose:
     """Of a lidar whose x axis is turned by yaw from the world's."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     axes = torch.tensor([[[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]])
-    return Pose(axes, torch.tensor([[x, y, 0.0]]), torch.tensor([seconds]))
+    return LidarPose(axes, torch.tensor([[x, y, 0.0]]), torch.tensor([seconds]))
 
 
 def test_a_standing_vehicle_carries_on_by_velocity_alone() -> None:
