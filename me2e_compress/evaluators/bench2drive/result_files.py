@@ -23,7 +23,11 @@ from me2e_compress.metrics.episode import LARGEST
 _CHECKPOINT = b'"_checkpoint"'
 _STEP = re.compile(rb'\s*\{\s*"-?\d+"\s*:\s*\{\s*"\w+"\s*:\s*\[')
 _PARTS = (b'"angular_velocity"', b'"forward_vector"')
-_BEGUN = b"begun"
+_BEGUN, _UTF_16 = b"begun", b"UTF-16"
+_UNREADABLE = {
+    _BEGUN: "it ends before it says what it is",
+    _UTF_16: "not UTF-8 but UTF-16, as PowerShell writes it",
+}
 _RECORDING = "metric_info.json"
 """What Bench2Drive's agents call it: one that says nothing else must be named, too."""
 _DECISIONS = "decisions.jsonl"
@@ -86,8 +90,8 @@ def find_files(folder: Path) -> FoundFiles:
             found.decisions.append(path)
         if kind is None:
             continue
-        if kind == _BEGUN:
-            found.broken[path] = "it ends before it says what it is"
+        if kind in _UNREADABLE:
+            found.broken[path] = _UNREADABLE[kind]
             continue
         if kind != _CHECKPOINT:
             found.recordings.append(path)
@@ -125,8 +129,11 @@ def _kind(path: Path) -> bytes | None:
             head = file.read(_HEAD_BYTES).removeprefix(codecs.BOM_UTF8)
             if path.name == _RECORDING:
                 return _PARTS[0]
-            if _is_begun(head) and path.suffix == ".json":
-                return _BEGUN
+            if path.suffix == ".json":
+                if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+                    return _UTF_16
+                if _is_begun(head):
+                    return _BEGUN
             if not head.lstrip().startswith(b"{"):
                 return None
             if _CHECKPOINT in head:

@@ -53,6 +53,17 @@ def test_files_are_found_by_what_they_hold(tmp_path: Path) -> None:
     assert found.missing[0] == "1773"
 
 
+def test_a_file_in_utf_16_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "good.json", checkpoint(GOOD))
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps(checkpoint(OTHER)), "utf-16")
+
+    found = collect(tmp_path)
+
+    assert routes(found) == ["1711"]
+    assert found.broken == {str(other): "not UTF-8 but UTF-16, as PowerShell writes it"}
+
+
 def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     write(tmp_path / "elsewhere" / "r.json", checkpoint(GOOD))
     (tmp_path / "run").mkdir()
