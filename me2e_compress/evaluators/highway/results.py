@@ -3,7 +3,7 @@
 import errno
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -191,15 +191,6 @@ def log_beside(folder: Path) -> Path:
     """Return where the log of a folder of results goes."""
     resolved = folder.resolve()
     return resolved.with_name(f"{resolved.name}.log")
-
-
-def read_results(paths: Iterable[Path]) -> list[ResultsFolder]:
-    """Open several folders.
-
-    Raises:
-        EvaluationError: One of them is not a results folder.
-    """
-    return [ResultsFolder.open(path) for path in paths]
 
 
 def _check_manifest(path: Path, made_by: object) -> None:
