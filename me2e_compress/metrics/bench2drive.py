@@ -108,28 +108,27 @@ def smoothness(episode: Episode) -> Measure:
             for frame in frames
         ]
     ).T
-    if len(frames) <= BLOCK_FRAMES:
-        return Measure(float(block_is_smooth(*columns)), "ratio")
-    starts = range(0, len(frames) - BLOCK_FRAMES + 1, BLOCK_FRAMES)
-    blocks = [columns[:, start : start + BLOCK_FRAMES] for start in starts]
-    return Measure(fmean(float(block_is_smooth(*block)) for block in blocks), "ratio")
+    length = min(len(frames), BLOCK_FRAMES)
+    blocks = len(frames) // length
+    cut = columns[:, : blocks * length].reshape(len(columns), blocks, length)
+    return Measure(fmean(smooth_blocks(*cut).tolist()), "ratio")
 
 
-def block_is_smooth(
+def smooth_blocks(
     along: Floats, across: Floats, length: Floats, yaw_rate_degps: Floats
-) -> bool:
-    """Return whether all samples of a block lie within the bounds.
+) -> npt.NDArray[np.bool_]:
+    """Return [B] whether all samples of a block lie within the bounds.
 
     Args:
-        along: [N] acceleration along the heading, m/s2.
-        across: [N] acceleration across it, m/s2.
-        length: [N] length of the acceleration in the plane, m/s2.
-        yaw_rate_degps: [N] degrees per second.
+        along: [B, N] acceleration along the heading, m/s2.
+        across: [B, N] acceleration across it, m/s2.
+        length: [B, N] length of the acceleration in the plane, m/s2.
+        yaw_rate_degps: [B, N] degrees per second.
     """
     a_along, a_across, a_length = map(_smoothed, (along, across, length))
-    turns = np.round(np.diff(yaw_rate_degps) / (2.0 * np.pi))
-    unwrapped = yaw_rate_degps - 2.0 * np.pi * np.concatenate([[0.0], turns.cumsum()])
-    yaw_rate = _smoothed(unwrapped)
+    turns = np.round(np.diff(yaw_rate_degps) / (2.0 * np.pi)).cumsum(axis=1)
+    turned = np.pad(turns, ((0, 0), (1, 0)))
+    yaw_rate = _smoothed(yaw_rate_degps - 2.0 * np.pi * turned)
     yaw_acceleration = yaw_rate
     within = (
         (a_along > -4.05) & (a_along < 2.40),
@@ -139,7 +138,7 @@ def block_is_smooth(
         np.abs(yaw_acceleration) < 1.93,
         np.abs(yaw_rate) < 0.95,
     )
-    return all(bool(samples.all()) for samples in within)
+    return np.asarray(np.logical_and.reduce(within).all(axis=1))
 
 
 def _norm(frame: EgoFrame) -> float:
@@ -149,8 +148,9 @@ def _norm(frame: EgoFrame) -> float:
 
 
 def _smoothed(values: Floats, derivative: int = 0) -> Floats:
+    """Smooth every row of [B, N] on its own."""
     from scipy.signal import savgol_filter  # takes half a second to import
 
-    window = min(7, len(values))
+    window = min(7, values.shape[1])
     smoothed: Any = savgol_filter(values, window, 2, deriv=derivative, delta=DELTA_S)
     return np.asarray(smoothed, np.float64)
