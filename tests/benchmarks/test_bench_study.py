@@ -1,0 +1,67 @@
+import csv
+import re
+from collections import defaultdict
+from pathlib import Path
+from statistics import mean
+
+import pytest
+
+from benchmarks.bench_study import KEPT, STUDIES
+
+PAGE = Path(__file__).parents[2] / "docs" / "study.md"
+NUMBER = re.compile(r"[\N{MINUS SIGN}+]?\d+\.\d")
+
+kept = pytest.mark.parametrize(
+    "name", [each for each in STUDIES if (KEPT / each).is_dir()]
+)
+
+
+def numbers(text: str) -> list[float]:
+    return [float(each.replace("\N{MINUS SIGN}", "-")) for each in NUMBER.findall(text)]
+
+
+def rows(text: str) -> dict[tuple[str, ...], list[float]]:
+    """Cells by the names at the head of their rows."""
+    cells = (line.split(" | ") for line in text.splitlines() if line.startswith("| "))
+    return {
+        tuple(each.strip("| ") for each in row[:2]): numbers(" ".join(row[1:]))
+        for row in cells
+    }
+
+
+@kept
+def test_tables_are_of_the_routes_that_are_kept(name: str) -> None:
+    found = defaultdict[tuple[str, str], list[float]](list)
+    with (KEPT / name / "routes.csv").open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            drive = (row["scheme"], row["condition"])
+            found[drive].append(float(row["driving_score_percent"]))
+    boards = (KEPT / name / "tables.md").read_text("utf-8").split("**Scoreboard, ")[1:]
+
+    scores = {
+        (line.split(" ")[1], board.split(":")[0]): float(line.split(" ")[3])
+        for board in boards
+        for line in board.split("\n\n")[1].splitlines()[2:]
+    }
+
+    assert {len(each) for each in found.values()} == {220}
+    assert {drive: round(mean(each), 1) for drive, each in found.items()} == scores
+
+
+def test_the_page_says_what_the_tables_of_shifts_say() -> None:
+    tables = rows((KEPT / "shifts" / "tables.md").read_text("utf-8"))
+    section = PAGE.read_text("utf-8").split("| change |")[1].split("\n\n")[0]
+    for line in section.splitlines()[2:]:
+        change, float_, int8, beyond, success = line.strip("| ").split(" | ")
+        one = tables[f"float.{change}", "float.fps-4"]
+        two = tables[f"full.{change}", "full.fps-4"]
+        assert turned(float_) == one[:3]
+        assert turned(int8) == two[:3]
+        assert turned(beyond) == two[-6:-3]
+        assert turned(success) == two[-3:]
+
+
+def turned(cell: str) -> list[float]:
+    """Give a loss and its interval as a gain."""
+    middle, low, high = numbers(cell)
+    return [-middle, -high, -low]
