@@ -29,7 +29,7 @@ HEAD = """\
 
     me2e-compress study paper -o paper --workers 2
 
-asks the questions of the paper that this toolkit follows (*Software-hardware co-optimization of modular end-to-end driving*, arXiv 2601.07393) of the driver that ships, on the 220 routes of highway-env: its tables 2 to 6, figures 5 to 7, the share of collisions by partner, and each of its findings as a question: *confirmed* where the whole 95 % interval of a paired difference lies on its side, *opposite* where it lies on the other, *not confirmed* where it holds both. `--dry-run` says what that drives: 32 drives of 220 routes; they took three and a half hours on two shared cores, and a second run takes seconds. It goes on where it was ended, `--tables 2,3` drives a part, and `--routes 44` is a preview, which every title says.
+asks the questions of the paper that this toolkit follows (*Software-hardware co-optimization of modular end-to-end driving*, arXiv 2601.07393) of the driver that ships, on the 220 routes of highway-env: its tables 2 to 6, figures 5 to 7, the share of collisions by partner, and each of its findings as a question: *confirmed* where the whole 95 % interval of a paired difference lies on its side, *opposite* where it lies on the other, *not confirmed* where it holds both. `--dry-run` says what that drives: 36 drives of 220 routes; they took nearly four hours on two shared cores, and a second run takes seconds. It goes on where it was ended, `--tables 2,3` drives a part, and `--routes 44` is a preview, which every title says.
 
 Energy is measured where the machine has a counter; what is modelled from MACs and bytes stands in columns of its own. `--weigh FOLDER` counts another stack's files in table 4, such as VAD-tiny's:
 

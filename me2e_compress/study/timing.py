@@ -57,10 +57,11 @@ def time_all(
     """Load the traces that are given or kept, and measure the others, interleaved.
 
     What is measured together shares its noise. A trace that is kept is of the same
-    model, machine, threads and frames, and has as many samples; one that is not is
-    measured again. Files written before traces named their frames are taken to be of
-    the same ones. Without a kept trace of the baseline nothing that is kept can stand
-    beside what is measured now: then all are measured again.
+    model, machine, threads and frames, and has at least as many samples (studies of one
+    folder share the longest); one that is not is measured again. Files written before
+    traces named their frames are taken to be of the same ones. Without a kept trace of
+    the baseline nothing that is kept can stand beside what is measured now: then all
+    are measured again.
 
     Raises:
         EvaluationError: A trace cannot be read or written, or the baseline's median,
@@ -175,7 +176,7 @@ def _other(
     machine = describe_machine(study.timing.threads, study.provider)
     if trace.model_sha256 != each.sha256:
         return "another model"
-    if len(trace.samples_us) != wanted:
+    if len(trace.samples_us) < wanted:
         return f"{len(trace.samples_us)} samples, not {wanted}"
     if trace.machine != machine:
         return f"another machine ({trace.machine}; this is {machine})"

@@ -89,6 +89,24 @@ def test_other_drives_turn_a_finding_round(result: PaperResult) -> None:
     assert found["Comfort falls as the rate rises"] is YES
 
 
+@pytest.mark.parametrize(
+    ("where", "drive"), [("slow device", "device-tail"), ("10 decisions", "tail")]
+)
+def test_what_spikes_cost_is_told_of_the_speed_that_it_is_asked_of(
+    result: PaperResult, where: str, drive: str
+) -> None:
+    key = "optimizer", drive
+    record = result.cells[key]
+    worse = tuple(replace(each, driving_score=0.0) for each in record.routes)
+    cells = {**result.cells, key: replace(record, routes=worse)}
+
+    before, after = verdicts(result), verdicts(replace(result, cells=cells))
+
+    changed = [each for each in after if after[each] is not before[each]]
+    assert len(changed) == 3
+    assert all(f"({where}" in each and after[each] is YES for each in changed)
+
+
 def test_what_was_not_driven_is_not_tested_and_says_so(result: PaperResult) -> None:
     cells = {key: each for key, each in result.cells.items() if key[0] != "minus-occ"}
     lacking = replace(

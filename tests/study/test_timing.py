@@ -132,6 +132,17 @@ def test_a_trace_of_something_else_is_measured_again(
     assert warnings == [f"{stale}: of {words}: measured again"]
 
 
+def test_a_study_that_asks_for_fewer_samples_takes_those_that_are_kept(
+    ours: Study, paced: list[list[str]], tmp_path: Path
+) -> None:
+    fewer = replace(ours, timing=replace(ours.timing, samples=3))
+
+    kept = clock_of(ours, tmp_path)
+
+    assert clock_of(fewer, tmp_path) == kept
+    assert len(paced) == 1
+
+
 def test_more_threads_are_measured_again(
     ours: Study, paced: list[list[str]], tmp_path: Path
 ) -> None:

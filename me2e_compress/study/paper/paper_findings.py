@@ -118,6 +118,36 @@ RATE_QUESTIONS = (
         ),
     ),
 )
+
+
+def _of_the_stage(where: str, tail: str, even: str) -> tuple[PaperQuestion, ...]:
+    """Ask for the collision optimisation at one speed of the network."""
+    with_it = ("optimizer", tail)
+    return (
+        PaperQuestion(
+            "Spikes in critical frames cost driving score at equal mean latency"
+            f" {where}",
+            "the collision optimisation takes over 150 ms where obstacles are near",
+            "DS of the driver with that stage, charged where it is called, minus the"
+            " same at its mean latency",
+            lambda e: e.difference(with_it, ("optimizer", even)),
+            lambda _: falls,
+        ),
+        PaperQuestion(
+            f"Without the stage it drives better at equal mean latency {where}",
+            "DS +16.94 % without occupancy, which only triggers the stage (scheme 1)",
+            "DS without the stage at its mean latency, minus with it as it is charged",
+            lambda e: e.difference(("float", even), with_it),
+        ),
+        PaperQuestion(
+            f"Without the stage it drives better, and faster for it {where}",
+            "the same",
+            "DS without the stage and its time, minus with both",
+            lambda e: e.difference(("float", tail), with_it),
+        ),
+    )
+
+
 LATENCY_QUESTIONS = (
     PaperQuestion(
         "At equal mean latency, a long tail costs driving score",
@@ -126,26 +156,8 @@ LATENCY_QUESTIONS = (
         lambda e: e.difference(DEVICE, CONSTANT),
         lambda _: falls,
     ),
-    PaperQuestion(
-        "Spikes in critical frames cost driving score at equal mean latency",
-        "the collision optimisation takes over 150 ms where obstacles are near",
-        "DS of the driver with that stage, charged where it is called, minus the same"
-        " at its mean latency",
-        lambda e: e.difference(("optimizer", "tail"), ("optimizer", "even")),
-        lambda _: falls,
-    ),
-    PaperQuestion(
-        "Without the stage it drives better at equal mean latency",
-        "DS +16.94 % without occupancy, which only triggers the stage (scheme 1)",
-        "DS without the stage at its mean latency, minus with it as it is charged",
-        lambda e: e.difference(("float", "even"), ("optimizer", "tail")),
-    ),
-    PaperQuestion(
-        "Without the stage it drives better, and faster for it",
-        "the same",
-        "DS without the stage and its time, minus with both",
-        lambda e: e.difference(("float", "tail"), ("optimizer", "tail")),
-    ),
+    *_of_the_stage("(slow device)", "device-tail", "device-even"),
+    *_of_the_stage("(10 decisions a second)", "tail", "even"),
 )
 MODULE_QUESTIONS = (
     PaperQuestion(

@@ -252,7 +252,8 @@ def tail(result: "PaperResult", block: "StudyBlock") -> Table:
         tuple(rows),
         "optimizer is the driver with UniAD's collision optimisation, which runs on the"
         " host where its occupancy says that something is near. tail charges each"
-        " call's iterations; even charges every decision what that costs on average."
+        " call's iterations beside 100 ms, device-tail beside what the model takes on"
+        " the slow device; even charges every decision what that costs on average."
         " Milliseconds are what decisions were charged; the worst p99 is of a route."
         " Equation 4 drops what is beyond a whole step, so equal means are not equal"
         " rates in the world.",
