@@ -11,10 +11,6 @@ from benchmarks.bench_study import KEPT, STUDIES
 PAGE = Path(__file__).parents[2] / "docs" / "study.md"
 NUMBER = re.compile(r"[\N{MINUS SIGN}+]?\d+\.\d")
 
-kept = pytest.mark.parametrize(
-    "name", [each for each in STUDIES if (KEPT / each).is_dir()]
-)
-
 
 def numbers(text: str) -> list[float]:
     return [float(each.replace("\N{MINUS SIGN}", "-")) for each in NUMBER.findall(text)]
@@ -29,7 +25,7 @@ def rows(text: str) -> dict[tuple[str, ...], list[float]]:
     }
 
 
-@kept
+@pytest.mark.parametrize("name", STUDIES)
 def test_tables_are_of_the_routes_that_are_kept(name: str) -> None:
     found = defaultdict[tuple[str, str], list[float]](list)
     with (KEPT / name / "routes.csv").open(encoding="utf-8") as file:
