@@ -9,6 +9,7 @@ import importlib
 import os
 from typing import TYPE_CHECKING
 
+from me2e_compress.extras import explained
 from me2e_compress.version import __version__
 
 # onnxruntime (1.31), as soon as it is loaded, would write a device id and a database
@@ -189,7 +190,13 @@ def __getattr__(name: str) -> object:
     if name in _MODULES:
         return importlib.import_module(f"me2e_compress.{name}")
     if name in _HOMES:
-        return getattr(importlib.import_module(f"me2e_compress.{_HOMES[name]}"), name)
+        try:
+            home = importlib.import_module(f"me2e_compress.{_HOMES[name]}")
+        except ImportError as error:
+            if (told := explained(error)) is error:
+                raise
+            raise told from error
+        return getattr(home, name)
     raise AttributeError(f"me2e_compress has no {name}")
 
 

@@ -13,12 +13,14 @@
   x StudyError           a study is malformed, or names what it does not have
   x TrainingError        a driver cannot be trained as asked
   x MissingExtraError    an optional package is not installed
+  x BrokenPackageError   one is installed, and importing it fails
   x MissingPackageError  one that none of our extras brings
 
 Every message says what was found, what there is, and names the culprit, on one line.
 """
 
 __all__ = [
+    "BrokenPackageError",
     "EnergyError",
     "EvaluationError",
     "FramesError",
@@ -92,8 +94,26 @@ class MissingExtraError(Me2eError):
     """An optional package is not installed; the message says which extra brings it."""
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(
-            f"{package} is not installed: pip install 'me2e-compress[{extra}]'"
+        super().__init__(package, extra)  # as it was made: it travels between processes
+
+    def __str__(self) -> str:
+        """Return the line that says what to install."""
+        package, extra = self.args
+        return f"{package} is not installed: pip install 'me2e-compress[{extra}]'"
+
+
+class BrokenPackageError(Me2eError):
+    """An optional package is installed, and importing it fails."""
+
+    def __init__(self, package: str, extra: str, reason: str) -> None:
+        super().__init__(package, extra, reason)
+
+    def __str__(self) -> str:
+        """Return the line that says why, and what to install again."""
+        package, extra, reason = self.args
+        return (
+            f"{package} is installed, but cannot be imported: {reason}: pip install"
+            f" --force-reinstall 'me2e-compress[{extra}]'"
         )
 
 
@@ -101,4 +121,9 @@ class MissingPackageError(Me2eError):
     """A package that none of our extras brings is not installed."""
 
     def __init__(self, package: str) -> None:
-        super().__init__(f"{package} is not installed: pip install {package}")
+        super().__init__(package)
+
+    def __str__(self) -> str:
+        """Return the line that says what to install."""
+        (package,) = self.args
+        return f"{package} is not installed: pip install {package}"

@@ -42,12 +42,16 @@ def _run() -> int:
     from me2e_compress.cli.app import app
     from me2e_compress.cli.console import errors
     from me2e_compress.cli.verbosity import Verbosity, set_verbosity
+    from me2e_compress.extras import explained
 
     set_verbosity(Verbosity.NORMAL)
     try:
         app(standalone_mode=True, prog_name="me2e-compress")
-    except (Me2eError, OSError) as error:
-        line = printable(" ".join(str(error).split()))
+    except (Me2eError, OSError, ImportError) as error:
+        told = explained(error)
+        if isinstance(told, ImportError):
+            raise  # of no optional package: a defect of ours, which needs its traceback
+        line = printable(" ".join(str(told).split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
         return 1
     return 0

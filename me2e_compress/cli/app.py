@@ -8,9 +8,8 @@ import typer
 from typer.core import TyperGroup
 
 from me2e_compress.cli.verbosity import Verbosity, set_verbosity
-from me2e_compress.errors import MissingExtraError
+from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
-from me2e_compress.workflows.extras import missing_extra
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class CommandEntry:
         panel: Of ``--help``, under which it stands.
         name: As it is called; also of its file and its function.
         help: The first line of its docstring.
-        extra: Of the package, which it takes; empty for none.
+        extra: Of the package, which its work takes; empty for none.
         function: Where it is not called like the command.
     """
 
@@ -33,24 +32,16 @@ class CommandEntry:
 
     def line(self) -> str:
         """Return what the list of commands says of it."""
-        lacking = missing_extra(self.extra)
-        return f"Needs the extra {lacking}." if lacking else self.help
+        if self.extra and missing_module(self.extra):
+            return f"{self.help} Needs the extra {self.extra}."
+        return self.help
 
     def load(self) -> Any:
-        """Import the command, as Click knows it; without its extra it says so."""
+        """Import the command, as Click knows it; its options need no extra."""
         alone = _app()
-        if missing_extra(self.extra):
-            anything = {"allow_extra_args": True, "ignore_unknown_options": True}
-            alone.command(self.name, context_settings=anything, help=self.line())(
-                self._advise
-            )
-        else:
-            home = importlib.import_module(f"me2e_compress.cli.commands.{self.name}")
-            alone.command(self.name)(getattr(home, self.function or self.name))
+        home = importlib.import_module(f"me2e_compress.cli.commands.{self.name}")
+        alone.command(self.name)(getattr(home, self.function or self.name))
         return typer.main.get_command(alone)
-
-    def _advise(self) -> None:
-        raise MissingExtraError(f"what {self.name} needs", self.extra)
 
 
 START = "Start here"
@@ -149,7 +140,6 @@ _ENTRIES = (
         DRIVE,
         "score",
         "Print driving score, success rate, efficiency, comfort and abilities.",
-        "highway",
     ),
     CommandEntry(
         DRIVE,

@@ -17,6 +17,7 @@ from me2e_compress.driving.contract import (
 )
 from me2e_compress.driving.policies import POLICIES, Driver
 from me2e_compress.errors import VerificationError
+from me2e_compress.extras import need_extra
 from me2e_compress.testing.form import check_form
 
 ROUTE = "HighwayExit_0"
@@ -45,6 +46,7 @@ def check_policy(driver: Driver) -> Answers:
         EvaluationError: it cannot be opened.
         MissingExtraError: the extra ``highway`` is not installed.
     """
+    need_extra("highway", "check_policy")
     check_form(driver, POLICIES)
     if not driver.fingerprint() or driver.fingerprint() != driver.fingerprint():
         raise VerificationError(f"{driver.name} has no fingerprint, or more than one")

@@ -14,6 +14,7 @@ from me2e_compress.evaluators.highway.evaluation_options import (
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress
 from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
+from me2e_compress.extras import need_extra
 from me2e_compress.metrics.deadlines import charged
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
@@ -133,6 +134,7 @@ def evaluate(
             is of another evaluation.
         GraphError: the folder is a file or an input.
         ProviderError: the provider is not there.
+        MissingExtraError: driving in highway-env needs the extra ``highway``.
     """
     options, output = options or EvaluateOptions(), Path(output)
     named = None if policy is None else str(policy)
@@ -167,6 +169,7 @@ def _by_another(
 def _evaluated(
     policy: str, output: Path, options: EvaluateOptions, listener: Listener
 ) -> EvaluateResult:
+    need_extra("highway", "driving")
     picked, _ = routes_named(options.routes)
     shown = () if options.render is None else pick_routes(picked, options.render)
     driver = driver_of(policy, options.adapter, options.provider)

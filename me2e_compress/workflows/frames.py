@@ -10,13 +10,13 @@ from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError
+from me2e_compress.extras import need_extra
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import digest_of_files
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.extras import need_closed_loop, need_extra
 from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.logged_inputs import inputs_of_model, inputs_of_stack
@@ -190,7 +190,7 @@ def _recorded(
 def _logged(
     source: str | Path, log: DriveLog, options: FramesOptions
 ) -> tuple[Source, str, dict[str, PixelInput]]:
-    need_extra("logs", "what reads pictures")
+    need_extra("logs", "reading pictures of a log")
     from me2e_compress.calibration.logs.log_frames import log_frames
 
     if Path(source).is_file():
@@ -211,7 +211,7 @@ def _logged(
 
 
 def _driven(model: Path, options: FramesOptions) -> Source:
-    need_closed_loop("what frames of a driver need")
+    need_extra("highway", "recording frames of a driver")
     from me2e_compress.driving.onnx_policy import OnnxPolicy
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 

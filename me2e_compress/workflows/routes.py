@@ -1,17 +1,23 @@
 """Sets of routes: made and admitted, or examined again."""
 
+from __future__ import annotations
+
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.admission import Admission, examine
-from me2e_compress.evaluators.highway.generate import ScenarioRoutes, generate
+from me2e_compress.extras import need_extra
 from me2e_compress.simulator.routes import load_routes, pick_routes, save_routes
 from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARIANTS
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Status, Table, table
+
+if TYPE_CHECKING:  # they take highway-env, an extra and a second to import
+    from me2e_compress.evaluators.highway.admission import Admission
+    from me2e_compress.evaluators.highway.generate import ScenarioRoutes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,14 +135,19 @@ def make_routes(
 
     Raises:
         GraphError: the output cannot be written.
+        MissingExtraError: the extra ``highway`` is not installed.
     """
+    need_extra("highway", "making routes")
     options, output = options or RoutesOptions(), Path(output)
     with writing([output], force=options.force):
         return _made(output, options, listener)
 
 
 def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesResult:
-    names, harvests = options.names, list[ScenarioRoutes]()
+    from me2e_compress.evaluators.highway.generate import generate
+
+    names = options.names
+    harvests: list[ScenarioRoutes] = []
     made = generate(options.seed, names, options.variants, options.workers)
     for harvest in made:
         harvests.append(harvest)
@@ -218,8 +229,12 @@ def examine_routes(
 
     Raises:
         EvaluationError: no such route, or no file of routes.
+        MissingExtraError: the extra ``highway`` is not installed.
     """
-    manifest, verdicts = Path(manifest), list[Admission]()
+    need_extra("highway", "examining routes")
+    from me2e_compress.evaluators.highway.admission import examine
+
+    manifest, verdicts = Path(manifest), []
     picked = pick_routes(load_routes(manifest), pick)
     for route in picked:
         verdicts.append(examine(route))

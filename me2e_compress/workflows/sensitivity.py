@@ -9,6 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError, RecipeError
+from me2e_compress.extras import need_extra
 from me2e_compress.sensitivity import (
     Drive,
     Int8Choice,
@@ -23,7 +24,6 @@ from me2e_compress.workflows.checks import (
     check_number,
     model_path,
 )
-from me2e_compress.workflows.extras import need_closed_loop
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.result import Result, Table, megabytes, number, table
@@ -226,7 +226,7 @@ def _on_routes(
         MissingExtraError: driving needs the extra ``highway``.
         EvaluationError: no such route, or the model cannot drive.
     """
-    need_closed_loop("what driving a variant needs")
+    need_extra("highway", "driving a variant")
     from me2e_compress.evaluators.highway.conditions import Conditions
     from me2e_compress.evaluators.highway.drivers import image_size_of
     from me2e_compress.evaluators.highway.engine import LocalEngine

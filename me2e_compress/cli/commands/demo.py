@@ -7,12 +7,12 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import console, listening, show
+from me2e_compress.extras import need_extra
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows.claims import check_ours, writing
 from me2e_compress.workflows.demo_result import DemoResult
 from me2e_compress.workflows.demo_stack import StackDemo
-from me2e_compress.workflows.extras import need_closed_loop
 from me2e_compress.workflows.result import Result
 from me2e_compress.zoo.shipped import SHIPPED
 
@@ -52,7 +52,7 @@ def demo(
     """
     runs = provider_named(provider, plugins or ())
     if stack in SHIPPED:
-        need_closed_loop("what the demo drives with")
+        need_extra("highway", "driving in the demo")
         from me2e_compress.study.demo import DriverDemo
 
         steps = DriverDemo(stack, output, scheme, routes, workers, runs, force).steps

@@ -8,6 +8,7 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
 from me2e_compress.simulator.scenarios.catalogue import VARIANTS
+from me2e_compress.workflows import routes as workflow
 
 Output = Annotated[
     Path | None, typer.Option("-o", "--output", help="the manifest to write")
@@ -33,9 +34,6 @@ def routes(
     as_json: given.Json = False,
 ) -> None:
     """Make a fresh set of admitted routes, or examine an existing set again."""
-    # takes highway-env a second to import
-    from me2e_compress.workflows import routes as workflow
-
     if examine is not None:
         with listening() as listener:
             examined = workflow.examine_routes(examine, picked, listener)

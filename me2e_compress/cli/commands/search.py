@@ -9,11 +9,11 @@ import typer
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show, tell
 from me2e_compress.errors import RecipeError
+from me2e_compress.extras import need_extra
 from me2e_compress.runtime.providers import provider_named
 from me2e_compress.workflows import search as workflow
 from me2e_compress.workflows.budgets import check_budgets
 from me2e_compress.workflows.checks import sizes
-from me2e_compress.workflows.extras import need_closed_loop
 
 MAX_JOULES = "most joules a frame: measured by a counter, else modelled"
 ROAD = "with --on-road"
@@ -105,7 +105,7 @@ def search(
             found = workflow.search(model, frames, output, options, listener)
         show(found, as_json)
         return
-    need_closed_loop("search --on-road")
+    need_extra("highway", "search --on-road")
     if ranges is not None or scheme != "full":
         raise RecipeError("--ranges and --scheme do not go with --on-road: --modules")
     # takes highway-env and matplotlib two seconds to import

@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, say, show, tell
+from me2e_compress.extras import need_extra
 
 STUDY = "STUDY.toml, or a shipped study's name: paper"
 Provider = Annotated[
@@ -46,6 +47,7 @@ def study(
     as_json: given.Json = False,
 ) -> None:
     """Drive variants under conditions and compare them; run it again to go on."""
+    need_extra("highway", "a study")
     # takes highway-env and matplotlib two seconds to import
     from me2e_compress.evaluators.highway.evaluation_options import engine_of
     from me2e_compress.study import load_study, study_path

@@ -7,6 +7,7 @@ import typer
 
 from me2e_compress.cli import arguments as given
 from me2e_compress.cli.console import listening, show
+from me2e_compress.extras import need_extra
 
 Stack = Annotated[Literal["highway"], typer.Argument(help="highway")]
 Output = Annotated[
@@ -25,6 +26,7 @@ def train(
     as_json: given.Json = False,
 ) -> None:
     """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
+    need_extra("zoo,highway", "training")
     # takes torch seconds to import
     from me2e_compress.workflows import train as workflow
 

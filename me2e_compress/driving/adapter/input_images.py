@@ -13,7 +13,8 @@ from me2e_compress.driving.adapter.image_inputs import (
     ImagePort,
 )
 from me2e_compress.driving.adapter.images import ImageNormalization
-from me2e_compress.errors import EvaluationError, MissingExtraError
+from me2e_compress.errors import EvaluationError
+from me2e_compress.extras import explained
 from me2e_compress.runtime.frames import Array
 
 Bytes = npt.NDArray[np.uint8]
@@ -146,7 +147,7 @@ def _resized(picture: Bytes, size: tuple[int, int]) -> Bytes:
     try:
         import cv2
     except ImportError as error:
-        raise MissingExtraError("cv2", "highway") from error
+        raise explained(error) from error
     made = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(made, np.uint8)
 

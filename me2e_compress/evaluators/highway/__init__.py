@@ -1,13 +1,4 @@
 """Closed loop in highway-env: world, cameras, expert, runner.
 
-Raises:
-    MissingExtraError: On import, if the extra ``highway`` is not installed.
+Results are read without highway-env; driving needs the extra ``highway``.
 """
-
-from importlib.util import find_spec
-
-from me2e_compress.errors import MissingExtraError
-
-for _package in ("highway_env", "gymnasium", "scipy", "cv2"):
-    if find_spec(_package) is None:
-        raise MissingExtraError(_package, "highway")

@@ -9,7 +9,7 @@ from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.driving.realtime import DT_US, LatencyModel
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import FRAME_US
-from me2e_compress.simulator.cameras import CLEAR, Weather
+from me2e_compress.simulator.weather import CLEAR, Weather
 
 
 @dataclass(frozen=True)

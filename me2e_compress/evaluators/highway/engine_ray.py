@@ -5,8 +5,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from me2e_compress.errors import EvaluationError, MissingExtraError
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.worker import Driven, Job, RouteWorker
+from me2e_compress.extras import explained
 from me2e_compress.simulator.routes import Route
 
 CONNECT_TIMEOUT_S = 5.0
@@ -74,5 +75,5 @@ def _ray() -> Any:
         import ray
         import ray.util
     except ImportError as error:
-        raise MissingExtraError("ray", "ray") from error
+        raise explained(error) from error
     return ray

@@ -20,9 +20,10 @@ from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
 from me2e_compress.evaluators.highway.engine_ray import RayEngine
 from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
 from me2e_compress.evaluators.highway.worker import FRAME_LIMIT_S, Job
+from me2e_compress.extras import need_extra
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.simulator.cameras import Weather
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.simulator.weather import Weather
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,9 @@ class HighwayEvaluation:
 
         Raises:
             EvaluationError: An option that nothing can be driven with.
+            MissingExtraError: The extra ``highway`` is not installed.
         """
+        need_extra("highway", "driving")
         picked, set_size = routes_named(self.routes)
         driver = driver or self._driver()
         latency = parse_latency(

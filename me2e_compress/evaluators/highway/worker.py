@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.sharedctypes import SynchronizedArray
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 import psutil
 
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError, Me2eError
 from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.extras import explained
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.children import end_with_parent, spawn_context
 from me2e_compress.simulator.routes import Route
@@ -164,8 +165,22 @@ def _ready(line: Connection[Route, Driven | Me2eError]) -> bool:
 def _serve(
     line: Connection[Driven | Me2eError, Route], heartbeat: Heartbeat, job: Job
 ) -> None:
-    """Drive the routes that come down the line until its other end closes."""
+    """Answer the routes that come down the line until its other end closes."""
     end_with_parent()
+    try:
+        _drive_routes(line, heartbeat, job)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+    except (Me2eError, ImportError) as error:
+        told = explained(error)
+        if not isinstance(told, Me2eError):
+            raise
+        line.send(told)
+
+
+def _drive_routes(
+    line: Connection[Driven | Me2eError, Route], heartbeat: Heartbeat, job: Job
+) -> NoReturn:
     from me2e_compress.evaluators.highway.episode_recorder import completion_percent
     from me2e_compress.evaluators.highway.runner import Listeners, drive
 
@@ -180,17 +195,12 @@ def _serve(
     def on_answer() -> None:
         heartbeat[0] = 0.0
 
-    try:
-        policy = job.driver.open()
-        while True:
-            route = line.recv()
-            begun = time.perf_counter()
-            listeners = Listeners(on_query, on_answer)
-            episode = drive(route, policy, job.conditions, listeners)
-            on_answer()
-            memory = psutil.Process().memory_info().rss
-            line.send(Driven(episode, time.perf_counter() - begun, memory))
-    except Me2eError as error:
-        line.send(error)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return
+    policy = job.driver.open()
+    while True:
+        route = line.recv()
+        begun = time.perf_counter()
+        listeners = Listeners(on_query, on_answer)
+        episode = drive(route, policy, job.conditions, listeners)
+        on_answer()
+        memory = psutil.Process().memory_info().rss
+        line.send(Driven(episode, time.perf_counter() - begun, memory))

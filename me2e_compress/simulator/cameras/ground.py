@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.cameras.rig import (
+from me2e_compress.simulator.camera_rig import (
     CAMERA_HEIGHT_M,
     CameraRig,
 )

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.cameras.ordering import painting_order
-from me2e_compress.simulator.cameras.rig import (
+from me2e_compress.simulator.camera_rig import (
     CAMERA_HEIGHT_M,
     CameraRig,
 )
+from me2e_compress.simulator.cameras.ordering import painting_order
 from me2e_compress.simulator.cameras.solids import Solid
 from me2e_compress.simulator.cameras.template import FIRST_LAMP
 from me2e_compress.simulator.scene import Ego

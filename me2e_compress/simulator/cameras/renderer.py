@@ -7,14 +7,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.simulator.camera_rig import CAMERAS, CameraRig
+from me2e_compress.simulator.cameras.atmosphere import Atmosphere, Sensor
 from me2e_compress.simulator.cameras.classes import PixelClass
 from me2e_compress.simulator.cameras.ground import GroundSampler
 from me2e_compress.simulator.cameras.painter import Painter, draw, label
-from me2e_compress.simulator.cameras.rig import CAMERAS, CameraRig
 from me2e_compress.simulator.cameras.solids import solids_of
 from me2e_compress.simulator.cameras.texture import GroundTexture
-from me2e_compress.simulator.cameras.weather import CLEAR, Atmosphere, Sensor, Weather
 from me2e_compress.simulator.scene import Scene
+from me2e_compress.simulator.weather import CLEAR, Weather
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]

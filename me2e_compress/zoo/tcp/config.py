@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from me2e_compress.zoo.resnet import STEM
-
 ActionHeads = Literal["bench2drive", "beta"]
 
 COMMANDS = 6
@@ -37,7 +35,7 @@ class TcpConfig:
 
     Attributes:
         image_hw: Pixels of the strip of three cameras.
-        stem: Channels of the first stage of the image trunk.
+        stem: Channels of the first stage of the image trunk, a ResNet's.
         classes: Width of the image vector.
         measured: Width of the measurement vector.
         joint: Width of the layers that join image and measurements.
@@ -46,7 +44,7 @@ class TcpConfig:
     """
 
     image_hw: tuple[int, int] = (256, 900)
-    stem: int = STEM
+    stem: int = 64
     classes: int = 1000
     measured: int = 128
     joint: int = 512

@@ -17,7 +17,12 @@ from typing import Any
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError, MissingExtraError, RecipeError
+from me2e_compress.errors import (
+    BrokenPackageError,
+    GraphError,
+    MissingExtraError,
+    RecipeError,
+)
 from me2e_compress.quantization.plan import INT8, QuantPlan, plan_of
 from me2e_compress.runtime.children import run_script
 from me2e_compress.targets.tensorrt.rtx.cut import cut
@@ -105,6 +110,7 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
 
     Raises:
         MissingExtraError: TensorRT-RTX is not installed.
+        BrokenPackageError: it is, and cannot be imported.
         RecipeError: no such generation.
         GraphError: the parser took its process down; the message has its last line.
         PreconditionError: the graph cannot be cut at a plugin.
@@ -142,6 +148,8 @@ def _ask(
     done = run_script(Path(__file__).with_name("rtx_main.py"), words)
     if not answer.is_file():
         last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+        if last[0].startswith(("ImportError", "ModuleNotFoundError")):
+            raise BrokenPackageError("tensorrt_rtx", EXTRA, last[0])
         raise GraphError(
             f"TensorRT-RTX ended with code {done.returncode} on the graph: {last[0]}"
         )

@@ -1,0 +1,77 @@
+"""What the extras of the package bring, and what to install where one is missing."""
+
+import traceback
+from importlib import util
+
+from me2e_compress.errors import BrokenPackageError, MissingExtraError
+
+MODULES = {
+    "highway": ("highway_env", "gymnasium", "cv2", "jinja2", "matplotlib"),
+    "fast": ("numba", "llvmlite"),
+    "logs": ("cv2",),
+    "ray": ("ray",),
+    "zoo": ("torch", "onnxscript", "safetensors"),
+    "bench": ("onnxslim",),
+    "models": ("transformers",),
+    "trt-check": ("tensorrt_rtx",),
+}
+"""The modules that each extra brings, as they are imported."""
+
+_EXTRA_OF = {
+    module: extra for extra, modules in reversed(MODULES.items()) for module in modules
+}
+
+
+def missing_module(extras: str) -> str:
+    """Return the first module of these extras that is not installed; empty for none.
+
+    Args:
+        extras: Names, parted by commas.
+    """
+    wanted = (module for extra in extras.split(",") for module in MODULES[extra])
+    return next((module for module in wanted if util.find_spec(module) is None), "")
+
+
+def need_extra(extras: str, what: str) -> None:
+    """Go on if these extras are installed; nothing is imported to know it.
+
+    Args:
+        extras: Names, parted by commas.
+        what: What needs them, for the message.
+
+    Raises:
+        MissingExtraError: A module of them is not installed.
+    """
+    if module := missing_module(extras):
+        raise MissingExtraError(f"{module}, which {what} needs,", extras)
+
+
+def explained(error: Exception) -> Exception:
+    """Return what to tell the user of an error: of a failed import, what to install.
+
+    An error that has nothing to do with our extras is returned as it is.
+    """
+    if not isinstance(error, ImportError | OSError):
+        return error
+    module = _module_behind(error)
+    if not module:
+        return error
+    if util.find_spec(module) is None:
+        return MissingExtraError(module, _EXTRA_OF[module])
+    return BrokenPackageError(module, _EXTRA_OF[module], str(error))
+
+
+def _module_behind(error: ImportError | OSError) -> str:
+    """Return the module of an extra whose import failed; empty if none did.
+
+    The error may name it, or something that it needs in its turn: then it is the last
+    one whose own code was running as it was imported.
+    """
+    named = error.name or "" if isinstance(error, ImportError) else ""
+    running = (
+        str(frame.f_globals.get("__name__"))
+        for frame, _ in traceback.walk_tb(error.__traceback__)
+        if frame.f_code.co_name == "<module>"
+    )
+    candidates = [each.partition(".")[0] for each in (*running, named)]
+    return next((each for each in reversed(candidates) if each in _EXTRA_OF), "")
