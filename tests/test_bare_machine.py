@@ -1,0 +1,325 @@
+"""What works where an extra is not installed, or only half."""
+
+import json
+import pickle
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from me2e_compress.cli import main
+from me2e_compress.cli.app import COMMANDS
+from me2e_compress.errors import (
+    BrokenPackageError,
+    MissingExtraError,
+    MissingPackageError,
+)
+from me2e_compress.extras import MODULES, explained, need_extra
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
+ALL = "all at once"
+
+TORCH = (
+    "training",
+    "workflows.train",
+    *("zoo.bev", "zoo.highway", "zoo.tcp", "zoo.uniad", "zoo.vad"),
+    *("zoo.counter", "zoo.drawing", "zoo.resnet"),
+)
+PICTURES = (
+    "agents.carla_observer",
+    "agents.graph_agent",
+    *("evaluators.highway.admission", "evaluators.highway.blind"),
+    *("evaluators.highway.driven_frames", "evaluators.highway.expert"),
+    *("evaluators.highway.generate", "evaluators.highway.observe"),
+    *("evaluators.highway.render", "evaluators.highway.runner"),
+    *("simulator.cameras", "simulator.pictures"),
+    "study",
+    *("training", "workflows.train"),
+)
+WORLD = (
+    *PICTURES,
+    *("evaluators.highway.controller", "evaluators.highway.endings"),
+    *("evaluators.highway.episode_recorder", "evaluators.highway.vehicle_map"),
+    *("simulator.scenarios", "simulator.traffic", "simulator.world"),
+    "workflows.latency_figure",
+)
+KERNELS = (
+    *("operators.kernels.custom_ops", "operators.kernels.deformable_kernel"),
+    *("operators.kernels.intrinsics", "operators.kernels.machine_code"),
+    "operators.kernels.weighted_rows",
+)
+ROOMS: Mapping[str, tuple[str, ...]] = {
+    "highway": WORLD,
+    "logs": PICTURES,
+    "zoo": TORCH,
+    "models": TORCH,
+    "fast": KERNELS,
+    "trt-check": ("targets.tensorrt.rtx.rtx_main",),
+}
+"""Modules, or rooms with them, that cannot be imported without an extra."""
+
+
+def distributions(wanted: Iterator[Requirement]) -> set[str]:
+    """Return the packages that some requirements bring, with all that those need."""
+    found, ahead = set[tuple[str, str]](), list(wanted)
+    while ahead:
+        each = ahead.pop()
+        name = canonicalize_name(each.name)
+        for extra in ("", *each.extras):
+            if (name, extra) in found:
+                continue
+            found.add((name, extra))
+            try:
+                needs = requires(name) or []
+            except PackageNotFoundError:
+                continue
+            ahead += [
+                need
+                for need in map(Requirement, needs)
+                if need.marker is None or need.marker.evaluate({"extra": extra})
+            ]
+    return {name for name, _ in found}
+
+
+def modules_of(packages: set[str]) -> set[str]:
+    """Return what packages are imported as; of one that is not there, its name."""
+    homes = packages_distributions()
+    known = {canonicalize_name(name) for names in homes.values() for name in names}
+    imported = {
+        module
+        for module, names in homes.items()
+        if packages & {canonicalize_name(name) for name in names}
+    }
+    return imported | {name.replace("-", "_") for name in packages - known}
+
+
+def blocked() -> dict[str, list[str]]:
+    """Return the modules that are missing without each extra, and without any.
+
+    Without one it is what the extra names, and what none of the others needs.
+    """
+    needs = {extra: list(map(Requirement, listed)) for extra, listed in EXTRAS.items()}
+    base = distributions(map(Requirement, PROJECT["dependencies"]))
+    closed = {extra: distributions(iter(listed)) for extra, listed in needs.items()}
+    gone = dict[str, list[str]]()
+    for extra, packages in closed.items():
+        named = {canonicalize_name(each.name) for each in needs[extra]}
+        others = base.union(*(closed[each] for each in closed if each != extra))
+        gone[extra] = sorted(modules_of((packages - others) | (named - base)))
+    gone[ALL] = sorted(modules_of(set[str]().union(*closed.values()) - base))
+    return gone
+
+
+CASES = blocked()
+
+
+@pytest.fixture(scope="module")
+def without(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What fails without each extra: modules, and `--help` of commands."""
+    cases = tmp_path_factory.mktemp("bare") / "cases.json"
+    cases.write_text(json.dumps(CASES))
+    script = Path(__file__).with_name("blocked_imports.py")
+    done = subprocess.run(
+        [sys.executable, script, cases],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "COLUMNS": "80"},
+    )
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+bare = pytest.mark.xdist_group("bare")
+
+
+def rooms_without(case: str) -> set[str]:
+    """Return the rooms that may fail in a case."""
+    cases = ROOMS if case == ALL else [case]
+    return {room for extra in cases for room in ROOMS.get(extra, ())}
+
+
+@bare
+@pytest.mark.parametrize("case", CASES)
+def test_every_module_is_imported_without_an_extra_but_in_its_rooms(
+    without: dict[str, Any], case: str
+) -> None:
+    rooms = rooms_without(case)
+    broken = {
+        name: error
+        for name, error in without[case]["modules"].items()
+        if not any(f"{name}.".startswith(f"me2e_compress.{room}.") for room in rooms)
+    }
+    assert broken == {}
+
+
+@bare
+@pytest.mark.parametrize("case", CASES)
+def test_a_room_that_needs_an_extra_really_does(
+    without: dict[str, Any], case: str
+) -> None:
+    failing = without[case]["modules"]
+    idle = {
+        room
+        for room in rooms_without(case)
+        if not any(f"{name}.".startswith(f"me2e_compress.{room}.") for name in failing)
+    }
+    assert idle == set()
+
+
+@bare
+@pytest.mark.parametrize("case", CASES)
+def test_help_of_every_command_shows_its_options_without_an_extra(
+    without: dict[str, Any], case: str
+) -> None:
+    silent = {
+        command: said
+        for command, (code, said) in without[case]["help"].items()
+        if code != 0 or ("--json" not in said)
+    }
+    assert silent == {}
+    assert without[case]["help"].keys() == COMMANDS.keys()
+
+
+@bare
+@pytest.mark.parametrize("case", CASES)
+def test_a_public_name_without_its_extra_says_what_to_install(
+    without: dict[str, Any], case: str
+) -> None:
+    lacking = without[case]["names"]
+    assert all(each.startswith("MissingExtraError: ") for each in lacking.values())
+    assert bool(lacking) == (case in ("highway", "logs", ALL))
+
+
+def test_modules_of_extras_are_what_the_project_says() -> None:
+    brought = {
+        extra: modules_of({canonicalize_name(Requirement(each).name) for each in needs})
+        for extra, needs in EXTRAS.items()
+    }
+    strangers = {
+        (extra, module)
+        for extra, modules in MODULES.items()
+        for module in modules
+        if module not in brought[extra] and module not in CASES[extra]
+    }
+    assert strangers == set()
+    assert MODULES.keys() == EXTRAS.keys() - {"docs", "test"}
+
+
+def commands() -> Mapping[str, tuple[str, ...]]:
+    """Return words that need an extra, by the module of it that is broken."""
+    frames = str(ROOT / "me2e_compress/zoo/weights/highway-frames")
+    return {
+        "highway_env": ("evaluate", "blind", "--routes", "1", "-o", "out"),
+        "cv2": ("evaluate", "highway", "--routes", "1", "-o", "out"),
+        "matplotlib": (
+            *("profile", "highway", frames, "-o", "t.json"),
+            *("--samples", "1", "--figure", "f.png"),
+        ),
+        "jinja2": ("study", "smoke", "-o", "out", "--dry-run"),
+        "torch": ("export", "tcp", "-o", "tcp.onnx"),
+        "ray": (*("evaluate", "blind", "--routes", "1", "--engine", "ray"), "-o", "o"),
+        "tensorrt_rtx": ("lint", "highway", "--target", "tensorrt", "--trt-check"),
+    }
+
+
+@pytest.mark.parametrize(("module", "words"), commands().items())
+def test_a_half_installed_extra_is_one_line(
+    tmp_path: Path, module: str, words: tuple[str, ...]
+) -> None:
+    """The module is found; importing it fails."""
+    reason = "libGL.so.1: cannot open shared object file"
+    package = tmp_path / "site" / module
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text(f"raise ImportError({reason!r})\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "me2e_compress", *words],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={"PYTHONPATH": f"{package.parent}:{ROOT}", "HOME": str(tmp_path)},
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"me2e-compress: {module} is installed, but cannot be")
+    assert reason in line
+    (extra, *_) = (name for name, brings in MODULES.items() if module in brings)
+    assert line.endswith(f"pip install --force-reinstall 'me2e-compress[{extra}]'")
+
+
+@pytest.mark.parametrize("extra", MODULES)
+def test_a_missing_extra_is_asked_for_before_work_starts(
+    monkeypatch: pytest.MonkeyPatch, extra: str
+) -> None:
+    first = MODULES[extra][0]
+    monkeypatch.setattr(
+        "importlib.util.find_spec",
+        lambda name: None if name == first else object(),
+    )
+    with pytest.raises(MissingExtraError) as caught:
+        need_extra(extra, "this")
+    assert str(caught.value) == (
+        f"{first}, which this needs, is not installed: pip install"
+        f" 'me2e-compress[{extra}]'"
+    )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ModuleNotFoundError("No module named 'x'", name="me2e_compress.nothing"),
+        ImportError("cannot import name 'a' from 'b'"),
+        FileNotFoundError(2, "No such file", "frames"),
+    ],
+)
+def test_what_has_nothing_to_do_with_an_extra_stays_as_it_is(error: Exception) -> None:
+    assert explained(error) is error
+
+
+def test_a_module_that_a_package_lacks_is_told_as_that_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As highway-env without pygame."""
+    package = tmp_path / "onnxslim"
+    package.mkdir()
+    (package / "__init__.py").write_text("import not_to_be_had\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "onnxslim", raising=False)
+    with pytest.raises(ImportError) as caught:
+        __import__("onnxslim")
+    told = explained(caught.value)
+    assert isinstance(told, BrokenPackageError)
+    assert told.args == ("onnxslim", "bench", "No module named 'not_to_be_had'")
+
+
+def test_a_defect_of_ours_keeps_its_traceback(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["me2e-compress", "doctor"])
+    monkeypatch.setitem(sys.modules, "me2e_compress.workflows.doctor", None)
+    monkeypatch.delitem(sys.modules, "me2e_compress.cli.commands.doctor", raising=False)
+    with pytest.raises(ImportError, match=r"me2e_compress\.workflows\.doctor"):
+        main()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MissingExtraError("torch", "zoo"),
+        BrokenPackageError("cv2", "highway", "libGL.so.1"),
+        MissingPackageError("pandas"),
+    ],
+)
+def test_errors_travel_between_processes(error: Exception) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again)) == (type(error), str(error))
