@@ -88,7 +88,7 @@ def found(gone: Collection[str]) -> dict[str, object]:
     """Look for what fails without some modules."""
     for name in [each for each in sys.modules if each.partition(".")[0] in gone]:
         del sys.modules[name]  # a base package takes it where it is there
-    sys.meta_path[:] = [NotInstalled(each, gone) for each in sys.meta_path]  # type: ignore[misc]
+    sys.meta_path[:] = [NotInstalled(each, gone) for each in sys.meta_path]
     package = importlib.import_module("me2e_compress")
     app = importlib.import_module("me2e_compress.cli.app")
     helps = {command: helped(command) for command in app.COMMANDS}
