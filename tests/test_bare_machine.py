@@ -19,7 +19,9 @@ from me2e_compress.extras import MODULES
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
-ALL = "all at once"
+TOOLS = ("bench", "docs", "models", "test")
+"""Extras whose own packages no module of ours imports: they are blocked together."""
+ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
 
 TORCH = (
     "training",
@@ -72,7 +74,6 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "highway": WORLD,
     "logs": PICTURES,
     "zoo": TORCH,
-    "models": TORCH,
     "fast": KERNELS,
     "trt-check": ("targets.tensorrt.rtx.rtx_main",),
 }
@@ -116,16 +117,20 @@ def modules_of(packages: set[str]) -> set[str]:
 def blocked() -> dict[str, list[str]]:
     """Return the modules that are missing without each extra, and without any.
 
-    Without one it is what the extra names, and what none of the others needs.
+    Without one it is what the extra names, and what none of the others needs. The torch
+    of `models` is that of `zoo`.
     """
     needs = {extra: list(map(Requirement, listed)) for extra, listed in EXTRAS.items()}
     base = distributions(map(Requirement, PROJECT["dependencies"]))
     closed = {extra: distributions(iter(listed)) for extra, listed in needs.items()}
     gone = dict[str, list[str]]()
-    for extra, packages in closed.items():
+    for extra in [each for each in needs if each not in TOOLS]:
         named = {canonicalize_name(each.name) for each in needs[extra]}
         others = base.union(*(closed[each] for each in closed if each != extra))
-        gone[extra] = sorted(modules_of((packages - others) | (named - base)))
+        gone[extra] = sorted(modules_of((closed[extra] - others) | (named - base)))
+    used = base.union(*(closed[each] for each in gone))
+    tools = set[str]().union(*(closed[each] for each in TOOLS))
+    gone[EVERY_TOOL] = sorted(modules_of(tools - used))
     gone[ALL] = sorted(modules_of(set[str]().union(*closed.values()) - base))
     return gone
 
@@ -221,7 +226,7 @@ def test_modules_of_extras_are_what_the_project_says() -> None:
         (extra, module)
         for extra, modules in MODULES.items()
         for module in modules
-        if module not in brought[extra] and module not in CASES[extra]
+        if module not in brought[extra] and module not in CASES.get(extra, ())
     }
     assert strangers == set()
     assert MODULES.keys() == EXTRAS.keys() - {"docs", "test"}

@@ -49,12 +49,14 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_every_round_leaves_a_driver(small: Path) -> None:
     for number in range(2):
         policy = OnnxPolicy.open(small / f"round-{number}" / "driver.onnx")
         assert policy.image_size == (96, 160)
 
 
+@pytest.mark.slow
 def test_the_log_tells_losses_and_closed_loop_scores(small: Path) -> None:
     rows = Log(small / "round-1" / "training-1" / "log.jsonl").rows()
     assert [row["what"] for row in rows] == ["losses", "closed_loop"]
@@ -63,6 +65,7 @@ def test_the_log_tells_losses_and_closed_loop_scores(small: Path) -> None:
     assert (rows[1]["routes"], len(rows[1]["success_rate_percent"])) == (2, 3)
 
 
+@pytest.mark.slow
 def test_the_log_tells_how_much_was_learned_from(small: Path) -> None:
     rows = Log(small / "round-1" / "training-1" / "log.jsonl").rows()
     files = [
@@ -74,6 +77,7 @@ def test_the_log_tells_how_much_was_learned_from(small: Path) -> None:
     assert rows[1]["learned_frames"] == frames_in(files) - frames_in(held_out)
 
 
+@pytest.mark.slow
 def test_the_student_drives_in_the_second_round(small: Path) -> None:
     told = [
         json.loads((small / f"round-{n}" / "episodes" / "dataset.json").read_bytes())
@@ -83,6 +87,7 @@ def test_the_student_drives_in_the_second_round(small: Path) -> None:
     assert told[1]["expert_share"] == SMALL.rounds[1].expert_share < 1
 
 
+@pytest.mark.slow
 def test_trial_routes_are_neither_learned_from_nor_judged_on(small: Path) -> None:
     tried = {
         (route.scenario, route.seed) for route in load_routes(small / "trial.json")
@@ -99,6 +104,7 @@ def test_trial_routes_are_neither_learned_from_nor_judged_on(small: Path) -> Non
     assert not tried & (judged | learned)
 
 
+@pytest.mark.slow
 def test_a_finished_course_is_not_gone_again(small: Path) -> None:
     def times() -> dict[str, int]:
         files = sorted(small.rglob("*"))
@@ -115,6 +121,7 @@ def test_a_finished_course_is_not_gone_again(small: Path) -> None:
     assert all(each.done == each.total for each in news if "training" not in each.what)
 
 
+@pytest.mark.slow
 def test_another_course_is_refused_there(small: Path) -> None:
     other = replace(SMALL, trial=replace(SMALL.trial, seed=901))
     words = "holds another course: its trial.seed is 900, this one's 901; choose"

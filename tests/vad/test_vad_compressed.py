@@ -127,7 +127,7 @@ def seeing(result: ir.Model, context: Context) -> Session:
     # that no layer holds (embeddings, biases, what stays float)
     [
         pytest.param("feature-ext", 85, 70.0, FEATURES_MOVE, marks=pytest.mark.slow),
-        ("prediction", 110, 15.0, HEADS_MOVE),
+        pytest.param("prediction", 110, 15.0, HEADS_MOVE, marks=pytest.mark.slow),
         ("full", 195, 90.0, FEATURES_MOVE),
     ],
 )
