@@ -64,11 +64,10 @@ def layout_of(operand: ir.Value) -> HeadLayout | None:
     nodes: list[ir.Node] = []
     while (node := sole_maker(value, "Transpose", "Mul", "Div", *VIEWS)) is not None:
         factor = _factor(node)
-        source = node.inputs[0]
+        first = node.op_type == "Mul" and scalar_of(node.inputs[0]) is not None
+        source = node.inputs[1 if first else 0]
         if factor is None or source is None or not is_standard(node):
             break
-        if scalar_of(source) is not None and node.inputs[1] is not None:
-            source = node.inputs[1]
         scale, value = scale * factor, source
         nodes.append(node)
     shape = static_shape(value)

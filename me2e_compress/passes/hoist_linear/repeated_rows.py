@@ -86,7 +86,8 @@ def do_before_repeats(node: ir.Node, rewriter: Rewriter, opset: int) -> bool:
     if not _is_row_wise(node, opset):
         return False
     shape = static_shape(node.outputs[0])
-    for index, value in enumerate(node.inputs[:2]):
+    operands = node.inputs[: 2 if node.op_type in BINARY else 1]
+    for index, value in enumerate(operands):
         given = static_shape(value)
         if value is None or not shape or not given or given[:-1] != shape[:-1]:
             continue
@@ -211,9 +212,9 @@ def _traffic(values: Sequence[ir.Value | None]) -> float:
 
 def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
     old, found = node.outputs[0], move.found
-    attributes = list(node.attributes.values())
+    inputs, attributes = _along_last(node, move, rewriter)
     new = rewriter.write(
-        node.op_type, move.inputs, attributes, move.shape, sources=(node,), like=old
+        node.op_type, inputs, attributes, move.shape, sources=(node,), like=old
     )
     if found.broadcasts:
         shape = static_shape(old) or ()
@@ -229,3 +230,18 @@ def _rewrite(node: ir.Node, move: Move, rewriter: Rewriter) -> None:
             kind, inputs, attributes, shape, sources=(node, moving), like=old
         )
     rewriter.swap(old, new)
+
+
+def _along_last(
+    node: ir.Node, move: Move, rewriter: Rewriter
+) -> tuple[list[ir.Value | None], list[ir.Attr]]:
+    """Say what a moved node reads: its axis is the last of what has another rank."""
+    inputs, attributes = list(move.inputs), dict(node.attributes)
+    last = len(move.shape) - 1
+    if node.op_type in ALONG_AXIS:
+        attributes["axis"] = ir.AttrInt64("axis", last)
+    elif "axes" in attributes:
+        attributes["axes"] = ir.AttrInt64s("axes", [last])
+    elif node.op_type in REDUCTIONS:
+        inputs[1] = rewriter.target((last,), f"{node.outputs[0].name}_axes")
+    return inputs, list(attributes.values())
