@@ -95,3 +95,77 @@ def test_whatever_follows_the_outputs_stay(followers: str, channels: int) -> Non
     }
     for want, got in zip(compute(before, feeds), compute(after, feeds), strict=True):
         np.testing.assert_allclose(got, want, rtol=0, atol=1e-5 * np.abs(want).max())
+
+
+BEHIND = ("g", "d", "m", "v")
+
+
+def unchanged(text: str, **given: Any) -> None:
+    """Fuse; the outputs are what they were."""
+    random = np.random.default_rng(5)
+    before, after = read(text, **given), read(text, **given)
+    apply(FuseBasic(), after)
+    feeds = {
+        str(port.name): random.normal(size=shape).astype(np.float32)
+        for port in before.graph.inputs
+        if (shape := graph.static_shape(port)) is not None
+    }
+    for want, got in zip(compute(before, feeds), compute(after, feeds), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-4)
+
+
+def drawn(*shape: int) -> Any:
+    return np.random.default_rng(1).uniform(0.5, 1.5, shape).astype(np.float32)
+
+
+def test_a_copy_is_another_where_the_weight_was_scaled_in_place_since() -> None:
+    text = (
+        HEAD
+        + """g (float[1,4,5,5] x1, float[1,4,5,5] x2)
+        => (float[1,4,5,5] v11, float[1,4,5,5] v24) {
+        v7 = Conv(x1, W, b)
+        v9 = Conv(x2, W)
+        v11 = Div(v7, two)
+        v17 = BatchNormalization(v9, g, d, m, v)
+        v24 = Div(v17, two)
+    }"""
+    )
+    unchanged(
+        text, W=drawn(4, 4, 1, 1), b=drawn(4), two=np.float32(2),
+        **{name: drawn(4) * (1 + i) for i, name in enumerate(BEHIND)},
+    )  # fmt: skip
+
+
+def test_a_copy_is_another_where_it_was_scaled_in_place_itself() -> None:
+    text = (
+        HEAD
+        + """g (float[1,4,5,5] x1, float[1,4,5,5] x2, float[1,4,5,5] x3)
+        => (float[1,4,5,5] c, float[1,4,5,5] y2, float[1,4,5,5] x) {
+        a = Conv(x1, W)
+        b = Mul(a, two)
+        c = BatchNormalization(b, g, d, m, v)
+        a2 = Conv(x2, W)
+        y2 = Mul(a2, two)
+        x = Conv(x3, W)
+    }"""
+    )
+    unchanged(
+        text, W=drawn(4, 4, 1, 1), two=np.float32(2),
+        **{name: drawn(4) * (1 + i) for i, name in enumerate(BEHIND)},
+    )  # fmt: skip
+
+
+def test_a_transposed_weight_has_copies_of_its_own() -> None:
+    text = (
+        HEAD
+        + """g (float[3,4] x1, float[3,4] x2, float[3,4] x3)
+        => (float[3,4] y1, float[3,4] y2, float[3,4] y3) {
+        a1 = Gemm(x1, W, b)
+        y1 = Mul(a1, k)
+        a2 = Gemm<transB = 1>(x2, W, b)
+        y2 = Mul(a2, k)
+        a3 = MatMul(x3, W)
+        y3 = Mul(a3, k)
+    }"""
+    )
+    unchanged(text, W=drawn(4, 4), b=drawn(4), k=drawn(4))

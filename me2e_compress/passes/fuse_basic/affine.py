@@ -143,8 +143,10 @@ def _give(
     """Give a layer its scaled weight; False if the copy would cost too much."""
     if (scale == 1).all():
         return True
-    name = _copy_name(shared, scale)
+    name = _copy_name(layer, shared, scale)
     copy = kit.graph.initializers.get(name)
+    if copy is not None and not _holds(copy, weight):
+        copy = None  # it was scaled once more since it was named
     if copy is None and sole_reader(shared) is layer:
         kit.refill(layer, 1, weight, shared.name or name)
         return True
@@ -156,9 +158,17 @@ def _give(
     return True
 
 
-def _copy_name(shared: ir.Value, scale: Numbers) -> str:
-    """Name the copy of a weight after its scale: equal copies are one."""
-    digest = hashlib.blake2b(np.ascontiguousarray(scale).tobytes(), digest_size=8)
+def _holds(copy: ir.Value, weight: Array) -> bool:
+    """Return whether a copy that has the right name holds the right numbers."""
+    tensor = copy.const_value
+    return tensor is not None and np.array_equal(tensor.numpy(), weight)
+
+
+def _copy_name(layer: ir.Node, shared: ir.Value, scale: Numbers) -> str:
+    """Name the copy of a weight after its layout and scale: equal copies are one."""
+    layout = f"{layer.op_type} {layer.attributes.get_int('transB', 0)}"
+    digest = hashlib.blake2b(layout.encode(), digest_size=8)
+    digest.update(np.ascontiguousarray(scale).tobytes())
     return f"{shared.name}.scaled.{digest.hexdigest()}"
 
 
@@ -174,7 +184,7 @@ def _is_worth_copies(shared: ir.Value) -> bool:
             stays = True
             continue
         worth += BYTES_PER_NODE * work(found.root)
-        copies.add(_copy_name(shared, _scale(use.node, affine)))
+        copies.add(_copy_name(use.node, shared, _scale(use.node, affine)))
     made = shared.graph.initializers if shared.graph is not None else {}
     growth = sum(name not in made for name in copies) - (not stays)
     tensor = shared.const_value
