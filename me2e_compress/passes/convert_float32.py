@@ -36,11 +36,15 @@ class ConvertFloat32(Pass):
         nodes = [n for n in model.graph if types.inputs(n) or types.outputs(n)]
         retyping = Retyping(model, types, self.name)
         retyping.run(nodes, keep_io=True)
-        changes = retyping.changed + _drop_idle_casts(model)
-        return PassResult(model, changes, (f"{len(nodes)} nodes in float32",))
+        changes = retyping.changed + _bypass_idle_casts(model)
+        if changes:
+            rewrite.sweep(model)
+        computing = sum(node.op_type != "Cast" for node in nodes)
+        return PassResult(model, changes, (f"{computing} nodes in float32",))
 
 
-def _drop_idle_casts(model: ir.Model) -> int:
+def _bypass_idle_casts(model: ir.Model) -> int:
+    """Let the readers of idle Casts read what these do; count the Casts."""
     idle = [
         node
         for node in model.graph
@@ -48,9 +52,8 @@ def _drop_idle_casts(model: ir.Model) -> int:
         and node.inputs[0] is not None
         and node.inputs[0].dtype == node.outputs[0].dtype == FLOAT
     ]
-    for node in idle:
-        source = node.inputs[0]
-        if source is not None:
-            rewrite.bypass(node.outputs[0], source)
-    rewrite.sweep(model)
-    return len(idle)
+    return sum(
+        rewrite.bypass(node.outputs[0], source)
+        for node in idle
+        if (source := node.inputs[0]) is not None
+    )

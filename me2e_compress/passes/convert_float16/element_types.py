@@ -13,8 +13,14 @@ FLOAT, HALF = ir.DataType.FLOAT, ir.DataType.FLOAT16
 _ONNX = {FLOAT: "tensor(float)", HALF: "tensor(float16)"}
 _FIRST_ONLY = {"Resize": 1}
 """Operators whose later inputs are scales and regions: how many inputs hold data."""
-_BY_TYPE = frozenset({"BitCast", "Cast", "CastLike", "Optional", "OptionalGetElement"})
-"""Operators that mean something else in another type, or whose schema omits one."""
+_BY_TYPE = frozenset(
+    {
+        "Bernoulli", "BitCast", "Cast", "CastLike", "EyeLike", "Optional",
+        "OptionalGetElement", "RandomNormalLike", "RandomUniformLike",
+    }
+)  # fmt: skip
+"""Operators that mean something else in another type, or whose schema omits one: what
+is drawn like an input is of its type where no attribute names another."""
 
 
 class ElementTypes:
@@ -85,6 +91,8 @@ class ElementTypes:
     def _schema(self, node: ir.Node) -> onnx.defs.OpSchema | None:
         if not is_standard(node) or node.op_type in _BY_TYPE or has_subgraph(node):
             return None
+        if node.op_type == "DequantizeLinear" and "output_dtype" in node.attributes:
+            return None  # of that type, whatever its scale is of
         values = [each for each in (*node.inputs, *node.outputs) if each is not None]
         if not all(isinstance(v.type, ir.TensorType | None) for v in values):
             return None  # sequences and optionals
@@ -133,6 +141,7 @@ class Retyping:
             node.outputs[index] for node in nodes for index in types.outputs(node)
         }
         wanted = {(n, index) for n, indices in chosen.items() for index in indices}
+        self._leave_casts(nodes, results, wanted)
         if not keep_io:
             given = [v for v in self._graph.inputs if _is_read_as(v, wanted)]
             results.update(given)
@@ -143,15 +152,38 @@ class Retyping:
         }
         for value in results:
             value.type = ir.TensorType(types.wanted)  # clones share the old one
+            if value.is_initializer():  # an input and its default are of one type
+                self._convert(value)
         for node in nodes:
             if node.op_type == "Cast" and node.outputs[0] in results:
                 node.attributes["to"] = ir.AttrInt64("to", types.wanted.value)
-            if chosen[node] or any(each in results for each in node.outputs):
+            reads = any((node, index) in wanted for index in chosen[node])
+            if reads or any(each in results for each in node.outputs):
                 provenance.inherit(node, [node], by=self._by)
                 self.changed += 1
         for value, users in uses.items():
             self._serve(value, users, wanted)
         self._outputs(results, keep_io=keep_io)
+
+    def _leave_casts(
+        self,
+        nodes: Iterable[ir.Node],
+        results: set[ir.Value],
+        wanted: set[tuple[ir.Node, int]],
+    ) -> None:
+        """Leave the Casts out that another type would only put one more Cast beside.
+
+        They make what nobody wants in the other type, or read what stays as it is.
+        """
+        casts = [node for node in nodes if node.op_type == "Cast"]
+        for node in casts:
+            uses = ((use.node, use.idx) for use in node.outputs[0].uses())
+            if wanted.isdisjoint(uses):
+                results.discard(node.outputs[0])
+        for node in casts:
+            value = node.inputs[0]
+            if value is None or not (value in results or self._is_constant(value)):
+                wanted.discard((node, 0))
 
     def _float_values(self, results: Iterable[ir.Value]) -> list[ir.Value]:
         """List inputs, constants and results of the source type, in graph order."""

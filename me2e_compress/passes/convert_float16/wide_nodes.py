@@ -127,7 +127,10 @@ def _by_operator(node: ir.Node) -> str | None:
 
 def _by_constants(node: ir.Node, types: ElementTypes) -> str | None:
     for index in types.inputs(node):
-        numbers = numbers_of(node.inputs[index])
+        value = node.inputs[index]
+        numbers = numbers_of(value)
+        if numbers is None and value is not None and value.const_value is not None:
+            numbers = value.const_value.numpy().astype(np.float64)  # an input's default
         if numbers is not None and not _fits(numbers):
             return "a constant that float16 does not hold"
     return None
