@@ -50,7 +50,7 @@ def nodes_in(graph: ir.Graph | ir.Function) -> Iterator[ir.Node]:
     """Walk the nodes of a graph, those of its bodies behind the node that has them."""
     for node in graph:
         yield node
-        for body in _bodies(node):
+        for body in bodies_of(node):
             yield from nodes_in(body)
 
 
@@ -58,7 +58,8 @@ _WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
 """The operators of ONNX that have bodies; to look for them in others takes time."""
 
 
-def _bodies(node: ir.Node) -> Sequence[ir.Graph]:
+def bodies_of(node: ir.Node) -> Sequence[ir.Graph]:
+    """List the graphs that a node carries, not those inside them."""
     if node.op_type not in _WITH_BODIES and is_standard(node):
         return ()
     found: list[ir.Graph] = []
@@ -90,7 +91,7 @@ def graphs_of(graph: ir.Graph) -> Iterator[ir.Graph]:
     """Walk a graph and all the graphs inside its nodes, outermost first."""
     yield graph
     for node in graph:
-        for body in _bodies(node):
+        for body in bodies_of(node):
             yield from graphs_of(body)
 
 

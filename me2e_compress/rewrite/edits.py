@@ -8,7 +8,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import graphs_of, provenance
-from me2e_compress.graph.nodes import Array, is_read, nodes_in
+from me2e_compress.graph.nodes import Array, bodies_of, is_read, nodes_in
 
 
 def value_names(graph: ir.Graph) -> set[str]:
@@ -137,8 +137,33 @@ def put(
     provenance.inherit(new, (old, *sources), by=by)
     graph.insert_before(old, new)
     replace_value(result, new.outputs[0])
-    graph.remove(old, safe=True)
+    remove_node(old)
     return new
+
+
+def remove_node(node: ir.Node) -> None:
+    """Remove a node that nothing reads, and what stands in its bodies.
+
+    Raises:
+        GraphError: the node is not in a graph, or it is read.
+    """
+    graph = node.graph
+    if not isinstance(graph, ir.Graph):
+        raise GraphError(f"node {node.name} is not in a graph")
+    if read := [value.name for value in node.outputs if is_read(value)]:
+        raise GraphError(f"node {node.name} cannot be removed: {read[0]} is read")
+    for body in bodies_of(node):
+        _empty(body)
+    graph.remove(node, safe=True)
+
+
+def _empty(body: ir.Graph) -> None:
+    """Take all nodes out of a body: they would go on reading what they captured."""
+    for node in body:
+        for inner in bodies_of(node):
+            _empty(inner)
+    body.outputs.clear()
+    body.remove(list(body), safe=True)
 
 
 def remove_dead(graph: ir.Graph) -> int:
@@ -152,7 +177,7 @@ def remove_dead(graph: ir.Graph) -> int:
     for inner in reversed(list(graphs_of(graph))):
         for node in reversed(inner):
             if not any(is_read(value) for value in node.outputs):
-                inner.remove(node, safe=True)
+                remove_node(node)
                 count += 1
     for inner in graphs_of(graph):
         for value in _idle(inner):

@@ -15,6 +15,7 @@ from me2e_compress.rewrite.edits import (
     fresh_name,
     put,
     remove_dead,
+    remove_node,
     replace_value,
     value_names,
 )
@@ -90,7 +91,7 @@ class Kit:
         sources += self.match.nodes[1:]
         put(last, op_type, inputs, by=self.by, sources=sources, attributes=attributes)
         for node in reversed(behind[:-1]):
-            self.graph.remove(node, safe=True)
+            remove_node(node)
 
     def add(
         self,
@@ -121,7 +122,7 @@ class Kit:
         for node in changed:
             provenance.inherit(node, (node, root), by=self.by)
         replace_value(root.outputs[0], changed[0].outputs[0])
-        self.graph.remove(root, safe=True)
+        remove_node(root)
 
 
 def _no_objection(found: Match, facts: Facts) -> None:
@@ -175,25 +176,34 @@ class Fused:
     Attributes:
         done: by the name of the fusion.
         refused: by the reason.
+        unread: nodes and weights that nothing read before anything was fused.
     """
 
     done: Counter[str] = dataclasses.field(default_factory=Counter)
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
+    unread: int = 0
 
     @property
     def changes(self) -> int:
-        """How many fusions were done."""
-        return self.done.total()
+        """How many fusions were done, and unread nodes and weights removed."""
+        return self.done.total() + self.unread
 
     def notes(self) -> tuple[str, ...]:
         """Return sentences for the report."""
         what = ", ".join(f"{count} {name}" for name, count in self.done.items())
         left = (f"left {count}: {reason}" for reason, count in self.refused.items())
-        return ((f"fused: {what}",) if what else ()) + tuple(left)
+        return (
+            *((f"fused: {what}",) if what else ()),
+            *((f"removed: {self.unread} unread",) if self.unread else ()),
+            *left,
+        )
 
 
 def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
-    """Try fusions on every node, in order, until none applies; sweep what is dead.
+    """Try fusions on every node, in order, until none applies.
+
+    What nothing reads is removed first, and after every round: it would read what a
+    pattern wants for itself.
 
     Args:
         model: the graph, shapes inferred; rewritten in place, its bodies too.
@@ -201,17 +211,15 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
         by: the pass's name.
     """
     run = _Run(Facts(opset_of(model)), by, value_names(model.graph), _by_root(fusions))
-    fused = Fused()
-    for body in graphs_of(model.graph):
-        refused: Counter[str] = Counter()
-        for _ in range(ROUNDS):
-            refused.clear()  # those of the last round are left
-            done = run.round(body, refused)
-            fused.done.update(done)
-            if not done:
-                break
-        fused.refused.update(refused)
-    if fused.changes:
+    fused = Fused(unread=remove_dead(model.graph))
+    for _ in range(ROUNDS):
+        done: Counter[str] = Counter()
+        fused.refused.clear()  # those of the last round are left
+        for body in graphs_of(model.graph):
+            done.update(run.round(body, fused.refused))
+        if not done:
+            break
+        fused.done.update(done)
         remove_dead(model.graph)
     return fused
 
@@ -262,7 +270,8 @@ def _clear(found: Match, body: ir.Graph) -> None:
         for node in found.nodes
         if node.graph is body and not any(is_read(each) for each in node.outputs)
     ]:
-        body.remove(dead, safe=True)
+        for node in dead:
+            remove_node(node)
 
 
 def _by_root(fusions: Sequence[Fusion]) -> _Table:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress.graph import array_of, provenance
+from me2e_compress.graph import array_of, infer_shapes, provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.identities import identity_of
 from me2e_compress.passes.eliminate_redundant.merges import MergeSite, merge
@@ -23,6 +23,7 @@ from me2e_compress.rewrite import (
     is_read,
     is_standard,
     remove_dead,
+    remove_node,
     replace_value,
     value_names,
 )
@@ -152,9 +153,11 @@ class EliminateRedundant(Pass):
         tally: Counter[str] = Counter()
         tally["unread"] += remove_dead(model.graph)
         for _ in range(ROUNDS):
-            before = tally.total()
+            before, branches = tally.total(), tally["branches"]
             for body in graphs_of(model.graph):
                 self._round(body, model.opset_imports, tally)
+            if tally["branches"] > branches:
+                infer_shapes(model)  # in a branch, less is known of what is around it
             tally["unread"] += remove_dead(model.graph)
             if tally.total() == before:
                 break
@@ -181,7 +184,7 @@ class EliminateRedundant(Pass):
         """Try the rules on one node; give the nodes to look at again."""
         if not any(is_read(value) for value in node.outputs):
             makers = list(node.predecessors())
-            site.graph.remove(node, safe=True)
+            remove_node(node)
             tally["unread"] += 1
             return makers
         inlined = _inline_branch(node, site.opsets, self.name)
@@ -190,7 +193,7 @@ class EliminateRedundant(Pass):
             return inlined
         same = identity_of(node, site.opset)
         if same is not None and bypass(node.outputs[0], same):
-            site.graph.remove(node, safe=True)
+            remove_node(node)
             tally["identities"] += 1
             return [use.node for use in same.uses()]
         merged = merge(node, site)
@@ -251,7 +254,7 @@ def _inline_branch(
     _move(branch, node, graph, by)
     for old, new in zip(node.outputs, results, strict=True):
         replace_value(old, new)
-    graph.remove(node, safe=True)
+    remove_node(node)
     return nodes
 
 

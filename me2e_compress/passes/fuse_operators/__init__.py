@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError, PreconditionError, RecipeError
 from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
-from me2e_compress.graph.nodes import is_read
+from me2e_compress.graph.nodes import is_read, nodes_in
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_operators import decomposed, fused_form
@@ -73,18 +73,24 @@ class FuseOperators(Pass):
             )
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Look at every GridSample of the graph and its bodies."""
-        opset = opset_of(model)
+        """Look at every GridSample of the graph and its bodies, dead code out of the way."""
+        if not any(map(_is_sampler, nodes_in(model.graph))):
+            return PassResult(model, 0)
+        opset, unread = opset_of(model), remove_dead(model.graph)
         run = _Run(self, opset, value_names(model.graph), Proofs(opset, context.seed))
         for body in graphs_of(model.graph):
             for node in list(body):
-                alive = node.graph is body
-                if alive and node.op_type == "GridSample" and is_standard(node):
+                if node.graph is body and _is_sampler(node):
                     run.attempt(body, node)
         if run.done:
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
             remove_dead(model.graph)
-        return PassResult(model, run.done, run.notes())
+        swept = (f"removed: {unread} unread",) * bool(unread)
+        return PassResult(model, run.done + unread, (*run.notes(), *swept))
+
+
+def _is_sampler(node: ir.Node) -> bool:
+    return node.op_type == "GridSample" and is_standard(node)
 
 
 class _Run:

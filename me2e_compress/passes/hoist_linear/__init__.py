@@ -31,11 +31,13 @@ class _Tally:
     others: int = 0
     operands: int = 0
     merged: int = 0
+    unread: int = 0
     macs: int = 0
 
     @property
     def changes(self) -> int:
-        return self.products + self.others + self.operands + self.merged
+        moved = self.products + self.others + self.operands
+        return moved + self.merged + self.unread
 
     def notes(self) -> tuple[str, ...]:
         found = []
@@ -46,6 +48,8 @@ class _Tally:
             found.append(f"moved {self.others} other nodes in front of repeated rows")
         if self.merged:
             found.append(f"merged {self.merged} layers that share what they read")
+        if self.unread:
+            found.append(f"removed {self.unread} nodes and weights that nothing reads")
         return tuple(found)
 
 
@@ -84,23 +88,24 @@ class HoistLinear(Pass):
         tally, opset = _Tally(), opset_of(model)
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
+        tally.unread = remove_dead(model.graph)  # it would hold on to what it reads
         names = value_names(model.graph)
-        for body in graphs_of(model.graph):
-            rewriter = Rewriter(body, names, self.name)
-            for _ in range(ROUNDS):
-                before = tally.changes
-                self._round(body, rewriter, opset, tally)
-                if self.merge_shared and tally.changes == before:
-                    tally.merged += merge_layers(body, rewriter, opset)
-                if tally.changes == before:
-                    break
-        if tally.changes:
+        rewriters = [
+            Rewriter(each, names, self.name) for each in graphs_of(model.graph)
+        ]
+        for _ in range(ROUNDS):
+            before = tally.changes
+            for rewriter in rewriters:
+                self._round(rewriter, opset, tally)
+            if self.merge_shared and tally.changes == before:
+                tally.merged += sum(merge_layers(each, opset) for each in rewriters)
+            if tally.changes == before:
+                break
             remove_dead(model.graph)
         return PassResult(model, tally.changes, tally.notes())
 
-    def _round(
-        self, body: ir.Graph, rewriter: Rewriter, opset: int, tally: _Tally
-    ) -> None:
+    def _round(self, rewriter: Rewriter, opset: int, tally: _Tally) -> None:
+        body = rewriter.graph
         prices = Prices(self.bytes_per_node)
         for node in list(body):
             if node.graph is not body:

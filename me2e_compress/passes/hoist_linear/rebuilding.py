@@ -26,6 +26,7 @@ from me2e_compress.rewrite import (
     inherit,
     is_read,
     overflow,
+    remove_node,
     replace_value,
 )
 
@@ -73,7 +74,7 @@ class Rewriter:
                 continue
             if not any(map(is_read, last.outputs)):
                 waiting.extend(last.predecessors())
-                self.graph.remove(last, safe=True)
+                remove_node(last)
 
     def target(self, shape: tuple[int, ...], name: str) -> ir.Value:
         """Return the initializer that holds a shape, for a Reshape or Expand."""

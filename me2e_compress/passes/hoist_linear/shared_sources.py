@@ -22,10 +22,10 @@ SPLIT_INPUT_OPSET = 13
 """Since then the sizes of a Split are an input."""
 
 
-def merge_layers(graph: ir.Graph, rewriter: Rewriter, opset: int) -> int:
+def merge_layers(rewriter: Rewriter, opset: int) -> int:
     """Merge the layers of one module that read the same value; count them."""
     groups: dict[tuple[int, str], list[LinearLayer]] = {}
-    for node in graph:
+    for node in rewriter.graph:
         layer = layer_at(node)
         if layer is not None and sole_reader(layer.weight) is not None:
             key = (id(layer.source), provenance.module_of(node))
