@@ -45,8 +45,9 @@ from me2e_compress.quantization.plan import (
 )
 from me2e_compress.quantization.rules.safe_rules import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.constants import evaluate_constants
 from me2e_compress.runtime.interleaved import time_interleaved
-from me2e_compress.runtime.session import Session, evaluate_constants
+from me2e_compress.runtime.session import Session
 from me2e_compress.targets.tensorrt import TensorRT
 
 NODES = 8000

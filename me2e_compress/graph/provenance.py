@@ -146,15 +146,15 @@ def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
         node
         for node in nodes_in(after.graph)
         if f'"{by}"' not in node.metadata_props.get(PASSES, "")
-        and not _same(known.get(node.name), node)
+        and not is_same(known.get(node.name), node)
     ]
 
 
-def _same(old: ir.Node | None, new: ir.Node) -> bool:
+def is_same(old: ir.Node | None, new: ir.Node) -> bool:
     """Return whether two nodes compute the same from what they read."""
     if old is None or (old.domain, old.op_type) != (new.domain, new.op_type):
         return False
-    if old.attributes.keys() != new.attributes.keys():
+    if list(old.attributes) != list(new.attributes):
         return False
     return all(
         mine is theirs or mine.type in _BODIES or repr(mine) == repr(theirs)

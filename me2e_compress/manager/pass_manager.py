@@ -18,14 +18,16 @@ from me2e_compress.errors import (
     PreconditionError,
     VerificationError,
 )
-from me2e_compress.graph.nodes import has_subgraph
 from me2e_compress.graph.opset import lowered
 from me2e_compress.manager import equivalence, pass_contract, reproducer
 from me2e_compress.manager.attempt import attempt
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
+from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 from me2e_compress.recipe import to_text
+
+NOT_ASKED = "they were to be checked on 0 frames (--verify-frames)"
 
 Progress = Callable[[int, int, str], None]
 Stretch = list[tuple[Pass, ir.Model]]
@@ -38,7 +40,8 @@ class PassManager:
     Attributes:
         passes: what to run. ``import-normalize`` is put in front of a graph whose
             nodes do not say yet where they come from.
-        verify_frames: how many frames exact passes are checked on; 0 turns it off.
+        verify_frames: how many frames exact passes are checked on; 0 turns it off,
+            and the report says that they are not proven.
         reproducers: the folder that a failing pass leaves its reproducer in.
         samples: recorded frames that exact passes are checked on where the context has
             none; None makes seeded inputs up then.
@@ -127,7 +130,8 @@ class _Books:
         self.steps: list[Step] = []
         self.verifications: list[Verification] = []
         self.lossy: list[LossyPass] = []
-        self._stretch: list[tuple[Pass, ir.Model]] = []
+        self._stretch: Stretch = []
+        self._unchecked: list[str] = []
         self._size = graph.size(checkpoint)
         self._digest = graph.digest(checkpoint)
 
@@ -145,24 +149,23 @@ class _Books:
         if isinstance(found, Me2eError):
             raise found
         # Commit: what the next pass is given has its shapes, and is hashed once.
-        result = found.result
-        interface = graph.interface(result.model)
-        if result.changes:
-            graph.infer_shapes(result.model, written=found.written)
-        stale = any(has_subgraph(node) for node in result.model.graph)
-        stale |= graph.interface(result.model) != interface  # an output has a shape now
-        self._digest = graph.digest(result.model) if stale else found.digest
+        result, self._digest = found.result, found.digest
         self._enter(current, result, process_time() - start)
         if not current.exact:
             self.lossy.append(LossyPass(current, model, result.changes))
-        elif self.manager.verify_frames:  # else nobody asks for the graph before
+        elif result.changes and self.manager.verify_frames:
             self._stretch.append((current, model))
+        elif result.changes:  # nobody will ask for the graph before
+            self._unchecked.append(current.name)
         return result.model
 
     def verify(self, model: ir.Model) -> None:
         """Check the exact passes since the last check, and name the guilty one."""
         stretch, self._stretch = self._stretch, []
-        if not stretch or not self.manager.verify_frames:
+        if self._unchecked:
+            names, self._unchecked = tuple(self._unchecked), []
+            self.verifications.append(equivalence.skipped(names, NOT_ASKED))
+        if not stretch:
             return
         self.manager.try_first(model, f"the graph after {stretch[-1][0].name}")
         found, runnable, inputs = self._compare(stretch, model)
@@ -170,12 +173,7 @@ class _Books:
         if equivalence.passed(found) or inputs is None:
             return
         current, guilty = _bisect(runnable, model, inputs)
-        judged = [
-            name
-            for name, error in found.errors.items()
-            if error > found.tolerances[name] and name not in found.unsteady
-        ]
-        worst = max(judged, key=lambda name: found.errors[name])
+        worst = max(found.judged, key=lambda name: found.errors[name])
         error = VerificationError(
             f"{current.name} promises the same outputs and changed {worst} by"
             f" {found.errors[worst]:.3g} of its range"
@@ -185,7 +183,7 @@ class _Books:
 
     def _compare(
         self, stretch: Stretch, model: ir.Model
-    ) -> tuple[Verification, Stretch, equivalence.VerificationInputs | None]:
+    ) -> tuple[Verification, Stretch, VerificationInputs | None]:
         """Compare with the earliest graph that runs (import may make it runnable)."""
         context, count = self.context, self.manager.verify_frames
         frames = context.frames or self.manager.samples
@@ -193,16 +191,26 @@ class _Books:
         for first, (_, before) in enumerate(stretch):
             names = tuple(current.name for current, _ in stretch[first:])
             try:
-                inputs = equivalence.VerificationInputs.of(
+                inputs = VerificationInputs.of(
                     before, frames, context.seed, count, model, context.provider
                 )
                 found = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)
                 continue
+            self._leave_out(stretch[:first], reason)
             return found, stretch[first:], inputs
         names = tuple(current.name for current, _ in stretch)
         return equivalence.skipped(names, reason), stretch, None
+
+    def _leave_out(self, stretch: Stretch, reason: str) -> None:
+        """Say what is not proven since the graph did not run before it.
+
+        An import alone is what makes a graph run that somebody else exported.
+        """
+        names = tuple(current.name for current, _ in stretch)
+        if set(names) - {ImportNormalize.name}:
+            self.verifications.append(equivalence.skipped(names, reason))
 
     def _enter(self, current: Pass, result: PassResult, seconds: float) -> None:
         after = graph.size(result.model)
@@ -237,7 +245,7 @@ class _Books:
 
 
 def _bisect(
-    stretch: Stretch, last: ir.Model, inputs: equivalence.VerificationInputs
+    stretch: Stretch, last: ir.Model, inputs: VerificationInputs
 ) -> tuple[Pass, ir.Model]:
     """Find the first pass after which the outputs differ, in log2 trials."""
     models = [*(model for _, model in stretch), last]
@@ -259,7 +267,7 @@ def _fails_alike(
     if not current.exact or isinstance(error, PassError):
         return False
     try:
-        inputs = equivalence.VerificationInputs.of(
+        inputs = VerificationInputs.of(
             part, None, context.seed, 1, provider=context.provider
         )
         found = equivalence.verify((), part, result.result.model, inputs)

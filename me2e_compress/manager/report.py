@@ -20,6 +20,12 @@ from me2e_compress.display import (
 from me2e_compress.graph import Size
 from me2e_compress.passes.base import Pass
 
+UNSTEADY = (
+    "not judged: on these inputs rounding alone moves the output as far; "
+    "recorded frames (--frames) tell more"
+)
+RANDOM = "not judged: the graph that came in gives another output at every run"
+
 _PACKAGES = ("me2e-compress", "onnx", "onnx-ir", "onnxruntime", "numpy")
 
 
@@ -76,6 +82,10 @@ class Verification:
         skipped: why nothing was measured, or None.
         unsteady: outputs that rounding alone moves as far on these inputs: they
             differ, and that says nothing about the passes.
+        random: outputs that the graph before gives anew at every run.
+        sizes: of open dimensions, that were drawn to run the graphs at.
+        remarks: what else is to be known: where onnxruntime's own optimizations change
+            an output, and the graphs were compared without them.
     """
 
     passes: tuple[str, ...]
@@ -84,6 +94,40 @@ class Verification:
     tolerances: dict[str, float]
     skipped: str | None = None
     unsteady: tuple[str, ...] = ()
+    random: tuple[str, ...] = ()
+    sizes: tuple[dict[str, int], ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def judged(self) -> tuple[str, ...]:
+        """The outputs that say something about the passes."""
+        left_out = {*self.unsteady, *self.random}
+        return tuple(name for name in self.errors if name not in left_out)
+
+    @property
+    def unproven(self) -> str | None:
+        """Why no output says that the passes are exact; None where one does."""
+        if self.skipped is not None:
+            return self.skipped
+        return None if self.judged else self.left_out
+
+    @property
+    def left_out(self) -> str:
+        """Which outputs say nothing of the passes, and why; empty where all do."""
+        why = {
+            "another at every run": self.random,
+            "rounding alone moves it as far": self.unsteady,
+        }
+        return "; ".join(f"{', '.join(n)}: {reason}" for reason, n in why.items() if n)
+
+    @property
+    def fed(self) -> str:
+        """The inputs in a word or two, drawn sizes with them."""
+        drawn = " and ".join(
+            ", ".join(f"{name}={size}" for name, size in each.items())
+            for each in self.sizes
+        )
+        return f"{self.inputs}, {drawn}" if drawn else self.inputs
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -105,6 +149,11 @@ class Report(Displayed):
     verifications: tuple[Verification, ...]
     lossy: tuple[LossyPass, ...] = ()
     read_as: str = ""
+
+    @property
+    def unproven(self) -> tuple[Verification, ...]:
+        """The checks of exact passes in which no output could be judged."""
+        return tuple(each for each in self.verifications if each.unproven is not None)
 
     @property
     def headline(self) -> str:
@@ -134,7 +183,10 @@ class Report(Displayed):
             "output": {"file": output.name, "sha256": graph.sha256_of(output)},
             "pipeline": self.pipeline,
             "steps": [dataclasses.asdict(step) for step in self.steps],
-            "verifications": [dataclasses.asdict(v) for v in self.verifications],
+            "verifications": [
+                dataclasses.asdict(each) | {"proven": each.unproven is None}
+                for each in self.verifications
+            ],
             "versions": versions(),
         }
 
@@ -178,26 +230,24 @@ def steps_table(steps: Sequence[Step]) -> Table:
 
 def verification_table(verifications: Iterable[Verification]) -> Table:
     """Show how far exact passes moved the outputs."""
-    rows, unsteady = list[tuple[str, ...]](), False
+    rows, notes = list[tuple[str, ...]](), dict[str, None]()
     for check in verifications:
         names = ", ".join(check.passes)
         if check.skipped is not None:
-            rows.append((names, f"not measured: {check.skipped}", "", "", ""))
+            rows.append((names, f"not proven: {check.skipped}", "", "", ""))
             continue
-        judged = [name for name in check.errors if name not in check.unsteady]
-        for worst in sorted(judged, key=lambda name: -check.errors[name])[:1]:
+        for worst in sorted(check.judged, key=lambda name: -check.errors[name])[:1]:
             error, allowed = check.errors[worst], check.tolerances[worst]
-            rows.append((names, check.inputs, worst, f"{error:.1e}", f"{allowed:.0e}"))
-        if check.unsteady:
-            listed, unsteady = ", ".join(check.unsteady), True
-            rows.append((names, check.inputs, listed, "not judged", ""))
+            rows.append((names, check.fed, worst, f"{error:.1e}", f"{allowed:.0e}"))
+        for listed, why in ((check.unsteady, UNSTEADY), (check.random, RANDOM)):
+            if listed:
+                rows.append((names, check.fed, ", ".join(listed), "not judged", ""))
+                notes[why] = None
+        notes |= dict.fromkeys(check.remarks)
     return table(
         "Exact passes, checked by running both graphs",
         ("passes", "inputs", "worst output", "max|a-b|/max|a|", "allowed"),
         rows,
-        "not judged: on these inputs rounding alone moves the output as far; "
-        "recorded frames (--frames) tell more"
-        if unsteady
-        else "",
+        "\n".join(notes),
         words=3,
     )

@@ -72,15 +72,32 @@ class FixShapes(Pass):
         return PassResult(model, count)
 
 
-def open_dimensions(model: ir.Model) -> tuple[str, ...]:
-    """Name the open dimensions of the inputs: their symbols, else ``input:axis``."""
-    names: dict[str, None] = {}
+def open_dimensions(model: ir.Model) -> dict[str, int]:
+    """Name the open dimensions of the inputs: their symbols, else ``input:axis``.
+
+    Returns:
+        Name -> the axis that it stands at, where at several the first of them.
+    """
+    names: dict[str, int] = {}
     for value in model.graph.inputs:
         for axis, dim in enumerate(value.shape or ()):
             if isinstance(dim, ir.SymbolicDim):
-                symbols = _symbols(dim) or (f"{value.name}:{axis}",)
-                names |= dict.fromkeys(symbols)
-    return tuple(names)
+                for name in _symbols(dim) or (f"{value.name}:{axis}",):
+                    names[name] = min(axis, names.get(name, axis))
+    return names
+
+
+def sized_inputs(model: ir.Model, sizes: Mapping[str, int]) -> ir.Model:
+    """Return a graph of nothing but the inputs of another, open dimensions sized."""
+    inputs = [
+        ir.Value(
+            name=each.name,
+            type=each.type,
+            shape=_sized(each.shape, sizes, f"{each.name}"),
+        )
+        for each in model.graph.inputs
+    ]
+    return ir.Model(ir.Graph(inputs, [], nodes=[]), ir_version=model.ir_version)
 
 
 def _fixed(model: ir.Model) -> dict[str, object]:

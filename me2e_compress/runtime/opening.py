@@ -63,7 +63,8 @@ def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
     if not unknown or provider.plugins:
         return None
     node = next(iter(unknown.values()))
-    return f"onnxruntime has no operator {', '.join(unknown)} (node {node.name!r})"
+    name = node.name or node.outputs[0].name
+    return f"onnxruntime has no operator {', '.join(unknown)} (node {name!r})"
 
 
 _INT8_STAYS = "session.qdqisint8allowed"

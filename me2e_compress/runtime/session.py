@@ -2,13 +2,12 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Literal, TypeAlias, cast
 
 import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
 
-from me2e_compress import rewrite
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Array, Frame
@@ -23,10 +22,10 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.recurrence import SessionPort, not_fed_back, recurrence
 
 __all__ = [
+    "Level",
     "Session",
     "SessionPort",
     "detached",
-    "evaluate_constants",
     "replay",
     "run_once",
 ]
@@ -51,13 +50,27 @@ _SHRINK = "memory.enable_memory_arena_shrinkage"
 _WEIGHTS_FILE = "session.optimized_model_external_initializers_file_name"
 
 
+Level: TypeAlias = Literal["none", "basic", "extended", "layout", "all"]
+"""How far onnxruntime optimizes a graph; each level does what those before it do."""
+
+_LEVELS: Mapping[Level, ort.GraphOptimizationLevel] = {
+    "none": ort.GraphOptimizationLevel.ORT_DISABLE_ALL,
+    "basic": ort.GraphOptimizationLevel.ORT_ENABLE_BASIC,
+    "extended": ort.GraphOptimizationLevel.ORT_ENABLE_EXTENDED,
+    "layout": ort.GraphOptimizationLevel.ORT_ENABLE_LAYOUT,
+    "all": ort.GraphOptimizationLevel.ORT_ENABLE_ALL,
+}
+_DEFAULT: Mapping[bool, Level] = {False: "none", True: "all"}
+
+
 class Session:
     """An onnxruntime session.
 
     Args:
         model: the graph, or the file that holds it.
         threads: threads within an operator; 0 lets onnxruntime take every core.
-        optimize: False runs the nodes exactly as they stand (``ORT_DISABLE_ALL``).
+        optimize: False runs the nodes exactly as they stand (``ORT_DISABLE_ALL``), as
+            the level ``none`` does; True goes to the last level.
         stock: True makes every optimization that onnxruntime makes elsewhere, those
             that the provider leaves out too.
         frugal: True runs nodes in the priority-based order, in which a reduction
@@ -88,7 +101,7 @@ class Session:
         model: ir.Model | Path,
         *,
         threads: int = 0,
-        optimize: bool = True,
+        optimize: bool | Level = True,
         stock: bool = False,
         frugal: bool = False,
         release: bool = False,
@@ -103,10 +116,8 @@ class Session:
         options.log_severity_level = 4
         # Idle threads that spin slow down whatever else runs on the machine.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        if not optimize:
-            options.graph_optimization_level = (
-                ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-            )
+        level: Level = optimize if isinstance(optimize, str) else _DEFAULT[optimize]
+        options.graph_optimization_level = _LEVELS[level]
         # One block for all tensors of a run: twice the memory on VAD-tiny, no gain.
         options.enable_mem_pattern = False
         if frugal:
@@ -268,28 +279,3 @@ def zeros(name: str, port: SessionPort) -> Array:
 
 def _line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array]:
-    """Compute constant values of a graph.
-
-    Args:
-        model: the graph; it stays as it is.
-        names: values that :func:`~me2e_compress.graph.nodes.constant_values` lists.
-
-    Raises:
-        GraphError: onnxruntime cannot compute them.
-        FramesError: one of them depends on an input after all.
-    """
-    if not names:
-        return {}
-    part = model.clone()
-    part.metadata_props.clear()  # it speaks of inputs and outputs that go
-    made = {str(each.name): each for node in part.graph for each in node.outputs}
-    part.graph.outputs.clear()
-    part.graph.outputs.extend(made[name] for name in names)
-    rewrite.sweep(part)
-    used = [value for value in part.graph.inputs if value.uses()]
-    part.graph.inputs.clear()
-    part.graph.inputs.extend(used)
-    return run_once(part, {})

@@ -11,8 +11,8 @@ from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import opset_of
 from me2e_compress.quantization.plan import Decision
+from me2e_compress.runtime.constants import evaluate_constants
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.session import evaluate_constants
 
 MIN_OPSET = 13
 """The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""

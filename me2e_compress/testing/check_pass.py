@@ -10,6 +10,7 @@ from me2e_compress.errors import Me2eError, VerificationError
 from me2e_compress.graph import provenance
 from me2e_compress.manager import equivalence
 from me2e_compress.manager.attempt import attempt
+from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.modules import map_of
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize
@@ -84,7 +85,6 @@ def _run(current: Pass, ready: ir.Model, context: Context) -> PassResult:
         raise found
     if graph.digest(ready) != before:
         raise VerificationError(f"{current.name} reached into a clone's source")
-    graph.infer_shapes(found.result.model)
     return found.result
 
 
@@ -97,7 +97,7 @@ def _check_exact(
             f"{current.name} is not idempotent: {second.changes} changes on a second"
             " run"
         )
-    inputs = equivalence.VerificationInputs.of(before, context.frames, context.seed, 2)
+    inputs = VerificationInputs.of(before, context.frames, context.seed, 2)
     found = equivalence.verify((current.name,), before, after, inputs)
     if not equivalence.passed(found):
         raise VerificationError(f"{current.name} moved the outputs: {found.errors}")

@@ -13,7 +13,7 @@ from me2e_compress import recipe as recipes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
-from me2e_compress.manager import PassManager
+from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context, Pass
@@ -63,7 +63,10 @@ class CompressOptions:
         method: how ranges are read from frames, or were for ``ranges``.
         module_map: preset or TOML file; None finds the preset.
         seed: of everything random.
-        verify_frames: frames that exact passes are checked on; 0 checks none.
+        verify_frames: frames that exact passes are checked on; 0 checks none, and the
+            verdict says so.
+        unproven: write the graph although a recipe of exact passes could not be
+            checked, since the graph does not run here.
         measure_frames: most frames that are kept out of calibration, to measure lossy
             passes on; 0 measures nothing and calibrates on all.
         floor: least SQNR of an output, in dB, without a warning.
@@ -86,6 +89,7 @@ class CompressOptions:
     module_map: str | Path | None = None
     seed: int = 0
     verify_frames: int = 2
+    unproven: bool = False
     measure_frames: int = 4
     floor: float = SQNR_FLOOR_DB
     allow_empty: bool = False
@@ -178,8 +182,8 @@ def compress(
         GraphError: no such model, or the output would harm an input.
         RecipeError: nothing to do, or options that do not fit the passes.
         FramesError: frames that do not fit the model.
-        PreconditionError: nothing became int8 although a pass quantizes; nothing is
-            written.
+        PreconditionError: nothing became int8 although a pass quantizes, or a recipe
+            of exact passes is not proven; nothing is written.
         ProviderError: the provider is not there.
         Me2eError: a pass refused the graph or broke.
     """
@@ -234,6 +238,7 @@ def compress_graph(
         passes, options.verify_frames, reproducers, frames_of.samples, first
     )
     report = manager.run(loaded, context, partial(listener.on_progress, "passes"))
+    _refuse_unproven(report, options)
     int8 = Int8Outcome.of(report, context)
     _refuse_empty(int8, options, listener)
     if report.lossy and frames_of.measured is not None:
@@ -261,6 +266,21 @@ def _split(
     saved = any(each.reads_ranges and not each.needs_frames for each in passes)
     most = options.measure_frames if lossy else 0
     return SplitFrames.of(recording, samples, most, saved=saved)
+
+
+def _refuse_unproven(report: Report, options: CompressOptions) -> None:
+    """Refuse to write what promises to be exact, and could not be run to prove it.
+
+    Who asked for no check gets none, and the verdict says so.
+    """
+    promised = all(step.exact for step in report.steps)
+    if not promised or options.unproven or not options.verify_frames:
+        return
+    for check in report.unproven:
+        raise PreconditionError(
+            f"not proven that {', '.join(check.passes)} left the outputs as they were:"
+            f" {check.unproven}; nothing is written, --unproven writes it nevertheless"
+        )
 
 
 def _refuse_empty(

@@ -22,15 +22,14 @@ def verdict(
     """Say in a line each what became int8, how far the outputs moved, and on what."""
     if int8 is not None:
         yield _int8_line(int8)
-    if loss is None:
-        yield from _exact_line(report)
-    elif loss.fidelity is None and loss.on == NOT_ASKED:
+    yield from _proof(report)
+    if loss is None or (loss.fidelity is None and loss.on == NOT_ASKED):
         return
-    elif loss.fidelity is None:
+    if loss.fidelity is None:
         yield f"fidelity: not measured ({loss.on})"
     else:
         yield fidelity_line(loss.fidelity, loss)
-    if loss is not None and loss.unsteady:
+    if loss.unsteady:
         yield (
             f"not judged: {', '.join(loss.unsteady)}: the graph itself, uncompressed,"
             f" falls to {_figures(loss)} when only its largest input is rounded to"
@@ -90,16 +89,24 @@ def _int8_line(int8: Int8Outcome) -> str:
     return said
 
 
-def _exact_line(report: Report) -> Iterator[str]:
+def _proof(report: Report) -> Iterator[str]:
+    """Say how far exact passes moved the outputs, and what of it is not proven."""
     judged = [
-        (error, check.inputs)
+        (check.errors[name], check.fed)
         for check in report.verifications
-        for name, error in check.errors.items()
-        if name not in check.unsteady
+        for name in check.judged
     ]
-    if judged:
+    if judged and not report.lossy:
         worst, inputs = max(judged)
         yield f"every output is the same within {worst:.1e} of its largest ({inputs})"
+    if not any(step.changes for step in report.steps):
+        yield "every output is the same: no pass changed anything"
+    for check in report.verifications:
+        if check.unproven is not None:
+            yield f"not proven: {', '.join(check.passes)}: {check.unproven}"
+        elif check.left_out:
+            yield f"not proven of every output: {check.left_out}"
+        yield from check.remarks
 
 
 def fidelity_line(found: Fidelity, loss: MeasuredLoss) -> str:

@@ -124,7 +124,7 @@ def inspected(
         total if total or not unknown else None,
         unknown,
         _uncounted(folded),
-        open_dimensions(loaded),
+        tuple(open_dimensions(loaded)),
         lowered(loaded),
         "; ".join(filter(None, (lacking_shapes(loaded), wrong))),
         fed_back,

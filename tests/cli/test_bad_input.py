@@ -224,21 +224,3 @@ def test_zeros_of_an_open_shape_are_refused(
     graph.save(model, files / "open.onnx")
     words = compress(files, model="open.onnx", passes="ablate-modules{drop=[occ]}")
     assert "zeros or a mean need a static one" in refused(*words)
-
-
-def test_an_operator_nobody_knows_is_carried_through(
-    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1]>\n'
-        "m (float[1,4] camera) => (float[1,4] plan) {"
-        ' ["/backbone/Identity"] a = Identity(camera)\n'
-        ' ["/occ_head/Rotate"] b = trt.plugins.Rotate<mode=1>(a)\n'
-        ' ["/plan_head/Neg"] plan = Neg(b) }'
-    )
-    graph.save(model, files / "plugin.onnx")
-    words = compress(files, model="plugin.onnx", passes="eliminate-redundant")
-    assert command(*words) == 0
-    left = [node.op_type for node in graph.load(files / "out.onnx").graph]
-    assert left == ["Rotate", "Neg"]
-    assert "not measured" in capsys.readouterr().out

@@ -191,3 +191,61 @@ class Halves(_Sample):
                 data = value.const_value.numpy() * np.float32(0.5)
                 value.const_value = ir.tensor(data, name=value.name)
         return PassResult(model, len(model.graph.initializers), ("halved",))
+
+
+@dataclass(frozen=True)
+class SwapsSizes(_Sample):
+    """Wrong where two open dimensions differ, and right where they are equal."""
+
+    name: ClassVar[str] = "swaps-sizes"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        shape = next(node for node in model.graph if node.op_type == "Shape")
+        if shape.inputs[0] is model.graph.inputs[1]:
+            return PassResult(model, 0)
+        shape.replace_input_with(0, model.graph.inputs[1])
+        provenance.inherit(shape, [shape], by=self.name)
+        return PassResult(model, 1)
+
+
+@dataclass(frozen=True)
+class RemovesDead(_Sample):
+    name: ClassVar[str] = "remove-dead"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        dead = [node for node in model.graph if node.op_type == "NoSuchOperator"]
+        model.graph.remove(dead, safe=True)
+        return PassResult(model, len(dead))
+
+
+@dataclass(frozen=True)
+class Leaves(_Sample):
+    """Writes an attribute or an axis that does not fit what a node reads."""
+
+    name: ClassVar[str] = "leaves"
+    axes: int = 0
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        axes = model.graph.initializers["axes"]
+        if axes.const_value is None or int(axes.const_value.numpy()[0]) == self.axes:
+            return PassResult(model, 0)
+        axes.const_value = ir.tensor(np.array([self.axes]), name="axes")
+        reader = next(iter(axes.consumers()))
+        provenance.inherit(reader, [reader], by=self.name)
+        return PassResult(model, 1)
+
+
+@dataclass(frozen=True)
+class SwapsTerms(_Sample):
+    """Right: a sum is the same in the other order."""
+
+    name: ClassVar[str] = "swaps-terms"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        epsilon, sums = model.graph.initializers["e"], 0
+        for node in model.graph:
+            if node.op_type == "Add" and node.inputs[0] is epsilon:
+                node.replace_input_with(0, node.inputs[1])
+                node.replace_input_with(1, epsilon)
+                sums += 1
+        return PassResult(model, sums)

@@ -6,14 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from me2e_compress.manager.equivalence import (
-    VerificationInputs,
-    errors,
-    passed,
-    relative,
-    tolerances,
-)
+from me2e_compress.manager.equivalence import passed
+from me2e_compress.manager.output_errors import errors, relative, tolerances
 from me2e_compress.manager.report import Verification
+from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.runtime.frames import Frame
 
 FLOATS = hnp.arrays(

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import onnx
 import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import ModuleMapError, PreconditionError, ProviderError
-from me2e_compress.manager.equivalence import relative
+from me2e_compress.manager.output_errors import relative
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.convert_float16 import ConvertFloat16
@@ -22,6 +23,7 @@ from me2e_compress.runtime.session import run_once
 from me2e_compress.testing import check_pass
 from tests.frames import record
 from tests.nets import MODULES, conv_attention, net
+from tests.passes.small import compute
 
 OPSET = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
 HALF, FLOAT = ir.DataType.FLOAT16, ir.DataType.FLOAT
@@ -311,6 +313,62 @@ def test_int8_takes_float16_scales_from_opset_19() -> None:
 
     assert half.graph.initializers["s"].dtype == HALF
     assert casts(half) == 2
+
+
+DEFAULTS = """<ir_version: 9, opset_import: ["" : 17]>
+d (float[2] x, bool seen, float[2] w = {1, 2}, float[2] v = {3, 4}, float[2] u = {5, 6})
+    => (float[2] y, float[2] z) {
+    a = Mul(x, w)
+    b = Add(a, v)
+    c = Exp(v)
+    z = Add(b, c)
+    y = If (seen) <then_branch = t () => (float[2] t) { t = Mul(b, u) },
+                   else_branch = e () => (float[2] e) { e = Neg(u) }>
+}"""
+
+
+@pytest.mark.parametrize("keep_io", [True, False])
+def test_an_input_and_its_default_are_of_one_type(*, keep_io: bool) -> None:
+    half = check_pass(ConvertFloat16(keep_io=keep_io), bare(DEFAULTS, {})).model
+    io = {value.name: value.dtype for value in half.graph.inputs}
+    x = np.array([1, 2], FLOAT.numpy() if keep_io else HALF.numpy())
+
+    onnx.checker.check_model(ir.to_proto(half), full_check=True)
+    y, z = compute(half, {"x": x, "seen": np.array(True)})
+
+    assert io["w"] == (FLOAT if keep_io else HALF)  # only float16 reads it
+    assert io["v"] == io["u"] == FLOAT  # so do an Exp, and a body
+    np.testing.assert_allclose(y, [20, 48], rtol=2e-3)
+    np.testing.assert_allclose(z, [4 + np.exp(3), 8 + np.exp(4)], rtol=2e-3)
+
+
+def test_a_default_that_float16_does_not_hold_stays_in_float32() -> None:
+    text = "m (float[2] x, float[2] c = {-1e9, 0}) => (float[2] y) { y = Add(x, c) }"
+
+    assert types_of(converted(text, keep_io=False)) == {"Add": "FLOAT"}
+
+
+@pytest.mark.parametrize("operator", ["EyeLike", "RandomNormalLike"])
+def test_what_is_made_like_an_input_keeps_its_type(operator: str) -> None:
+    half = converted(
+        f"m (float[2,2] x) => (float[2,2] y) {{ a = Relu(x)\n y = {operator}(a) }}"
+    )
+
+    assert types_of(half) == {"Relu": "FLOAT16", operator: "FLOAT"}
+    onnx.checker.check_model(ir.to_proto(half), full_check=True)
+
+
+def test_a_scale_stays_where_the_output_has_a_type_of_its_own() -> None:
+    text = """<ir_version: 10, opset_import: ["" : 23]>
+    q (float[4] x) => (float[4] y) <float s = {0.5}, int8 z = {0}> {
+        q = QuantizeLinear(x, s, z)
+        y = DequantizeLinear<output_dtype = 1>(q, s, z)
+    }"""
+    half = check_pass(ConvertFloat16(), bare(text, {})).model
+
+    assert types_of(half)["QuantizeLinear"] == "FLOAT16"
+    (y,) = compute(half, {"x": np.ones(4, np.float32)})
+    np.testing.assert_array_equal(y, np.ones(4, np.float32))
 
 
 def test_back_to_float32() -> None:

@@ -21,6 +21,9 @@ Output = Annotated[
 ]
 Passes = Annotated[str | None, typer.Option(help="a pipeline, as text; see above")]
 Verify = Annotated[int, typer.Option(min=0, help="frames to check exact passes on")]
+Unproven = Annotated[
+    bool, typer.Option("--unproven", help="write it although it does not run here")
+]
 Measure = Annotated[int, typer.Option(min=0, help="most frames kept to measure on")]
 Floor = Annotated[float, typer.Option(help="warn of an output below this SQNR, in dB")]
 AllowEmpty = Annotated[
@@ -44,6 +47,7 @@ def compress(
     module_map: given.ModuleMap = None,
     seed: given.Seed = 0,
     verify_frames: Verify = 2,
+    unproven: Unproven = False,
     measure_frames: Measure = 4,
     floor: Floor = SQNR_FLOOR_DB,
     allow_empty: AllowEmpty = False,
@@ -65,7 +69,7 @@ def compress(
         method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
         measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
         weight_only_gemv=weight_only_gemv, force=force, dims=sizes(set_dim or ()),
-        provider=provider_named(provider, plugins or ()),
+        unproven=unproven, provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
         do = compress_stack if is_stack(model) else workflow.compress

@@ -1,0 +1,134 @@
+"""Where onnxruntime's own optimizations change what a graph gives.
+
+It rewrites a graph when it opens it, at levels that do more and more; a rewrite that is
+wrong for a graph (there were some in every release) is not the fault of a pass.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+
+import onnx_ir as ir
+
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph.nodes import is_read
+from me2e_compress.manager.output_errors import errors, relative
+from me2e_compress.manager.verification_inputs import VerificationInputs
+from me2e_compress.rewrite import sweep
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.session import Level, Session
+
+LEVELS: tuple[Level, ...] = ("basic", "extended", "layout", "all")
+
+
+def disagreements(
+    graphs: Mapping[str, ir.Model],
+    outputs: Iterable[str],
+    allowed: Mapping[str, float],
+    inputs: VerificationInputs,
+) -> tuple[str, ...]:
+    """Say which graphs onnxruntime answers otherwise when it optimizes them, and where.
+
+    Args:
+        graphs: by what a sentence calls them.
+        outputs: those that are looked at.
+        allowed: by how much of its largest value an output may differ.
+        inputs: what the graphs are fed.
+
+    Returns:
+        A sentence for each graph and output: the first level, and the first node.
+    """
+    names = list(outputs)
+    return tuple(
+        sentence
+        for what, model in graphs.items()
+        for sentence in _of_graph(what, model, names, allowed, inputs)
+    )
+
+
+def _of_graph(
+    what: str,
+    model: ir.Model,
+    names: list[str],
+    allowed: Mapping[str, float],
+    inputs: VerificationInputs,
+) -> Iterator[str]:
+    plain, waiting = list(inputs.run(model, "none")), names
+    for level in LEVELS:
+        try:
+            gaps = errors(plain, inputs.run(model, level))
+        except GraphError:
+            yield f"onnxruntime cannot run the graph {what} at its level {level}"
+            return
+        for name in [each for each in waiting if gaps[each] > allowed[each]]:
+            waiting = [each for each in waiting if each != name]
+            node = _first_node(model, name, level, allowed[name], inputs)
+            where = "" if node is None else f", from node {node.name} ({node.op_type})"
+            yield (
+                f"onnxruntime gives another {name} of the graph {what} at its level"
+                f" {level} than without optimizations (off by {gaps[name]:.1e} of its"
+                f" largest){where}; judged without them"
+            )
+
+
+def _first_node(
+    model: ir.Model,
+    output: str,
+    level: Level,
+    allowed: float,
+    inputs: VerificationInputs,
+) -> ir.Node | None:
+    """Find the first node behind which a level differs, in log2 trials.
+
+    None where the difference does not show on one frame, or not of this output alone.
+    """
+    frame = inputs.frames[0]
+    session = Session(model, optimize="none", provider=inputs.provider)
+    feeds = {**frame.arrays, **session.first_state(frame.arrays)}
+    behind = _makers(model, output)
+
+    def differs(node: ir.Node) -> bool:
+        return _gap(_up_to(model, node), feeds, level, inputs) > allowed
+
+    if not behind or not differs(behind[-1]):
+        return None
+    good, bad = -1, len(behind) - 1
+    while bad - good > 1:
+        middle = (good + bad) // 2
+        good, bad = (good, middle) if differs(behind[middle]) else (middle, bad)
+    return behind[bad]
+
+
+def _makers(model: ir.Model, output: str) -> list[ir.Node]:
+    """List the nodes that an output is computed by, in order."""
+    last = {value.name: value.producer() for value in model.graph.outputs}[output]
+    found, waiting = set[ir.Node](), [last]
+    while waiting:
+        node = waiting.pop()
+        if node is not None and node not in found:
+            found.add(node)
+            waiting.extend(node.predecessors())
+    return [node for node in model.graph if node in found]
+
+
+def _up_to(model: ir.Model, node: ir.Node) -> ir.Model:
+    """Cut a graph off behind a node."""
+    part = model.clone()
+    part.metadata_props.clear()  # it speaks of outputs that go
+    names = {value.name for value in node.outputs if value.name and is_read(value)}
+    made = {value.name: value for each in part.graph for value in each.outputs}
+    part.graph.outputs.clear()
+    part.graph.outputs.extend(made[name] for name in sorted(filter(None, names)))
+    sweep(part)
+    return part
+
+
+def _gap(
+    part: ir.Model, feeds: Mapping[str, Array], level: Level, inputs: VerificationInputs
+) -> float:
+    try:
+        plain, optimized = (
+            Session(part, optimize=each, provider=inputs.provider).run(feeds)
+            for each in ("none", level)
+        )
+    except (GraphError, FramesError):
+        return 0.0  # an output of a type that cannot be compared, say
+    return max(relative(plain[name], optimized[name]) for name in plain)

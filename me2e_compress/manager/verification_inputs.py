@@ -1,0 +1,184 @@
+"""What two graphs are compared on: recorded frames, or seeded inputs of drawn sizes."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import onnx_ir as ir
+
+from me2e_compress.calibration.dataset import synthetic
+from me2e_compress.calibration.stream import Recording
+from me2e_compress.errors import FramesError, GraphError, PreconditionError
+from me2e_compress.graph.shapes import is_static, static_shape
+from me2e_compress.passes.fix_shapes import open_dimensions, sized_inputs
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import Level, Session, detached, replay
+
+NUDGE_ULPS = 4
+"""By how many units in the last place inputs are nudged."""
+
+TRIALS = 2
+"""At how many sizes a graph with open dimensions is run."""
+
+DISTINCT = (2, 3, 5, 7, 11, 13)
+"""Sizes that are all different: what mixes up two open dimensions shows."""
+
+EQUAL = (
+    *((2, 2), (3, 3), (1, 1)),
+    *(
+        (lead, size)
+        for size in (4, 8, 16, 32, 64, 128, 224, 256, 512)
+        for lead in (2, 1)
+    ),
+)
+"""Sizes of leading dimensions (batches), and of all others: where the graph wants some
+of them to be equal, or pictures that can be halved again and again."""
+
+MOST_ELEMENTS = 1 << 25
+"""Inputs of more numbers than this (128 MB) are not made up."""
+
+Outputs: TypeAlias = dict[str, npt.NDArray[np.generic]]
+Sizes: TypeAlias = Mapping[str, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class VerificationInputs:
+    """The inputs that two graphs are compared on.
+
+    Attributes:
+        frames: what is fed, in order.
+        kind: ``recorded`` or ``synthetic``.
+        provider: what runs both.
+        sizes: of open dimensions that were drawn, one scene of frames each.
+    """
+
+    frames: Sequence[Frame]
+    kind: str
+    provider: Provider = CPU
+    sizes: tuple[Sizes, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        model: ir.Model,
+        frames: Recording | None,
+        seed: int,
+        count: int,
+        successor: ir.Model | None = None,
+        provider: Provider = CPU,
+    ) -> "VerificationInputs":
+        """Take the first recorded frames, or make seeded inputs where none are given.
+
+        Open dimensions are given two sizes that the graph runs at, one after the other.
+
+        Args:
+            model: the graph.
+            frames: the recording; None makes inputs up.
+            seed: of those.
+            count: how many frames; of drawn sizes that many each.
+            successor: what passes made of the graph: where its inputs have the sizes
+                that the graph leaves open, those are taken.
+            provider: what runs the graphs.
+
+        Raises:
+            PreconditionError: none are given, and the inputs are of unknown rank or no
+                numbers, or the graph runs at no drawn size.
+            GraphError: onnxruntime cannot open the graph to try sizes.
+        """
+        if frames is not None:
+            chosen = [frames[i] for i in range(min(count, len(frames)))]
+            return cls(chosen, "recorded", provider)
+        shaped = model if successor is None or is_static(model) else successor
+        if open_dimensions(shaped):
+            scenes = _runnable_scenes(model, shaped, seed, count, provider)
+            made = [frame for _, scene in scenes for frame in scene]
+            sizes = tuple(sizes for sizes, _ in scenes)
+            return cls(made, "synthetic", provider, sizes)
+        return cls(
+            list(synthetic(shaped, seed=seed, count=count)), "synthetic", provider
+        )
+
+    def run(self, model: ir.Model, level: Level = "all") -> Iterator[Outputs]:
+        """Run a graph over the frames, recurrent state fed forward.
+
+        Args:
+            model: the graph.
+            level: how far onnxruntime optimizes it.
+
+        Yields:
+            The outputs of every frame, which are the caller's to keep.
+
+        Raises:
+            GraphError: onnxruntime cannot run it, or an output is no tensor.
+        """
+        session = Session(model, optimize=level, provider=self.provider)
+        for outputs in replay(session, self.frames):
+            for name, value in outputs.items():
+                if not isinstance(value, np.ndarray):
+                    raise GraphError(f"output {name} is no tensor: not compared")
+            yield detached(outputs)
+
+    def nudged(self, seed: int) -> "VerificationInputs":
+        """Move every float of the inputs by a few units in its last place."""
+        signs = np.random.default_rng(seed)
+        frames = [
+            dataclasses.replace(
+                frame, arrays={k: _nudge(v, signs) for k, v in frame.arrays.items()}
+            )
+            for frame in self.frames
+        ]
+        return dataclasses.replace(self, frames=frames)
+
+
+def _nudge(
+    values: npt.NDArray[np.generic], signs: np.random.Generator
+) -> npt.NDArray[np.generic]:
+    if values.dtype.kind != "f":
+        return values
+    moved = signs.choice((-NUDGE_ULPS, NUDGE_ULPS), values.shape)
+    return np.asarray(values + moved * np.spacing(values), values.dtype)
+
+
+def _runnable_scenes(
+    model: ir.Model, shaped: ir.Model, seed: int, count: int, provider: Provider
+) -> list[tuple[Sizes, list[Frame]]]:
+    """Find sizes that a graph runs at, and make a scene of frames of each."""
+    session, reason = Session(model, provider=provider), ""
+    found: list[tuple[Sizes, list[Frame]]] = []
+    for sizes in drawn_sizes(shaped):
+        inputs = sized_inputs(shaped, sizes)
+        made = [math.prod(static_shape(each) or ()) for each in inputs.graph.inputs]
+        if sum(made) > MOST_ELEMENTS:
+            continue
+        scene = list(synthetic(inputs, seed=seed + len(found), count=count))
+        try:
+            for _ in replay(session, scene):
+                pass  # to run is all that is asked
+        except (GraphError, FramesError) as error:
+            reason = reason or f" ({error})"
+            continue
+        found.append((sizes, scene))
+        if len(found) == TRIALS:
+            break
+    if not found:
+        names = ", ".join(open_dimensions(shaped))
+        raise PreconditionError(
+            f"the graph runs at none of the sizes that were tried for {names}{reason};"
+            " give frames instead, or sizes (--set-dim)"
+        )
+    return found
+
+
+def drawn_sizes(model: ir.Model) -> Iterator[Sizes]:
+    """Yield sizes of the open dimensions of a graph's inputs, the likeliest first."""
+    axes = open_dimensions(model)
+    for start in range(TRIALS):
+        sizes = itertools.islice(itertools.cycle(DISTINCT), start, None)
+        yield dict(zip(axes, sizes, strict=False))
+    for lead, other in EQUAL:
+        yield {name: other if axis else lead for name, axis in axes.items()}
