@@ -73,7 +73,7 @@ class FuseOperators(Pass):
             )
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Look at every GridSample of the graph and its bodies, dead code out of the way."""
+        """Look at every GridSample that is read, of the graph and its bodies."""
         if not any(map(_is_sampler, nodes_in(model.graph))):
             return PassResult(model, 0)
         opset, unread = opset_of(model), remove_dead(model.graph)
