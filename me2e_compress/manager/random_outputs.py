@@ -29,8 +29,8 @@ def _draws(node: ir.Node, model: ir.Model) -> bool:
     if node.op_type in DRAWS and node.domain == "":
         return "seed" not in node.attributes
     function = model.functions.get(node.op_identifier())
-    inside = [] if function is None else list(nodes_in(function))
-    return any(_draws(each, model) for each in (*inside, *_inside(node)))
+    bodies = bodies_of(node) if function is None else (function,)
+    return any(_draws(each, model) for body in bodies for each in body)
 
 
 def _read_by(node: ir.Node) -> Iterator[ir.Value]:

@@ -14,8 +14,8 @@ from me2e_compress.graph.shapes import INLINE_BYTES
 def check_shapes(name: str, before: ir.Model, after: ir.Model) -> None:
     """Infer strictly what each node gives that a pass made, changed or fed anew.
 
-    A node that contradicted itself before the pass is let pass, and so are nodes with
-    bodies, plugins, and those of whose inputs no type is known.
+    Where the maker of the same value contradicted itself before the pass, nothing is
+    said, nor of nodes with bodies, of plugins, and of nodes whose inputs have no type.
 
     Args:
         name: of the pass.
@@ -26,10 +26,10 @@ def check_shapes(name: str, before: ir.Model, after: ir.Model) -> None:
         VerificationError: a node refuses what it reads, or gives another shape or type
             than the graph says; the message names it.
     """
-    old = {node.name: node for node in nodes_in(before.graph)}
+    old = {each.name: node for node in nodes_in(before.graph) for each in node.outputs}
     opset = opset_of(after)
     for node in nodes_in(after.graph):
-        was = old.get(node.name)
+        was = old.get(node.outputs[0].name) if node.outputs else None
         if was is not None and _reads_alike(was, node) and is_same(was, node):
             continue
         reason = contradiction(node, opset)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, static_shape
+from me2e_compress.graph import array_of, rank_of
 from me2e_compress.rewrite import (
     Array,
     Facts,
@@ -144,7 +144,13 @@ def _is_layer(node: ir.Node) -> bool:
 
 
 def _is_float(match: Match, facts: Facts) -> bool:
-    return match.root.outputs[0].dtype in KINDS
+    return match.root.outputs[0].dtype in KINDS and _keeps_rank(match)
+
+
+def _keeps_rank(match: Match) -> bool:
+    """Return whether no constant has more axes than x: then the result has them too."""
+    rank = rank_of(match[X])
+    return rank is not None and rank == rank_of(match.root.outputs[0])
 
 
 def _swish(*, allowed: bool) -> Fusion:
@@ -206,8 +212,7 @@ def _bounds(match: Match) -> list[Array]:
 
 def _is_interval(match: Match, facts: Facts) -> bool:
     low, high = _bounds(match)
-    same = static_shape(match[X]) == static_shape(match.root.outputs[0])
-    return same and bool(np.less_equal(low, high))
+    return _keeps_rank(match) and bool(np.less_equal(low, high))
 
 
 def _put_clip(match: Match, kit: Kit) -> None:

@@ -7,7 +7,7 @@ Result:  LayerNormalization(x, scale, bias)
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, static_shape
+from me2e_compress.graph import array_of, rank_of, static_shape
 from me2e_compress.rewrite import (
     Facts,
     Fusion,
@@ -40,11 +40,12 @@ NORMALIZED = op("Div", CENTRED, op("Sqrt", op("Add", VARIANCE, EPSILON)))
 
 def _is_over_last_axes(match: Match, facts: Facts) -> bool:
     """Return whether all three means are over the same axes, the last ones."""
-    shape = match[X].shape
-    rank = len(shape) if shape is not None else 0
+    rank = rank_of(match[X]) or 0
     first, *others = [_axes(match.node(mean)) for mean in (VARIANCE, *MEANS)]
     if not rank or not first or others != [first, first]:
         return False
+    if rank_of(match.root.outputs[0]) != rank:
+        return False  # the epsilon has more axes
     last = list(range(rank - len(first), rank))
     return sorted(axis % rank for axis in first) == last
 
