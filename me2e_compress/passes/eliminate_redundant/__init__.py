@@ -154,10 +154,11 @@ class EliminateRedundant(Pass):
         tally["unread"] += remove_dead(model.graph)
         for _ in range(ROUNDS):
             before, branches = tally.total(), tally["branches"]
+            outputs = list(model.graph.outputs)
             for body in graphs_of(model.graph):
                 self._round(body, model.opset_imports, tally)
-            if tally["branches"] > branches:
-                infer_shapes(model)  # in a branch, less is known of what is around it
+            if tally["branches"] > branches or outputs != list(model.graph.outputs):
+                infer_shapes(model)  # in a branch less is known; of an output, more
             tally["unread"] += remove_dead(model.graph)
             if tally.total() == before:
                 break
