@@ -7,7 +7,7 @@ JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 # tests run side by side: threads of one would spin while the other's work
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup
 
-.PHONY: coverage demo docs test test-slow check check-mypy check-rest fix clean
+.PHONY: coverage demo docs nightly test test-slow check check-mypy check-rest fix clean
 
 demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
 	$(BIN)/me2e-compress demo -o $(OUT)
@@ -17,6 +17,9 @@ test: check  ## lint, types, layers, tests
 
 test-slow: $(VENV)/.test  ## what takes minutes: TensorRT-RTX builds of whole stacks, training killed and resumed, 2 GB
 	$(PYTEST) -m slow
+
+nightly: $(VENV)/.test  ## hours: exact passes on drawn graphs; resumes from out/nightly; FIRST=seed GRAPHS=count
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.exact --graphs $(or $(GRAPHS),20000) --jobs $(JOBS) --first $(or $(FIRST),0) --out $(OUT)/nightly
 
 coverage: $(VENV)/.test  ## the same tests, with branch coverage and its floor
 	$(PYTEST) --cov --cov-report=term:skip-covered

@@ -1,0 +1,227 @@
+"""A graph that grows node by node, its shapes and types known by construction."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+from onnx import helper, numpy_helper
+
+from tests.fuzz.exact.dims import Dim, elements, is_static
+from tests.fuzz.exact.values import (
+    LARGEST,
+    Array,
+    Attributes,
+    Shared,
+    TooLargeError,
+    Val,
+    port,
+)
+
+
+class Builder:
+    """Nodes, inputs and weights of one graph, or of a body within it.
+
+    Args:
+        shared: what it shares with the graphs around it.
+        outer: the values around it that it may capture.
+        around: who builds the graph around it.
+    """
+
+    def __init__(
+        self, shared: Shared, outer: Sequence[Val] = (), around: "Builder | None" = None
+    ) -> None:
+        self.shared, self.outer, self.around = shared, tuple(outer), around
+        self.rng, self.draws = shared.rng, shared.draws
+        self.opset, self.dtype = shared.opset, shared.dtype
+        self.nodes: list[onnx.NodeProto] = []
+        self.inputs: list[Val] = []
+        self.initializers: list[onnx.TensorProto] = []
+        self.values: list[Val] = []
+        self.weights: list[Val] = []
+        self.hidden: set[str] = set()
+        self.scope = "model"
+
+    # -- drawing ---------------------------------------------------------------
+
+    def chance(self, probability: float) -> bool:
+        return self.rng.random() < probability
+
+    @property
+    def is_double(self) -> bool:
+        return self.dtype == np.float64
+
+    def normal(self, shape: Sequence[int], scale: float = 1.0) -> Array:
+        return np.asarray(self.draws.normal(size=tuple(shape)) * scale, self.dtype)
+
+    def uniform(self, low: float, high: float, shape: Sequence[int]) -> Array:
+        return np.asarray(self.draws.uniform(low, high, tuple(shape)), self.dtype)
+
+    def fresh(self, hint: str) -> str:
+        return f"{hint}{next(self.shared.numbers)}"
+
+    # -- values ----------------------------------------------------------------
+
+    def input(self, shape: Sequence[Dim], dtype: np.dtype[Any] | None = None) -> Val:
+        """Add an input of the graph; a body captures one of the graph around it."""
+        if self.around is not None:
+            return self.around.input(shape, dtype)
+        value = Val(self.fresh("x"), tuple(shape), dtype or self.dtype)
+        self.inputs.append(value)
+        self.values.append(value)
+        return value
+
+    def const(self, array: npt.ArrayLike, *, plain: bool = False) -> Val:
+        """Add a constant: an initializer, or a node; ``plain`` asks for the first."""
+        held = np.asarray(array)
+        name = self.fresh("c")
+        if self.shared.named == "modules" and held.ndim > 1:
+            name = f"{self.scope}.{name}.weight"
+        value = Val(name, held.shape, held.dtype, held)
+        if plain or self.chance(0.7):
+            self.initializers.append(numpy_helper.from_array(held, name))
+        else:
+            tensor = numpy_helper.from_array(held)
+            self._add(helper.make_node("Constant", [], [name], value=tensor))
+        return value
+
+    def ints(self, *values: int) -> Val:
+        return self.const(np.array(values, np.int64))
+
+    def weight(self, shape: Sequence[int], scale: float | None = None) -> Val:
+        """Add a weight, or take one of that shape that is there already."""
+        wanted = tuple(shape)
+        known = [each for each in self.weights if each.shape == wanted]
+        if known and self.chance(0.2):
+            return self.rng.choice(known)
+        size = float(np.sqrt(max(1, int(np.prod(wanted[:-1])))))
+        made = self.const(self.normal(wanted, 1 / size if scale is None else scale))
+        self.weights.append(made)
+        return made
+
+    def op(
+        self,
+        kind: str,
+        inputs: Sequence[Val | None],
+        shape: Sequence[Dim],
+        attributes: Attributes | None = None,
+        *,
+        dtype: np.dtype[Any] | None = None,
+        domain: str = "",
+    ) -> Val:
+        """Add a node of one output; the output's type is that of the first input."""
+        first = next((each.dtype for each in inputs if each is not None), self.dtype)
+        value = Val(self.fresh("v"), tuple(shape), dtype or first)
+        self.emit(kind, inputs, [value], attributes, domain=domain)
+        return value
+
+    def emit(
+        self,
+        kind: str,
+        inputs: Sequence[Val | None],
+        outputs: Sequence[Val],
+        attributes: Attributes | None = None,
+        *,
+        domain: str = "",
+    ) -> None:
+        """Add a node whose outputs are made already."""
+        if any(elements(each.shape, 9) > LARGEST for each in outputs):
+            raise TooLargeError
+        read = ["" if each is None else each.name for each in inputs]
+        while read and not read[-1] and self.chance(0.8):
+            read.pop()
+        names = [each.name for each in outputs]
+        if domain:
+            self.shared.domains.setdefault(domain, 1)
+        node = helper.make_node(kind, read, names, domain=domain, **(attributes or {}))
+        self._add(node)
+        self.values.extend(each for each in outputs if each.name)
+
+    def _add(self, node: onnx.NodeProto) -> None:
+        if self.shared.named == "modules":
+            scope = self.scope.replace(".", "/")
+            node.name = f"/{scope}/{node.op_type}_{len(self.nodes)}"
+        elif self.shared.named == "plain":
+            node.name = self.fresh("n")
+        self.nodes.append(node)
+
+    # -- choosing what a motif reads -------------------------------------------
+
+    def floats(self) -> list[Val]:
+        """List what a motif may read, the latest last."""
+        return [
+            each
+            for each in (*self.outer, *self.values)
+            if each.dtype == self.dtype
+            and each.name not in self.hidden
+            and elements(each.shape) <= 1 << 16
+        ]
+
+    def hide(self, value: Val) -> Val:
+        """Keep other motifs from reading a value that is not finite."""
+        self.hidden.add(value.name)
+        return value
+
+    def pick(self, wanted: Callable[[Val], bool]) -> Val | None:
+        """Choose a value, the latest most often; None if there is none."""
+        found = [each for each in self.floats() if wanted(each)]
+        if not found:
+            return None
+        return found[-1] if self.chance(0.6) else self.rng.choice(found)
+
+    def rows(self, least: int = 2, most: int = 4) -> Val:
+        """Choose or make a value of rows: its last axis has a known size."""
+        found = self.pick(
+            lambda each: (
+                least <= each.rank <= most
+                and isinstance(each.shape[-1], int)
+                and 2 <= each.shape[-1] <= 64
+            )
+        )
+        return found or self.source(least, most)
+
+    def source(self, least: int = 2, most: int = 4) -> Val:
+        """Make an input of rows, or reshape one that has as many elements."""
+        rank = self.rng.randint(least, most)
+        middle = [self.rng.randint(1, 5) for _ in range(rank - 2)]
+        width = self.rng.choice((4, 6, 8, 12, 16))
+        shape: list[Dim] = [*middle, width]
+        first = self.shared.batch if self.chance(0.7) else self.rng.randint(1, 6)
+        return self.input([first, *shape])
+
+    def image(self) -> Val:
+        """Choose or make a value [B, C, H, W] with small C, H, W."""
+        found = self.pick(
+            lambda each: (
+                each.rank == 4
+                and is_static(each.shape[1:])
+                and elements(each.shape[2:]) <= 64
+                and elements(each.shape[1:2]) <= 24
+            )
+        )
+        if found is not None:
+            return found
+        first = self.shared.batch if self.chance(0.6) else self.rng.randint(1, 3)
+        size = self.rng.randint(2, 6)
+        return self.input([first, self.rng.choice((4, 6, 8)), size, size])
+
+    # -- bodies ----------------------------------------------------------------
+
+    def inner(self) -> "Builder":
+        """Begin a body that may capture what is here."""
+        body = Builder(self.shared, [*self.outer, *self.values], self)
+        body.weights, body.hidden = list(self.weights), set(self.hidden)
+        body.scope = self.scope
+        return body
+
+    def graph(self, outputs: Sequence[Val], name: str) -> onnx.GraphProto:
+        """Write the graph."""
+        made = helper.make_graph(
+            self.nodes,
+            name,
+            [port(each) for each in self.inputs],
+            [port(each) for each in outputs],
+            self.initializers,
+        )
+        return made

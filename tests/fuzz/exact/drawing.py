@@ -1,0 +1,108 @@
+"""A random graph: motifs of exporters, one reading what others gave."""
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+
+import onnx
+from onnx import helper
+
+from tests.fuzz.exact import values
+from tests.fuzz.exact.builder import Builder
+from tests.fuzz.exact.registry_of_motifs import MOTIFS
+from tests.fuzz.exact.values import Val
+
+IR_OF_OPSET = ((21, 10), (19, 9), (15, 8), (12, 7), (11, 6))
+"""The IR version that came with an opset."""
+
+MOST_NODES = 36
+"""No motif is begun beyond this."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """A graph and what it was made of."""
+
+    model: onnx.ModelProto
+    motifs: tuple[str, ...]
+
+
+def draw(seed: int) -> onnx.ModelProto:
+    """Draw a graph; the same seed gives the same bytes."""
+    return drawing(seed).model
+
+
+def drawing(seed: int) -> Drawing:
+    """Draw a graph and tell its motifs."""
+    b = Builder(values.shared(seed))
+    names = list(MOTIFS)
+    weights = [MOTIFS[name][1] for name in names]
+    for _ in range(b.rng.choice((1, 1, 2, 2, 3, 3, 4, 5))):
+        if len(b.nodes) > MOST_NODES:
+            break
+        (name,) = b.rng.choices(names, weights)
+        b.scope = b.rng.choice(values.SCOPES)
+        before = len(b.nodes)
+        with contextlib.suppress(values.TooLargeError):
+            MOTIFS[name][0](b)
+        if len(b.nodes) > before:
+            b.shared.motifs.append(name)
+    if not b.nodes:
+        MOTIFS["one-layer"][0](b)
+    return Drawing(_model(b), tuple(b.shared.motifs))
+
+
+def _outputs(b: Builder) -> list[Val]:
+    """Choose what is given: most of what nothing reads, and some that is read."""
+    read = {name for node in b.nodes for name in _read(node)}
+    made = [each for each in b.values if each not in b.inputs]
+    ends = [each for each in made if each.name not in read]
+    given = [each for each in ends if b.chance(0.9)] or ends[-1:]
+    given += [each for each in made if each.name in read and b.chance(0.06)]
+    if b.inputs and b.chance(0.04):
+        given.append(b.rng.choice(b.inputs))
+    if b.weights and b.chance(0.03):
+        given.append(b.rng.choice(b.weights))
+    return given
+
+
+def _read(node: onnx.NodeProto) -> Sequence[str]:
+    inner = [
+        name
+        for attribute in node.attribute
+        if attribute.type == onnx.AttributeProto.GRAPH
+        for each in attribute.g.node
+        for name in _read(each)
+    ]
+    return [*node.input, *inner]
+
+
+def _model(b: Builder) -> onnx.ModelProto:
+    graph = b.graph(_outputs(b), "drawn")
+    opset = b.opset
+    least = next(ir for since, ir in IR_OF_OPSET if opset >= since)
+    imports = [helper.make_opsetid("", opset)]
+    imports += [helper.make_opsetid(*each) for each in b.shared.domains.items()]
+    if b.shared.listed_weights:
+        _list_weights(b, graph)
+    if b.shared.functions:
+        least = max(least, 8)
+    version = max(least, b.rng.choice((least, 8, 9, 10)))
+    return helper.make_model(
+        graph,
+        opset_imports=imports,
+        ir_version=version,
+        functions=b.shared.functions,
+        producer_name="drawn",
+    )
+
+
+def _list_weights(b: Builder, graph: onnx.GraphProto) -> None:
+    """Name weights among the inputs too, as old exporters do."""
+    for tensor in graph.initializer:
+        if b.chance(0.8):
+            graph.input.append(
+                helper.make_tensor_value_info(
+                    tensor.name, tensor.data_type, list(tensor.dims)
+                )
+            )

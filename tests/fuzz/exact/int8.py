@@ -1,0 +1,193 @@
+"""What quantizing must keep: the graph loads and runs, and without its int8 is itself.
+
+For the target tensorrt, pairs of QuantizeLinear and DequantizeLinear on activations are
+taken out again, and every dequantized weight gives way to the float one, from which it
+may differ by half a step: what is left must compute what the graph did. For the target
+onnxruntime (and ``lower-int8``) weights are permuted, biases are integers and layers
+are rewritten, so there only names, shapes, types and finite numbers are checked; how
+close the numbers are is a matter of fidelity, not of this test.
+"""
+
+import dataclasses
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+import onnx_ir as ir
+from onnx import numpy_helper
+
+from me2e_compress import recipe
+from me2e_compress.errors import Me2eError, PassError, VerificationError
+from me2e_compress.manager.pass_manager import PassManager
+from me2e_compress.passes import Context
+from me2e_compress.runtime.frames import Frame
+from tests.fuzz.exact.findings import Judged
+from tests.fuzz.exact.judging import Case, Verdict
+from tests.fuzz.exact.module_map import MODULES, modules_of
+from tests.fuzz.exact.running import Arrays, RefusedError, Runner, drawn_inputs
+from tests.fuzz.exact.stripping import StrippingError, stripped
+
+METHODS = ("max-min", "moving-average:0.5", "percentile:99.9", "mse", "entropy")
+SCHEMES = ("full", "full", "feature-ext", "prediction")
+RULES = ("paper", "paper", "safe")
+EACH = 2
+"""How many ways a graph is quantized."""
+
+FRAMES = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Held:
+    """A recording in memory."""
+
+    arrays: Sequence[Arrays]
+    fingerprint: str
+
+    @property
+    def scenes(self) -> Sequence[int]:
+        return (0,)
+
+    @property
+    def places(self) -> Sequence[int]:
+        return range(len(self.arrays))
+
+    def __len__(self) -> int:
+        return len(self.arrays)
+
+    def __getitem__(self, index: int) -> Frame:
+        return Frame(index, index == 0, dict(self.arrays[index]))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[index] for index in range(len(self)))
+
+
+def ways(seed: int, *, named: bool) -> Iterator[tuple[str, str]]:
+    """Draw how a graph is quantized: a label and a pipeline, one for each target.
+
+    Args:
+        seed: of the drawing.
+        named: whether the graph has modules, by which schemes go.
+    """
+    draw = random.Random(seed)
+    for target in ("tensorrt", "onnxruntime", "lowered"):
+        for _ in range(EACH):
+            options = {
+                "scheme": draw.choice(SCHEMES) if named else "full",
+                "method": draw.choice(METHODS),
+                "rules": draw.choice(RULES),
+                "weight_only_gemv": draw.choice(("true", "false")),
+                "target": "onnxruntime" if target == "onnxruntime" else "tensorrt",
+            }
+            given = ", ".join(f"{key}={value}" for key, value in options.items())
+            text = f"quantize-int8{{{given}}}"
+            if target == "lowered":
+                text += ", lower-int8"
+            yield f"int8 {target}", text
+
+
+def judged(seed: int, model: onnx.ModelProto) -> Iterator[Judged]:
+    """Judge a drawn graph by all of these."""
+    try:
+        case = Case(model, seed)
+    except RefusedError:
+        return
+    named = modules_of(model) is MODULES
+    for label, text in ways(seed, named=named):
+        yield Judged(label, judge_int8(case, text, seed))
+
+
+def judge_int8(case: Case, pipeline: str, seed: int) -> Verdict:
+    """Fold constants, quantize, and hold the result to what the module says."""
+    runner = case.answers.runner
+    size = case.sizes[0]
+    fed = [drawn_inputs(runner, seed + turn, size) for turn in range(FRAMES)]
+    context = dataclasses.replace(
+        case.context, frames=Held(fed, f"drawn-{seed}-{size}"), measured={}
+    )
+    try:
+        base = _run("fold-constants", case.imported, context)
+        after = _run(pipeline, base, context)
+    except (PassError, VerificationError) as error:
+        return Verdict("crash", pipeline, str(error))
+    except Me2eError as error:
+        return Verdict("refused", pipeline, str(error))
+    except Exception as error:  # the judge must outlive whatever is raised
+        return Verdict("crash", pipeline, f"{type(error).__name__}: {error}")
+    return _verdict(case, pipeline, base, after)
+
+
+def _run(pipeline: str, model: ir.Model, context: Context) -> ir.Model:
+    passes = recipe.parse(pipeline)
+    return PassManager(passes, verify_frames=0).run(model, context).model
+
+
+def _verdict(case: Case, pipeline: str, base: ir.Model, after: ir.Model) -> Verdict:
+    written = ir.to_proto(after)
+    if not any(node.op_type == "DequantizeLinear" for node in written.graph.node):
+        return Verdict("unchanged", pipeline)
+    try:
+        onnx.checker.check_model(written)
+        found = Runner(written).run(case.answers.feeds[0])
+    except (RefusedError, onnx.checker.ValidationError) as error:
+        return Verdict("does-not-load", pipeline, str(error))
+    if said := _unlike(case.answers.values[0], found):
+        return Verdict("wrong", pipeline, said)
+    if "target=tensorrt" not in pipeline or "lower-int8" in pipeline:
+        return Verdict("right", pipeline)
+    return _without_int8(case, pipeline, written, _weights(ir.to_proto(base)))
+
+
+def _weights(model: onnx.ModelProto) -> list[npt.NDArray[Any]]:
+    """List the constants of a graph: a node holds one that is an output as well."""
+    nodes = [
+        attribute.t
+        for node in model.graph.node
+        if node.op_type == "Constant"
+        for attribute in node.attribute
+        if attribute.name == "value"
+    ]
+    return [numpy_helper.to_array(each) for each in (*model.graph.initializer, *nodes)]
+
+
+def _without_int8(
+    case: Case,
+    pipeline: str,
+    written: onnx.ModelProto,
+    weights: Sequence[npt.NDArray[Any]],
+) -> Verdict:
+    """Take int8 out again and compare with the graph as drawn."""
+    try:
+        plain = stripped(written, weights)
+    except StrippingError as error:
+        return Verdict("wrong", pipeline, str(error))
+    try:
+        answers = Runner(plain).run(case.answers.feeds[0])
+    except RefusedError as error:
+        return Verdict("does-not-load", pipeline, f"without int8: {error}")
+    gaps = case.answers.off(0, answers)
+    if not gaps:
+        return Verdict("right", pipeline)
+    steady = case.answers.is_steady(0, gaps)
+    said = f"without int8 it is off by {max(gaps.values()):.3g}"
+    return Verdict("wrong" if steady else "unstable", pipeline, said)
+
+
+def _unlike(
+    wanted: Mapping[str, npt.NDArray[Any]], found: Mapping[str, npt.NDArray[Any]]
+) -> str:
+    """Say what is wrong with the form of the outputs; empty if nothing is."""
+    if list(wanted) != list(found):
+        return f"outputs {list(wanted)} became {list(found)}"
+    for name, value in wanted.items():
+        other = found[name]
+        if (value.shape, value.dtype) != (other.shape, other.dtype):
+            return (
+                f"{name} {value.dtype}{value.shape} became {other.dtype}{other.shape}"
+            )
+        whole = value.dtype.kind == "f" and np.isfinite(value).all()
+        if whole and not np.isfinite(other).all():
+            return f"{name} is no longer finite"
+    return ""

@@ -1,0 +1,155 @@
+"""What ONNX allows and passes forget: twins, views, empty inputs, odd constants."""
+
+import math
+
+import numpy as np
+
+from tests.fuzz.exact import spelling as sp
+from tests.fuzz.exact.builder import Builder
+from tests.fuzz.exact.dims import is_static, sizes
+from tests.fuzz.exact.values import BOOL, INT64, Val
+
+
+def no_ops(b: Builder) -> None:
+    """Identity, Dropout, casts to the same type, a Pad of nothing, a full slice."""
+    x = b.rows(1, 4)
+    for _ in range(b.rng.randint(1, 3)):
+        kind = b.rng.randint(0, 6)
+        if kind == 0:
+            x = b.op("Identity", [x], x.shape)
+        elif kind == 1:
+            more = [] if b.chance(0.5) or b.opset < 12 else [sp_ratio(b)]
+            x = b.op("Dropout", [x, *more], x.shape)
+        elif kind == 2:
+            to = 11 if b.is_double else 1
+            x = b.op("Cast", [x], x.shape, {"to": to})
+        elif kind == 3:
+            x = sp.slice_(b, x, x.rank - 1, 0, x.width)
+        elif kind == 4:
+            x = sp.reshape(b, x, x.shape)
+        elif kind == 5:
+            x = sp.transpose(b, x, range(x.rank))
+        else:
+            x = sp.concat(b, [x], x.rank - 1)
+    if b.chance(0.6):
+        sp.unary(b, x)
+
+
+def sp_ratio(b: Builder) -> Val:
+    return b.const(np.float32(0.5))
+
+
+def pairs(b: Builder) -> None:
+    """Transposes and views in a row, which cancel or merge."""
+    x = b.rows(2, 4)
+    for _ in range(b.rng.randint(2, 4)):
+        kind = b.rng.random()
+        if kind < 0.5:
+            order = list(range(x.rank))
+            b.rng.shuffle(order)
+            x = sp.transpose(b, x, order)
+        elif kind < 0.7:
+            flat = sp.flatten(b, x, b.rng.randint(0, x.rank))
+            x = sp.reshape(b, flat, x.shape) if b.chance(0.6) else flat
+        elif x.rank < 5:
+            x = sp.unsqueeze(b, x, b.rng.randint(0, x.rank))
+        if b.chance(0.15):
+            sp.unary(b, x)
+    ones = [axis for axis, dim in enumerate(x.shape) if dim == 1]
+    if ones and b.chance(0.6):
+        sp.squeeze(b, x, b.rng.choice(ones))
+
+
+def twins(b: Builder) -> None:
+    """Equal subexpressions, their operands swapped at times."""
+    x = b.rows(2, 4)
+    number = b.normal((x.width,))
+    made = []
+    for _ in range(b.rng.randint(2, 3)):
+        other = b.const(number)
+        pair = [x, other] if b.chance(0.5) else [other, x]
+        y = sp.binary(b, b.rng.choice(("Add", "Mul", "Max", "Sub")), *pair)
+        made.append(b.op("Tanh", [y], y.shape) if b.chance(0.7) else y)
+    if b.chance(0.6):
+        sp.binary(b, "Sub", made[0], made[1])
+
+
+def empty_inputs(b: Builder) -> None:
+    """Optional inputs that are left out in the middle."""
+    x = b.rows(1, 4)
+    low, high = b.rng.choice(((None, 0.7), (-0.7, None), (None, None), (-0.5, 0.5)))
+    y = sp.clip(b, x, low, high)
+    if b.chance(0.5):
+        y = sp.clip(b, y, b.rng.choice((None, -0.2)), b.rng.choice((None, 0.9)))
+    sp.unary(b, y)
+
+
+def odd_constants(b: Builder) -> None:
+    """Zeros of both signs, infinities and NaN, where they do not reach far."""
+    x = b.rows(1, 3)
+    kind = b.rng.randint(0, 4)
+    if kind == 0:
+        zero = sp.scalar(b, b.rng.choice((0.0, -0.0)))
+        if zero.rank <= x.rank:
+            y = sp.binary(b, b.rng.choice(("Add", "Sub", "Mul")), x, zero)
+            inverse = b.op("Reciprocal", [y], y.shape) if b.chance(0.3) else y
+            b.hide(inverse)
+    elif kind == 1:
+        bound = sp.scalar(b, b.rng.choice((math.inf, -math.inf)), 0)
+        y = sp.binary(b, b.rng.choice(("Min", "Max")), x, bound)
+        b.op("Tanh", [b.hide(y)], y.shape)
+    elif kind == 2:
+        chosen = b.const(np.asarray(b.draws.random((x.width,)) < 0.8))
+        other = sp.scalar(b, b.rng.choice((math.nan, math.inf, 0.0)), 0)
+        y = b.op("Where", [chosen, x, other], x.shape, dtype=b.dtype)
+        if not np.all(np.isfinite(other.array if other.array is not None else 0)):
+            sp.unary(b, b.hide(y), "Neg")
+            b.hide(b.values[-1])
+    elif kind == 3:
+        one = b.const(np.full((1,) * b.rng.randint(1, 3), 2.0, b.dtype))
+        turned = sp.transpose(b, one, range(one.rank))
+        if one.rank <= x.rank:
+            y = sp.binary(b, b.rng.choice(("Mul", "Div")), x, turned)
+            if y.rank >= 2:
+                sp.matmul(b, y, b.weight((x.width, 4)))
+    else:
+        least = b.op("Greater", [x, sp.scalar(b, 0.0, 0)], x.shape, dtype=BOOL)
+        other = sp.binary(b, "Mul", x, sp.scalar(b, 0.1, 0))
+        b.op("Where", [least, x, other], x.shape, dtype=b.dtype)
+
+
+def nothing_at_all(b: Builder) -> None:
+    """A value with no elements, joined to one that has some."""
+    x = b.rows(2, 3)
+    if not is_static(x.shape):
+        return
+    shape = list(sizes(x.shape))
+    shape[-1] = 0
+    empty = b.const(np.zeros(shape, b.dtype))
+    if b.chance(0.5):
+        empty = sp.slice_(b, x, x.rank - 1, 0, 0)
+    both = sp.concat(b, [x, empty], x.rank - 1)
+    sp.unary(b, both)
+
+
+def indices(b: Builder) -> None:
+    """The largest of every row, and a choice of some by it."""
+    x = b.rows(2, 3)
+    keep = b.rng.randint(0, 1)
+    attributes = {"axis": -1, "keepdims": keep}
+    shape = (*x.shape[:-1], 1) if keep else x.shape[:-1]
+    best = b.op("ArgMax", [x], shape, attributes, dtype=INT64)
+    if keep:
+        attributes = {"axis": -1}
+        b.op("GatherElements", [x, best], best.shape, attributes, dtype=b.dtype)
+
+
+def branches(b: Builder) -> None:
+    """A split whose parts are joined in another order, or one of them unread."""
+    x = b.rows(2, 4)
+    cut = b.rng.randint(1, x.width - 1)
+    first, second = sp.split(b, x, x.rank - 1, [cut, x.width - cut])
+    if b.chance(0.3):
+        first = sp.unary(b, first)
+    if b.chance(0.7):
+        sp.concat(b, [second, first] if b.chance(0.5) else [first, second], x.rank - 1)

@@ -1,0 +1,138 @@
+"""The tester can fail: passes that are wrong on purpose are caught, and shrunk."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import ClassVar
+
+import onnx
+import onnx.parser
+import onnx_ir as ir
+import pytest
+from numpy import array, float32
+
+from me2e_compress.graph import provenance
+from me2e_compress.passes import Context, Pass, PassResult
+from tests.fuzz.exact.judging import Case, Kind, judge
+from tests.fuzz.exact.nightly import CHUNK, Tally, digest_of_code, run
+from tests.fuzz.exact.shrinking import shrink
+from tests.fuzz.exact.stripping import StrippingError, stripped
+from tests.fuzz.exact.texts import as_text
+
+TEXT = """
+<ir_version: 8, opset_import: ["" : 17]>
+g (float[4,6] x, float[4,6] y, bool c) => (float[4,6] z, float[6] w) {
+    a = Add(x, y)  b = Relu(a)  d = Mul(b, y)  e = Softmax(d)  f = Tanh(e)
+    h = Neg(f)  i = Add(h, x)
+    j = If(c) <
+        then_branch = yes () => (float[4,6] u) { n = Exp(e)  u = Sub(n, i) },
+        else_branch = no () => (float[4,6] v) { v = Sin(i) }>
+    k = Abs(j)  z = Sqrt(k)  l = Sigmoid(y)  w = ReduceSum<keepdims = 0>(l, axis)
+}
+""".replace("bool c)", "bool c, float[6] unread)").replace(
+    "=> (float[4,6] z, float[6] w)",
+    "=> (float[4,6] z, float[6] w)\n<int64[1] axis = {0}>",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Faulty(Pass):
+    """Do to every Tanh what no exact pass may.
+
+    Attributes:
+        how: ``wrong`` takes a Sigmoid, ``crash`` raises, ``nowhere`` takes an operator
+            that there is not, ``again`` swaps what the Adds read on every run.
+    """
+
+    name: ClassVar[str] = "faulty"
+    exact: ClassVar[bool] = True
+    how: str = "wrong"
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        kind = "Add" if self.how == "again" else "Tanh"
+        found = [node for node in model.graph if node.op_type == kind]
+        for node in found:
+            if self.how == "crash":
+                raise KeyError(node.name)
+            if self.how == "again":
+                one, other = node.inputs
+                node.replace_input_with(0, other)
+                node.replace_input_with(1, one)
+            else:
+                node.op_type = "Sigmoid" if self.how == "wrong" else "NoSuchOperator"
+            provenance.inherit(node, [node], by=self.name)
+        return PassResult(model, len(found))
+
+
+def kind_of(model: onnx.ModelProto, how: str) -> Kind:
+    return Case(model).judge_passes([Faulty(how)], how).kind
+
+
+@pytest.mark.parametrize(
+    ("how", "kind"),
+    [
+        ("wrong", "wrong"),
+        ("crash", "crash"),
+        ("nowhere", "does-not-load"),
+        ("again", "changes-again"),
+    ],
+)
+def test_a_pass_that_is_wrong_is_caught_and_shrunk(how: str, kind: Kind) -> None:
+    model = onnx.parser.parse_model(TEXT)
+    assert kind_of(model, how) == kind
+    small = shrink(model, lambda part: safe_kind(part, how) == kind)
+    assert len(small.graph.node) <= 2
+    again = onnx.parser.parse_model(as_text(small))
+    assert kind_of(again, how) == kind
+
+
+def safe_kind(model: onnx.ModelProto, how: str) -> Kind:
+    """Judge a candidate, which may not run at all."""
+    if judge(model, "eliminate-redundant").kind == "invalid-draw":
+        return "invalid-draw"
+    return kind_of(model, how)
+
+
+def test_what_does_not_run_is_an_invalid_draw() -> None:
+    model = onnx.parser.parse_model(TEXT)
+    model.graph.node[0].op_type = "NoSuchOperator"
+    assert judge(model, "fold-constants").kind == "invalid-draw"
+
+
+def test_what_rounding_moves_as_far_is_unstable() -> None:
+    """A Floor of what is nearly whole: a sum in another order may fall below it."""
+    text = """<ir_version: 8, opset_import: ["" : 17]>
+    g (float[4] x) => (float[4] y) <float one = {1}, float[4] a = {3, 7, 0.1, 9}> {
+        s = Div(x, x)  t = Mul(s, a)  u = Tanh(t)  v = Div(t, t)
+        w = Sub(v, one)  r = Sign(w)  y = Add(r, u)
+    }"""
+    verdict = judge(onnx.parser.parse_model(text), "fuse-basic")
+    assert verdict.kind in ("right", "unchanged", "unstable")
+
+
+def test_a_weight_that_is_off_by_a_step_is_told() -> None:
+    text = """<ir_version: 8, opset_import: ["" : 17]>
+    g (float[1,2] x) => (float[1,2] y)
+    <int8[2,2] w = {1, 2, 3, 127}, float s = {0.5}> {
+        f = DequantizeLinear(w, s)  y = MatMul(x, f)
+    }"""
+    model = onnx.parser.parse_model(text)
+    good = array([[0.6, 1.1], [1.3, 63.5]], float32)
+    assert [n.op_type for n in stripped(model, [good]).graph.node] == [
+        "Identity", "MatMul"
+    ]  # fmt: skip
+    bad = array([[1.0, 1.1], [1.3, 63.5]], float32)
+    with pytest.raises(StrippingError, match="1 steps off"):
+        stripped(model, [bad])
+
+
+def test_a_run_that_was_killed_goes_on(tmp_path: Path) -> None:
+    """A line of other code, and one that is cut short, count for nothing."""
+    path = tmp_path / "exact.jsonl"
+    kinds = {"recipe exact": {"right": CHUNK - 1, "wrong": 1}}
+    done = Tally(0, digest_of_code(), CHUNK, kinds)
+    old = Tally(0, "another", CHUNK, kinds)
+    lines = [json.dumps(dataclasses.asdict(each)) for each in (old, done)]
+    path.write_text("\n".join([*lines, lines[1][:40]]))
+    total = run(path, 0, CHUNK, 1, lambda chunk, all_: pytest.fail("judged again"))
+    assert (total.graphs, total.bad) == (CHUNK, 1)
