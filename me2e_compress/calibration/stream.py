@@ -9,6 +9,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
+import onnx_ir.passes.common as common
 
 from me2e_compress.calibration.probes import Probe
 from me2e_compress.errors import GraphError
@@ -113,6 +114,7 @@ def probed_session(
         path = Path(folder) / "optimized.onnx"
         Session(probed, threads=1, rewritten=path, provider=provider)
         rewritten = ir.load(path)
+        common.NameFixPass()(rewritten)  # its fusions give one name to two values
         schedule_probes(rewritten)
         scheduled = path.with_name("scheduled.onnx")
         ir.save(rewritten, scheduled)

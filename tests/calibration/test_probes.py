@@ -112,3 +112,27 @@ def test_histograms_are_those_of_numpy(tmp_path: Path, opset: int) -> None:
     expected, _ = np.histogram(together, BINS, (0, edge))
     np.testing.assert_array_equal(seen.counted(), [expected, expected])
     assert graph.digest(model) == seen.model
+
+
+def test_what_onnxruntime_names_twice_in_a_branch_is_still_measured() -> None:
+    # Its fusion of MatMul and Add gives a reshape one name, here and in the branch.
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 20]>\n'
+        """g (bool s, float[2,2,3,2] x) => (float[2,2,3,2] z)
+        <float[2] b = {1, 2}, float[2,2] w = {1, 2, 3, 4}> {
+            a = MatMul(x, w)
+            y = Add(b, a)
+            t = Tanh(y)
+            z = If (s) <
+                then_branch = one () => (float[2,2,3,2] v) <float[2] c = {1, 2}> {
+                    p = MatMul(t, w)
+                    v = Add(p, c)
+                },
+                else_branch = two () => (float[2,2,3,2] u) { u = Neg(t) }
+            >
+        }"""
+    )
+    session = probed_session(model, ["y"], Extremes(), threads=1, optimize=True)
+    feeds = {"s": np.array(True), "x": np.ones((2, 2, 3, 2), np.float32)}
+    low, high, _ = session.run(feeds, [READINGS])[READINGS].reshape(-1)
+    assert (low, high) == (5, 8)
