@@ -18,7 +18,7 @@ test: check  ## lint, types, layers, tests
 test-slow: $(VENV)/.test  ## what takes minutes: TensorRT-RTX builds of whole stacks, training killed and resumed, 2 GB
 	$(PYTEST) -m slow
 
-nightly: $(VENV)/.test  ## hours: exact passes on drawn graphs; resumes from out/nightly; FIRST=seed GRAPHS=count
+nightly: $(VENV)/.test  ## an hour: exact passes on 20,000 drawn graphs; resumes from out/nightly; FIRST=seed GRAPHS=count
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.exact --graphs $(or $(GRAPHS),20000) --jobs $(JOBS) --first $(or $(FIRST),0) --out $(OUT)/nightly
 
 coverage: $(VENV)/.test  ## the same tests, with branch coverage and its floor

@@ -1,4 +1,4 @@
-"""Many graphs, all pipelines: judged in chunks, each a line of a file when it is done.
+"""Many graphs, each judged by some pipelines in turn; a chunk is a line of a file.
 
 A run that is killed goes on where it was: chunks that stand in the file, judged by the
 same code, are not judged again.
@@ -20,12 +20,13 @@ from tests.fuzz.exact import int8
 from tests.fuzz.exact.drawing import drawing
 from tests.fuzz.exact.findings import Judged, judged, report, signature
 from tests.fuzz.exact.judging import BAD
-from tests.fuzz.exact.pipelines import for_graph
+from tests.fuzz.exact.pipelines import SLOW, for_graph
+from tests.fuzz.exact.rotation import LONG, some_for
 
 CHUNK = 25
 """Graphs of one line; a kill loses at most as many for each process."""
 
-INT8_EVERY = 5
+INT8_EVERY = 10
 """One graph of so many is quantized too."""
 
 Counts = dict[str, dict[str, int]]
@@ -86,7 +87,7 @@ class Tally:
 
 
 def judge_chunk(first: int, count: int) -> Tally:
-    """Judge some graphs by all pipelines; shrink one finding of each cause."""
+    """Judge some graphs; shrink one finding of each cause."""
     tally, known = Tally(first, digest_of_code()), set[tuple[str, str, str]]()
     for seed in range(first, first + count):
         drawn = drawing(seed)
@@ -109,7 +110,9 @@ def judge_chunk(first: int, count: int) -> Tally:
 
 def _verdicts(seed: int) -> Iterator[Judged]:
     drawn = drawing(seed)
-    yield from judged(seed, drawn, for_graph(drawn.model, seed))
+    slow = [each for each in for_graph(drawn.model, seed) if each.label in SLOW]
+    chosen = some_for(drawn.model, seed, LONG)
+    yield from judged(seed, drawn, (*chosen, *slow))
     if seed % INT8_EVERY == 0:
         yield from int8.judged(seed, drawn.model)
 

@@ -1,20 +1,28 @@
-"""Which pipelines a graph of the short test is judged by: each in its turn."""
+"""Which pipelines a graph is judged by: each in its turn."""
 
 import onnx
 
-from tests.fuzz.exact.pipelines import Pipeline, for_graph
+from tests.fuzz.exact.pipelines import RECIPES, SLOW, Pipeline, for_graph
 
-TAKEN = 7
-"""Pipelines for each graph."""
+SHORT, LONG = 7, 8
+"""Pipelines for each graph of the short test, and of a night."""
 
 
-def some_for(model: onnx.ModelProto, seed: int) -> tuple[Pipeline, ...]:
+def some_for(
+    model: onnx.ModelProto, seed: int, taken: int = SHORT
+) -> tuple[Pipeline, ...]:
     """Choose every n-th pipeline, beginning with another for every seed.
 
-    The recipe ``exact`` is among them always: it is what users run.
+    The recipes that ship are among them always: they are what users run.
+
+    Args:
+        model: the graph.
+        seed: of the graph.
+        taken: about how many besides the recipes.
     """
-    found = [each for each in for_graph(model, seed) if "onnxsim" not in each.text]
-    step = max(1, len(found) // TAKEN)
-    chosen = found[seed % step :: step]
-    whole = [each for each in found if each.label == "recipe exact"]
-    return tuple(dict.fromkeys((*chosen, *whole)))
+    found = for_graph(model, seed)
+    whole = {f"recipe {name}" for name in RECIPES[: None if taken > SHORT else 1]}
+    turns = [each for each in found if each.label not in (*whole, *SLOW)]
+    step = max(1, len(turns) // taken)
+    always = [each for each in found if each.label in whole]
+    return (*turns[seed % step :: step], *always)
