@@ -27,7 +27,7 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 from me2e_compress.recipe import to_text
 
-NOT_ASKED = "they were to be checked on 0 frames (--verify-frames)"
+NOT_ASKED = "no frame was asked for (--verify-frames 0)"
 
 Progress = Callable[[int, int, str], None]
 Stretch = list[tuple[Pass, ir.Model]]

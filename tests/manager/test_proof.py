@@ -96,7 +96,7 @@ def test_inputs_that_are_no_numbers_are_not_proven(context: Context) -> None:
 def test_what_is_checked_on_no_frame_is_not_proven(context: Context) -> None:
     (check,) = checks(MIXED, context, passes.Rounds(), frames=0)
     assert check.passes == ("import-normalize", "rounds")
-    assert check.unproven == "they were to be checked on 0 frames (--verify-frames)"
+    assert check.unproven == "no frame was asked for (--verify-frames 0)"
 
 
 def test_passes_before_a_graph_could_run_are_not_proven(context: Context) -> None:
