@@ -91,6 +91,9 @@ def _differences_note(found: Sequence[PairedDifference]) -> str:
             f", corrected for {len(found)} comparisons (Holm). The intervals are each "
             f"of 95 %: of {len(found)}, one in twenty would miss zero by chance."
         )
+    if found:
+        n, least = found[0].driving_score.n, found[0].smallest_shown
+        notes.append(f" {n} routes show no difference below {least:.1f} points.")
     alike = [each for each in found if not each.differ]
     if alike:
         routes, share = alike[0].driving_score.n, alike[0].unseen_percent

@@ -1,19 +1,10 @@
 """A comparison of two drivers in a few lines: size, time, plan, and the road."""
 
-import math
 from collections.abc import Iterator
 
-from me2e_compress.metrics.differences import PairedDifference
+from me2e_compress.metrics.differences import PairedDifference, shown_by
 from me2e_compress.study.outcome import StudyResult, VariantOutcome
 from me2e_compress.study.tables import number
-
-SCATTER = 12.0
-"""Standard deviation, points a route, of the driving score's paired difference between
-the driver that ships and its int8 forms on the 220 routes, decisions free: 11.2 to 12.9
-(``benchmarks/driver/schemes``)."""
-
-Z = 1.96
-"""Of a 95 % interval."""
 
 
 def verdict(outcome: StudyResult, name: str) -> Iterator[str]:
@@ -32,41 +23,20 @@ def verdict(outcome: StudyResult, name: str) -> Iterator[str]:
         yield _road(drive.difference, outcome)
 
 
-def smallest_shown(found: PairedDifference) -> float:
-    """Return the smallest difference that so many routes show, in points.
-
-    Half the width of the interval that the mean would have if routes scattered as
-    those of `SCATTER`, or of its own where that is wider: on few routes nothing may
-    differ by chance.
-    """
-    score = found.driving_score
-    usual = _shown_by(score.n)
-    if score.low is None or score.high is None:
-        return usual
-    return max(usual, (score.high - score.low) / 2)
-
-
-def _shown_by(routes: int) -> float:
-    return Z * SCATTER / math.sqrt(routes)
-
-
 def _road(found: PairedDifference, outcome: StudyResult) -> str:
     score = found.driving_score
     said = f"on the road: {number(score.value or 0.0, '+.1f')} points of driving score"
-    differs = False
     if score.low is not None and score.high is not None:
         low, high = (number(each, "+.1f") for each in (score.low, score.high))
         said += f" (95 %: {low} to {high})"
-        differs = not score.low <= 0 <= score.high
     routes, whole = score.n, outcome.coverage[1]
     if not found.differ:
         most = f"{found.unseen_percent:.0f} %"
         said += f"; 0 of {routes} routes differ, with 95 % at most {most} of all do"
-    shown = "a difference" if differs else "no difference shown"
-    limit = f"{routes} route{'s' * (routes > 1)} cannot show one below"
-    said += f": {shown}; {limit} {smallest_shown(found):.0f} points"
+    limit = f"{routes} route{'s' * (routes > 1)} cannot show a difference below"
+    said += f": {found.verdict}; {limit} {found.smallest_shown:.0f} points"
     if routes < whole:
-        said += f", all {whole} (--routes all) none below {_shown_by(whole):.1f}"
+        said += f", all {whole} (--routes all) none below {shown_by(whole):.1f}"
     return said
 
 

@@ -44,6 +44,18 @@ def test_where_nothing_differs_the_interval_is_what_may_be_unseen() -> None:
     assert found.differ == 0
 
 
+def test_four_routes_that_differ_alike_say_little_of_a_fifth() -> None:
+    worse = [drive(CRASH, route=name, completion=50.0) for name in "abcd"]
+
+    found = difference(worse, GOOD)
+
+    share = 1.0 - 0.05**0.25
+    low, high = -70.0 - share * 30.0, -70.0 + share * 170.0
+    score = found.driving_score
+    assert (score.low, score.high) == pytest.approx((low, high))
+    assert found.verdict == "no difference shown"
+
+
 def test_success_is_compared_by_mcnemars_exact_test() -> None:
     names = [str(i) for i in range(20)]
     one = [drive(*[CRASH] * (k < 1), route=name) for k, name in enumerate(names)]

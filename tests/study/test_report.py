@@ -136,7 +136,7 @@ def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
 
     assert list(told) == ["blind", "again", "fast"]
     assert told["again"].startswith(f"1.00 {TIMES} the size, ")
-    alike = f"ideal: driving score +0.0 points ({MINUS}77.6 to +77.6), no difference"
+    alike = f"ideal: driving score +0.0 points ({MINUS}77.6 to +77.6), too few"
     assert alike in told["again"]
     assert "size" not in told["blind"]
 

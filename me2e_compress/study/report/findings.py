@@ -62,7 +62,9 @@ def _road(drive: Drive, several: bool) -> str:
     if found.low is None or found.high is None:
         return f"{where}driving score {value} points on {found.n} route"
     low, high = (number(each, "+.1f") for each in (found.low, found.high))
-    return f"{where}driving score {value} points ({low} to {high}), {_verdict(found)}"
+    said = f"{where}driving score {value} points ({low} to {high})"
+    limit = f"{found.n} routes show none below {drive.difference.smallest_shown:.1f}"
+    return f"{said}, {drive.difference.verdict}; {limit}"
 
 
 def sure(found: Estimate) -> int:
@@ -75,7 +77,3 @@ def sure(found: Estimate) -> int:
     if found.high is not None and round(found.high, 1) < 0.0:
         return -1
     return 0
-
-
-def _verdict(found: Estimate) -> str:
-    return {1: "better", -1: "worse", 0: "no difference shown"}[sure(found)]
