@@ -7,6 +7,7 @@ without end, numbers of thousands of digits, lone surrogates, keys of thousands 
 
 import json
 import re
+import stat
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,8 +16,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
-LARGEST_BYTES = 256_000_000
-"""The largest text file that is read; a plan of 30,000 nodes has 15 MB."""
+LARGEST_BYTES = 64_000_000
+"""The largest document that is read; a plan of 30,000 nodes has 15 MB. Read, it may
+take thirty times as much memory."""
+LARGEST_LOG_BYTES = 256_000_000
+"""The largest file of documents that are read line by line."""
+LARGEST_TOML_BYTES = 4_000_000
+"""People write TOML, and Python reads a megabyte a second or less."""
 
 KEY_PARTS = 64
 """The most parts of a dotted TOML key."""
@@ -58,18 +64,31 @@ def reading(
         raise error(f"{path}: {otherwise}: {where}: {first['msg']}") from cause
 
 
-def content(path: Path) -> bytes:
+def check_regular(path: Path) -> None:
+    """Refuse what may never end as it is read.
+
+    Raises:
+        OSError: it is not there.
+        MalformedError: it is a folder, a device or a pipe.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        what = "it is a folder, " if path.is_dir() else ""
+        raise MalformedError(f"{what}not a regular file")
+
+
+def content(path: Path, most: int = LARGEST_BYTES) -> bytes:
     """Read a text file.
+
+    Args:
+        path: the file.
+        most: bytes that it may have.
 
     Raises:
         OSError: it is not there, or may not be read.
         MalformedError: it is a folder, a device or a pipe, or too large.
     """
-    about = path.stat()
-    if not path.is_file():
-        raise MalformedError("not a regular file")
-    if about.st_size > LARGEST_BYTES:
-        raise MalformedError(f"{about.st_size:,} bytes are too many for a text file")
+    check_regular(path)
+    _check_size(path.stat().st_size, most)
     return path.read_bytes()
 
 
@@ -101,6 +120,7 @@ def from_toml(text: bytes | str) -> dict[str, Any]:
         MalformedError: it is none.
     """
     try:
+        _check_size(len(text), LARGEST_TOML_BYTES)
         decoded = _decoded(text)
         _check_keys(decoded)
         return tomllib.loads(decoded)
@@ -108,6 +128,11 @@ def from_toml(text: bytes | str) -> dict[str, Any]:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
         raise MalformedError(_line(error)) from error
+
+
+def _check_size(size: int, most: int) -> None:
+    if size > most:
+        raise MalformedError(f"{size:,} bytes are too many: {most:,} may be")
 
 
 def _decoded(text: bytes | str) -> str:

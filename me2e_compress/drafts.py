@@ -7,11 +7,14 @@ a place is therefore told before: a later run knows it again, whichever came las
 import contextlib
 import os
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 _CLAIMED: dict[Path, Callable[[Path], None]] = {}
 """Who is told of a draft before it is put in a place."""
+_SETS: list[list[tuple[Path, Path]]] = []
+"""Of each open block: the places where something was put, and what was there."""
 
 
 @contextlib.contextmanager
@@ -46,14 +49,67 @@ def put(draft: Path, path: Path) -> None:
     if (told := _CLAIMED.get(_place(path))) is not None:
         told(draft)
     if not draft.is_dir():
+        _keep(path)
         os.replace(draft, path)
         return
-    aside = draft.with_name(f"{draft.name}.before")
-    shutil.rmtree(aside, ignore_errors=True)
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     if path.exists():  # a folder is renamed at once, and removed file by file
         os.replace(path, aside)
     os.replace(draft, path)
     shutil.rmtree(aside, ignore_errors=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file that a draft took the place of, if it is there."""
+    _keep(path)
+    path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def all_or_none() -> Iterator[None]:
+    """Take back the files that are put or removed in this block if an error leaves it.
+
+    What was there before is kept until its end, as a second link to the same file.
+    """
+    kept: list[tuple[Path, Path]] = []
+    _SETS.append(kept)
+    try:
+        yield
+    except BaseException:
+        for path, before in reversed(kept):
+            if os.path.lexists(before):
+                os.replace(before, path)
+            else:
+                path.unlink(missing_ok=True)
+        raise
+    finally:
+        _SETS.pop()
+        for _, before in kept:
+            shutil.rmtree(before.parent, ignore_errors=True)
+
+
+def _keep(path: Path) -> None:
+    """Keep what is in a place, if what happens there may be taken back."""
+    if not _SETS:
+        return
+    before = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent), path.name)
+    _SETS[-1].append((path, before))
+    if os.path.lexists(path):
+        try:
+            os.link(path, before, follow_symlinks=False)
+        except OSError:  # a file system without links
+            shutil.copy2(path, before, follow_symlinks=False)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let errors of the system name a file, not the draft of it, or nothing."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _place(path: Path) -> Path:

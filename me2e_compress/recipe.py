@@ -45,7 +45,7 @@ def load(name: str | Path) -> tuple[Pass, ...]:
         RecipeError: no such recipe, not TOML, or a pass or option nobody knows.
     """
     path, beside = Path(name), Path()
-    source: Path | Traversable = path
+    source: Traversable | None = None
     if path.is_file():
         beside = path.parent
     elif str(name) in shipped():
@@ -55,7 +55,9 @@ def load(name: str | Path) -> tuple[Pass, ...]:
             f"no recipe {name}: no such file; we ship {', '.join(shipped())}"
         )
     try:
-        content = documents.from_toml(source.read_bytes())
+        content = documents.from_toml(
+            documents.content(path) if source is None else source.read_bytes()
+        )
     except documents.MalformedError as error:
         raise RecipeError(f"{name} is not TOML: {error}") from error
     entries = content.get("pass")

@@ -9,6 +9,7 @@ from typing import IO
 
 import numpy as np
 
+from me2e_compress.documents import check_regular
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import UNREADABLE, Array
 
@@ -41,6 +42,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
             `LARGEST_BYTES`, or an array that is not as large as it says.
     """
     try:
+        check_regular(path)
         with path.open("rb") as source, zipfile.ZipFile(source) as archive:
             found = [_member(archive, each) for each in archive.infolist()]
     except UNREADABLE as error:

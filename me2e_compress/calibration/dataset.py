@@ -53,6 +53,8 @@ class CalibrationSet(Displayed):
         self.files = tuple(sorted(folder.glob("*.npz")))
         if not self.files:
             raise FramesError(f"{folder}: holds no .npz frames")
+        if odd := [each for each in self.files if not each.is_file()]:
+            raise FramesError(f"{odd[0]}: not a regular file")
         index = _index(folder / "scenes.json")
         self.scenes = _scenes(folder / "scenes.json", index, len(self.files))
         self.pixels = _pixels(folder / "scenes.json", index).inputs

@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 import pydantic
 
+from me2e_compress import documents
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.display import Displayed, Table, table
@@ -100,7 +101,9 @@ class Ranges(Displayed):
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
         try:
-            found = pydantic.TypeAdapter(cls).validate_json(path.read_bytes())
+            with documents.reading(path, FramesError, "not ranges"):
+                content = documents.content(path)
+            found = pydantic.TypeAdapter(cls).validate_json(content)
         except pydantic.ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"]) or "file"

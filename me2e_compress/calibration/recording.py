@@ -54,7 +54,7 @@ def write_recording(
     known what happened next, and ``scenes.json``, which says where scenes begin. A
     folder that holds an earlier recording of ours is replaced. The same frames give
     the same bytes. Whole scenes of a run that was killed wait beside the folder, and
-    the same run goes on from them.
+    the same run goes on from them, in a folder that only such a run fills.
 
     Args:
         folder: To write.
@@ -67,11 +67,12 @@ def write_recording(
         The folder.
 
     Raises:
-        FramesError: No frames, or the folder holds something else.
+        FramesError: No frames, or a folder holds something else.
     """
     _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = folder.with_name(f".{folder.name}.partial")
+    _check_replaceable(partial, PROGRESS)
     draft = _Draft(partial, _with_pixels(about, pixels or {}), key)
     try:
         for frame in source(draft.resume()):
@@ -80,6 +81,7 @@ def write_recording(
             raise FramesError(f"{folder}: there are no frames to write")
         draft.finish()
         drafts.put(draft.folder, folder)
+        (folder / PROGRESS).unlink()
     finally:
         if len(draft.scenes) < 2:  # nothing to go on from
             shutil.rmtree(draft.folder, ignore_errors=True)
@@ -117,6 +119,7 @@ class _Draft:
         if kept is None:
             shutil.rmtree(self.folder, ignore_errors=True)
             self.folder.mkdir()
+            (self.folder / PROGRESS).touch()  # from now on it is known as ours
             return Begin()
         scenes, places = kept
         self.scenes, self.places = scenes[:-1], places[:-1]
@@ -142,22 +145,27 @@ class _Draft:
             record = {"scenes": self.scenes, "places": self.places}
             write_json(self.folder / PROGRESS, {"key": self.key, **record})
         path = self._frame(self.count)
-        _write_npz(path, frame.arrays)
-        if frame.future is not None:
-            path.with_suffix(FUTURE).write_text(frame.future.model_dump_json() + "\n")
+        with drafts.naming(path):
+            _write_npz(path, frame.arrays)
+            if frame.future is not None:
+                text = frame.future.model_dump_json()
+                path.with_suffix(FUTURE).write_text(f"{text}\n")
         self.count += 1
 
     def finish(self) -> None:
         """Write the index: the folder is a recording now."""
         index = {"scenes": self.scenes, **self.about, "count": self.count}
-        (self.folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
-        (self.folder / PROGRESS).unlink()
+        with drafts.naming(self.folder / INDEX):
+            (self.folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
 
     def _frame(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
 
 
-def _check_replaceable(folder: Path) -> None:
+def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
+    """Refuse a folder that something else is in than frames, and the mark of ours."""
+    if folder.is_symlink() and mark == PROGRESS:
+        raise FramesError(f"{folder} is a link: frames that are unfinished go there")
     if not folder.exists():
         return
     if not folder.is_dir():
@@ -165,11 +173,12 @@ def _check_replaceable(folder: Path) -> None:
     names = sorted(path.name for path in folder.iterdir())
     if not names:
         return
-    if INDEX not in names:
+    if mark not in names:
         raise FramesError(f"{folder} is not empty, and no recording: it has {names[0]}")
     for name in names:
         number = name.removesuffix(FUTURE).removesuffix(".npz")
-        if name != INDEX and not (number != name and number.isdigit()):
+        ours = name in (INDEX, PROGRESS) or name.startswith(f".{PROGRESS}.")
+        if not ours and not (number != name and number.isdigit()):
             raise FramesError(f"{folder} holds frames but also {name}: not replaced")
 
 

@@ -1,9 +1,12 @@
 """The ``me2e-compress`` command, one short file each; the only room that prints."""
 
 import contextlib
+import os
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
+from threading import Timer
 from types import FrameType
 from typing import NoReturn
 
@@ -12,10 +15,18 @@ from me2e_compress.errors import Me2eError
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 """Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
-RESUMES = frozenset(
-    {"calibrate", "evaluate", "frames", "sensitivity", "study", "train"}
-)
-"""Commands that go on where they were interrupted."""
+_LOST: dict[type[BaseException], signal.Signals] = {
+    KeyboardInterrupt: signal.SIGINT,
+    SystemExit: signal.SIGTERM,
+}
+"""What signals raise, by what they are."""
+_MOMENT_S = 0.02
+_AGAIN = "run again to go on"
+RESUMES = {
+    **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study", "train"), _AGAIN),
+    "frames": f"{_AGAIN} after the last whole scene, if there is one",
+}
+"""Commands that go on where they were interrupted, and what to do for that."""
 
 
 def main() -> int:
@@ -33,8 +44,8 @@ def main() -> int:
         code = INTERRUPTED
     if code in (INTERRUPTED, TERMINATED):
         words = [word for word in sys.argv[1:] if not word.startswith("-")]
-        again = "; run again to go on" if RESUMES & set(words[:1]) else ""
-        sys.stderr.write(f"me2e-compress: interrupted{again}\n")
+        again = [RESUMES[word] for word in words[:1] if word in RESUMES]
+        sys.stderr.write(f"me2e-compress: {'; '.join(['interrupted', *again])}\n")
     return code
 
 
@@ -46,26 +57,58 @@ def _run() -> int:
 
     set_verbosity(Verbosity.NORMAL)
     try:
+        _check_place()
         app(standalone_mode=True, prog_name="me2e-compress")
     except (Me2eError, OSError, ImportError) as error:
         told = explained(error)
         if isinstance(told, ImportError):
             raise  # of no optional package: a defect of ours, which needs its traceback
-        line = printable(" ".join(str(told).split()))
+        line = printable(" ".join(_told(told).split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
         return 1
     return 0
 
 
+def _check_place() -> None:
+    """Refuse names that are not UTF-8, which no report can hold, or to be nowhere."""
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise Me2eError(f"the current folder: {error.strerror}") from error
+    for word in sys.argv[1:]:
+        if any("\ud800" <= each <= "\udfff" for each in word):
+            raise Me2eError(f"{word!a} is not UTF-8: rename the file")
+
+
+def _told(error: Exception) -> str:
+    """Return what an error says; one of the system names a file before it, if any."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    return str(error)
+
+
 @contextlib.contextmanager
 def _terminated_in_order() -> Iterator[None]:
-    """Make SIGTERM an exit like Ctrl-C: processes and drafts are cleared away."""
+    """Make SIGTERM an exit like Ctrl-C: processes and drafts are cleared away.
+
+    What is raised while Python clears something away, or in a callback of native code,
+    is lost. Python tells of it; the signal is then sent once more, a moment later.
+    """
 
     def leave(number: int, frame: FrameType | None) -> NoReturn:
         raise SystemExit(TERMINATED)
 
+    def again(lost: "sys.UnraisableHookArgs") -> None:
+        number = _LOST.get(lost.exc_type)
+        if number is None:
+            hook(lost)
+        else:
+            Timer(_MOMENT_S, os.kill, (os.getpid(), number)).start()
+
+    hook, sys.unraisablehook = sys.unraisablehook, again
     before = signal.signal(signal.SIGTERM, leave)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = hook

@@ -77,6 +77,10 @@ def _places(
         for attribute in node.attributes.values():
             if isinstance(attribute.value, ir.ExternalTensor):
                 yield attribute.value, _attribute_setter(node, attribute.name)
+            elif attribute.type == ir.AttributeType.TENSORS and not attribute.is_ref():
+                for at, tensor in enumerate(attribute.as_tensors()):
+                    if isinstance(tensor, ir.ExternalTensor):
+                        yield tensor, _item_setter(node, attribute.name, at)
 
 
 def _setter(value: ir.Value) -> Callable[[ir.TensorProtocol], None]:
@@ -89,6 +93,17 @@ def _setter(value: ir.Value) -> Callable[[ir.TensorProtocol], None]:
 def _attribute_setter(node: ir.Node, name: str) -> Callable[[ir.TensorProtocol], None]:
     def put(tensor: ir.TensorProtocol) -> None:
         node.attributes[name] = ir.AttrTensor(name, tensor)
+
+    return put
+
+
+def _item_setter(
+    node: ir.Node, name: str, at: int
+) -> Callable[[ir.TensorProtocol], None]:
+    def put(tensor: ir.TensorProtocol) -> None:
+        tensors = list(node.attributes[name].as_tensors())
+        tensors[at] = tensor
+        node.attributes[name] = ir.AttrTensors(name, tensors)
 
     return put
 

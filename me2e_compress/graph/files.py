@@ -1,6 +1,7 @@
 """Read and write ONNX files: weights mapped, outputs atomic, sources untouched."""
 
 import hashlib
+import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -103,13 +104,18 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     stored = list(external_tensors(model))
     names = data_names(path)
     for data in names:
-        if any(Path(tensor.path).resolve() == data.resolve() for tensor in stored):
+        if any(
+            os.path.realpath(data) == os.path.realpath(each.path) for each in stored
+        ):
             raise GraphError(f"{data}: holds the weights of the model being saved")
     earlier = _named_in(path, names)
     data = next(each for each in names if each not in earlier)
     if external is None:
         external = bool(stored) or _weight_bytes(model) > INLINE_LIMIT_BYTES
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder:
+    with (
+        drafts.naming(path),
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
+    ):
         draft = Path(folder) / path.name
         if external:
             ir.save(model, draft, format="protobuf", external_data=data.name)
@@ -121,7 +127,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
             drafts.put(draft_data, data)
         drafts.put(draft, path)
     for old in earlier:
-        old.unlink(missing_ok=True)
+        drafts.remove(old)
 
 
 def data_names(path: Path) -> tuple[Path, Path]:

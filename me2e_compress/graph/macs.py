@@ -19,6 +19,8 @@ _UNCOUNTED = frozenset(
 )  # fmt: skip
 """Operators of ONNX that multiply matrices, and that no rule here counts."""
 
+_LOOPS = ("Loop", "Scan")
+
 
 def macs(node: ir.Node) -> int | None:
     """Return a node's MACs: 0 for operators that multiply no matrices.
@@ -37,8 +39,9 @@ def macs(node: ir.Node) -> int | None:
     """
     if is_plugin(node):
         return knowledge().macs(node)
-    if node.op_type in ("Loop", "Scan"):  # nobody knows how often it runs
-        return 0 if all(macs(inner) == 0 for inner in _inside(node)) else None
+    if node.op_type in _LOOPS:  # nobody knows how often it runs
+        inside = (inner for inner in _inside(node) if inner.op_type not in _LOOPS)
+        return 0 if all(macs(inner) == 0 for inner in inside) else None
     if node.op_type in _UNCOUNTED:
         return None
     rule = _RULES.get(node.op_type)
@@ -50,7 +53,7 @@ def why_uncounted(node: ir.Node) -> str:
     if is_plugin(node):
         known = knowledge().knows(node)
         return f"{node.op_type} ({'open shape' if known else 'plugin or function'})"
-    if node.op_type in ("Loop", "Scan"):
+    if node.op_type in _LOOPS:
         return f"{node.op_type} (a loop)"
     if node.op_type in _UNCOUNTED or _has_shapes(node):
         return f"{node.op_type} (no rule)"
@@ -101,6 +104,7 @@ def total_macs(counts: Iterable[int | None]) -> tuple[int | None, int]:
 
 
 def _inside(node: ir.Node) -> Iterable[ir.Node]:
+    """Walk the nodes of a node's bodies, and of the bodies in them."""
     for attribute in node.attributes.values():
         if attribute.type == ir.AttributeType.GRAPH:
             for body in graphs_of(attribute.as_graph()):

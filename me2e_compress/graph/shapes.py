@@ -6,6 +6,7 @@ import math
 import onnx
 import onnx_ir as ir
 
+from me2e_compress.graph.carried import can_carry
 from me2e_compress.graph.nodes import input_at, is_plugin, nodes_in, nodes_of
 from me2e_compress.graph.plugins import knowledge
 
@@ -40,7 +41,7 @@ def rank_of(value: ir.Value | None) -> int | None:
 def infer_shapes(
     model: ir.Model, *, strict: bool = False, written: onnx.ModelProto | None = None
 ) -> None:
-    """Infer types and shapes by ONNX, data propagation included, in place.
+    """Infer types and shapes by ONNX, in place, data propagation included if it can be.
 
     Plugins of known dialects tell what they give (:mod:`me2e_compress.operators`). One
     that nobody knows stops nothing: what it gives keeps the shape that the file
@@ -67,7 +68,7 @@ def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) 
         proto = onnx.shape_inference.infer_shapes(
             without_weights(model) if written is None else written,
             strict_mode=strict,
-            data_prop=True,
+            data_prop=can_carry(model.graph),
         )
     except (
         onnx.checker.ValidationError,

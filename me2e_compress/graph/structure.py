@@ -5,6 +5,7 @@ what runs later (shape inference, cloning, passes) trusts what it is given. So a
 they trust is checked here, and nowhere else.
 """
 
+import itertools
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 
@@ -16,7 +17,11 @@ from me2e_compress.graph.signatures import check_signature
 
 LARGEST_VERSION = 2**31 - 1
 DEEPEST = 32
-"""Graphs in nodes of graphs: protobuf itself ends at about thirty."""
+"""Graphs in nodes of graphs: protobuf itself ends at about thirty. Calls of functions
+in functions likewise: what walks through them goes as deep."""
+MOST_CALLED_NODES = 1_000_000
+"""Nodes of a graph in which every call stands for what its function holds: ONNX's
+inference goes through all of them."""
 
 Names = Collection[str]
 
@@ -41,7 +46,7 @@ def check(model: onnx.ModelProto) -> bool:
     functions = {(f.domain, f.name, f.overload): f for f in model.functions}
     if len(functions) < len(model.functions):
         raise GraphError("two of its functions have one name")
-    _check_calls(functions)
+    _check_calls(model.graph, functions)
     walk = _Walk(versions, functions)
     walk.main(model.graph)
     for function in model.functions:
@@ -66,8 +71,18 @@ def _check_opsets(model: onnx.ModelProto) -> None:
 Function = tuple[str, str, str]
 
 
-def _check_calls(functions: dict[Function, onnx.FunctionProto]) -> None:
-    """Refuse functions that call each other in a circle: nothing can inline them."""
+def _check_calls(
+    graph: onnx.GraphProto, functions: dict[Function, onnx.FunctionProto]
+) -> None:
+    """Refuse functions that nothing can inline: in a circle, too deep or too many."""
+
+    def size(nodes: Iterable[onnx.NodeProto]) -> int:
+        names = (
+            (each.domain, each.op_type, each.overload) for each in _all_nodes(nodes)
+        )
+        return sum(sizes.get(name, 1) for name in names)
+
+    sizes: dict[Function, int] = {}
     calls = {
         name: {
             called
@@ -76,13 +91,23 @@ def _check_calls(functions: dict[Function, onnx.FunctionProto]) -> None:
         }
         for name, function in functions.items()
     }
-    while calls:
+    for depth in itertools.count():
         leaves = [name for name, called in calls.items() if not called & calls.keys()]
         if not leaves:
-            first = min(calls)[1]
-            raise GraphError(f"function {first} calls itself, at once or over others")
+            break
+        if depth > DEEPEST:
+            raise GraphError(f"functions call each other more than {DEEPEST} deep")
         for name in leaves:
             del calls[name]
+            sizes[name] = size(functions[name].node)
+    if calls:
+        first = min(calls)[1]
+        raise GraphError(f"function {first} calls itself, at once or over others")
+    if (found := size(graph.node)) > MOST_CALLED_NODES:
+        raise GraphError(
+            f"its functions make {found:,} nodes of it, {MOST_CALLED_NODES:,} at most"
+            " are read"
+        )
 
 
 def _all_nodes(nodes: Iterable[onnx.NodeProto]) -> Iterable[onnx.NodeProto]:
@@ -202,8 +227,9 @@ class _Walk:
         for each in node.metadata_props:
             check_text("metadata of a node", (each.key, each.value))
         for attribute in node.attribute:
-            if attribute.HasField("t"):
-                check_tensor(attribute.t, f"the tensor of node {node.name!r}")
+            own = (attribute.t,) if attribute.HasField("t") else ()
+            for tensor in (*own, *attribute.tensors):
+                check_tensor(tensor, f"the tensor of node {node.name!r}")
             for body in _bodies(attribute):
                 self.graph(body, reachable, depth + 1)
 

@@ -103,7 +103,9 @@ class ModuleMap(Displayed):
         if path.suffix == ".toml":
             if not path.is_file():
                 raise ModuleMapError(f"{path}: no such file")
-            return cls.parse(path.read_bytes(), path.stem, str(path))
+            with documents.reading(path, ModuleMapError, "not TOML"):
+                content = documents.content(path)
+            return cls.parse(content, path.stem, str(path))
         if str(source) == WHOLE:
             return cls.whole()
         if str(source) not in presets():

@@ -15,17 +15,18 @@ def write_bytes(path: Path, content: bytes) -> None:
     Raises:
         OSError: The folder is missing, not writable or full; nothing is left behind.
     """
-    handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(draft).chmod(0o644)
-        drafts.put(Path(draft), path)
-    except BaseException:
-        Path(draft).unlink(missing_ok=True)
-        raise
+    with drafts.naming(path):
+        handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(draft).chmod(0o644)
+            drafts.put(Path(draft), path)
+        except BaseException:
+            Path(draft).unlink(missing_ok=True)
+            raise
 
 
 def write_json(path: Path, record: dict[str, Any], indent: int | None = None) -> None:

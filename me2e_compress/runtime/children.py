@@ -17,7 +17,8 @@ from pathlib import Path
 
 from me2e_compress.runtime import child_main
 
-_SAFE_PATH = "PYTHONSAFEPATH"
+_TRACKER_IS_SILENT = "ignore::UserWarning:multiprocessing.resource_tracker"
+"""It clears locks away where this process was killed, and need not say so."""
 _STARTING = threading.RLock()
 
 
@@ -29,19 +30,26 @@ def sheltered() -> Iterator[None]:
     ``pickle`` or ``numpy``. And a terminal sends Ctrl-C to all processes at once: only
     the parent shall hear it, and ends the others.
     """
-    with _STARTING:
-        before = os.environ.get(_SAFE_PATH)
-        os.environ[_SAFE_PATH] = "1"
-        try:
-            if os.name == "posix":
+    with _STARTING, _told("PYTHONSAFEPATH", "1"):
+        if os.name == "posix":
+            with _told("PYTHONWARNINGS", _TRACKER_IS_SILENT):
                 resource_tracker.ensure_running()  # else a lock starts it unsheltered
-            with _deaf_to_interrupts():
-                yield
-        finally:
-            if before is None:
-                del os.environ[_SAFE_PATH]
-            else:
-                os.environ[_SAFE_PATH] = before
+        with _deaf_to_interrupts():
+            yield
+
+
+@contextlib.contextmanager
+def _told(name: str, value: str) -> Iterator[None]:
+    """Set a variable of the environment, for the processes that start meanwhile."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
 
 
 @contextlib.contextmanager

@@ -23,6 +23,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import is_read
+from me2e_compress.runtime.endless import endless
 from me2e_compress.runtime.fused_nodes import is_fused, runnable, unknown_nodes
 from me2e_compress.runtime.providers import CPU, Provider
 
@@ -42,6 +43,7 @@ REFUSALS: tuple[type[Exception], ...] = (
     _native.NotImplemented,
     _native.RuntimeException,
     UnicodeDecodeError,  # a message about names that are not UTF-8
+    MemoryError,  # what it computes of constants as it opens is too large
     RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
 )
 """Everything raised where a graph cannot be read, built or run."""
@@ -50,11 +52,14 @@ REFUSALS: tuple[type[Exception], ...] = (
 def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
     """Return why a graph cannot be run; None if every operator is known.
 
-    Fused operators are: a kernel or a body runs them. What the libraries of a provider
+    A loop that constants keep going cannot: nobody can end it, and no signal.
+    Fused operators can: a kernel or a body runs them. What the libraries of a provider
     bring is not known before a session is built. A known operator may still lack a
     kernel for its element type; only building a
     :class:`~me2e_compress.runtime.session.Session` finds that.
     """
+    if reason := endless(model):
+        return reason
     unknown = {
         f"{node.domain or 'ai.onnx'}::{node.op_type}": node
         for node in unknown_nodes(model)
@@ -102,7 +107,7 @@ def open_file(
     """
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
-    if not _has_own_nodes(path):
+    if not _holds_any(path, (_OWN_NODE, _LOOP)):
         try:
             return _build(str(path), options, provider, without), {}
         except GraphError:
@@ -111,11 +116,14 @@ def open_file(
 
 
 _OWN_NODE = b":\x04me2e"
-"""A node in the toolkit's own domain, as it stands in a file."""
+"""A node in the toolkit's own domain, as it stands in a file; onnxruntime would run
+its body."""
+_LOOP = b'"\x04Loop'
+"""A node that may have no end."""
 
 
-def _has_own_nodes(path: Path) -> bool:
-    """Return whether a file may hold nodes that onnxruntime would run as their bodies.
+def _holds_any(path: Path, nodes: Sequence[bytes]) -> bool:
+    """Return whether a file may hold nodes that are to be looked at before they run.
 
     Reading the graph takes ten times as long as looking through the bytes.
     """
@@ -123,7 +131,7 @@ def _has_own_nodes(path: Path) -> bool:
         if not path.stat().st_size:
             return False
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            return content.find(_OWN_NODE) >= 0
+            return any(content.find(each) >= 0 for each in nodes)
 
 
 def open_graph(
@@ -220,12 +228,20 @@ def _build(
         return _opened(source, options, provider, left_out)
     except REFUSALS as error:
         refusal = error
-    options.add_session_config_entry(_INT8_STAYS, "1")
+    _keep_int8(options)
     try:
         return _opened(source, options, provider, left_out)
     except REFUSALS:
         line = " ".join(str(refusal).split())
         raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
+
+
+def _keep_int8(options: ort.SessionOptions) -> None:
+    """Leave that step out; to say so twice would make onnxruntime warn."""
+    try:
+        options.get_session_config_entry(_INT8_STAYS)
+    except RuntimeError:  # nobody said so yet
+        options.add_session_config_entry(_INT8_STAYS, "1")
 
 
 def _opened(

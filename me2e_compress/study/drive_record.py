@@ -220,7 +220,7 @@ class DriveRecord:
 
 
 def _lines(path: Path) -> list[str]:
-    text = documents.content(path).decode("utf-8")
+    text = documents.content(path, documents.LARGEST_LOG_BYTES).decode("utf-8")
     if not text.endswith("\n"):
         raise ValueError("its last line was cut off")
     return text.splitlines()

@@ -8,6 +8,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress import documents, recipe
 from me2e_compress.driving.policies import driver_named
+from me2e_compress.driving.python_policy import PythonDriver
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -37,22 +38,27 @@ def load_study(
     routes: str | None = None,
     provider: str | None = None,
     plugins: Sequence[Path] = (),
+    *,
+    trust_code: bool = False,
 ) -> Study:
     """Read a study.
 
     Files are looked for beside the study's own file; a policy that is not one there
-    is a model that ships.
+    is a model that ships. Nothing that it names is run here.
 
     Args:
         path: The TOML file, or the name of a study that ships.
         routes: Drive these instead of the study's.
         provider: What runs the models, instead of the study's, as a text.
         plugins: Libraries of operators or plugins, besides the study's.
+        trust_code: Take a study that names code: a Python function that makes a policy,
+            or libraries, both of which may lie beside it.
 
     Raises:
         GraphError: A policy is neither a file nor a model that ships.
         StudyError: No such file, not TOML, a key that is unknown, missing or of
-            another type, frames that are none, or a study that could not be finished.
+            another type, frames that are none, code that is not trusted, or a study
+            that could not be finished.
         RecipeError: An unknown recipe or pass.
         EvaluationError: Unknown routes or latency.
         ProviderError: A provider or library that is not there.
@@ -70,6 +76,10 @@ def load_study(
         raise StudyError(f"{path}: {_complaint(error)}") from error
     if provider is not None:
         table.provider = provider
+    if not trust_code and (named := _code(table)):
+        raise StudyError(
+            f"{path} runs code: {named[0]}; look at it first, then say --trust-code"
+        )
     study = _Reader(path).study(table, routes, plugins)
     study.check_recordings()
     return study
@@ -167,6 +177,13 @@ def _complaint(error: ValidationError) -> str:
         return f"{where}: {first['msg']}"
     kind = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study
     return f"no key {where}; there are {', '.join(kind.model_fields)}"
+
+
+def _code(table: _Study) -> list[str]:
+    """List what a study has run that is neither ours nor an installed package's."""
+    policies = [each.policy for each in table.variant if each.policy not in SHIPPED]
+    made = [each for each in policies if isinstance(driver_named(each), PythonDriver)]
+    return [*made, *table.plugins]
 
 
 class _Reader:

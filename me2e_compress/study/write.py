@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from me2e_compress import drafts
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_json
@@ -55,7 +56,10 @@ def write_study(
     text = heading + "\n".join(table.markdown() for table in all_tables(outcome))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with writing([written.record, written.tables, written.report], force=force):
+        with (
+            writing([written.record, written.tables, written.report], force=force),
+            drafts.all_or_none(),
+        ):
             write_json(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
             write_bytes(written.report, html(outcome, command).encode())

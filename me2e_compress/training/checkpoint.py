@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -72,12 +73,13 @@ class TrainingCheckpoint:
         Raises:
             TrainingError: it cannot be written.
         """
-        draft = path.with_name(f".{path.name}")
+        content = {field.name: getattr(self, field.name) for field in fields(self)}
         try:
-            torch.save(
-                {field.name: getattr(self, field.name) for field in fields(self)}, draft
-            )
-            os.replace(draft, path)
+            with tempfile.TemporaryDirectory(
+                dir=path.parent, prefix=".saving-"
+            ) as near:
+                torch.save(content, draft := Path(near) / path.name)
+                os.replace(draft, path)
         except (OSError, RuntimeError) as error:
             first = str(error).splitlines()[0]
             raise TrainingError(f"{path}: cannot be written: {first}") from error

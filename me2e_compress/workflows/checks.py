@@ -1,6 +1,7 @@
 """What users give, checked before any work: files, folders, models, numbers."""
 
 import math
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -119,7 +120,7 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             raise GraphError(f"{output} is a folder: name a file for the output")
         if output.exists() and not output.is_file():
             raise GraphError(f"{output} is a device or a pipe: name a file")
-        if named.setdefault(output.resolve(), output) is not output:
+        if named.setdefault(resolved(output), output) is not output:
             raise GraphError(f"{output} is named for two outputs: choose another name")
         for given in read:
             _keep(output, given)
@@ -139,7 +140,7 @@ def check_folder(
         GraphError: it is a file or an input, or one of the files is an input.
     """
     read = list(inputs)
-    if not folder.resolve().name:
+    if not resolved(folder).name:
         raise GraphError(f"{folder} is the root of all files: name a folder")
     if folder.exists() and not folder.is_dir():
         raise GraphError(f"{folder} is a file: name a folder for the output")
@@ -151,10 +152,15 @@ def check_folder(
     check_output([folder / name for name in files], read)
 
 
+def resolved(path: Path) -> Path:
+    """Follow links; of those in a circle, what they are called."""
+    return Path(os.path.realpath(path))
+
+
 def _keep(output: Path, given: Path) -> None:
     """Refuse an output that would change an input."""
     if given.is_dir():
-        inside = output.resolve().parent == given.resolve()
+        inside = resolved(output).parent == resolved(given)
         if inside and (output.suffix == ".npz" or output.name == "scenes.json"):
             raise GraphError(
                 f"{output} would be a frame of the input: choose another name"

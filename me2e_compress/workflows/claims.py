@@ -20,7 +20,7 @@ from typing import TypeAlias
 
 from me2e_compress import documents, drafts
 from me2e_compress.errors import GraphError
-from me2e_compress.workflows.checks import Given, check_output
+from me2e_compress.workflows.checks import Given, check_output, resolved
 
 RECORD = ".me2e-compress.json"
 
@@ -60,7 +60,7 @@ def writing(
         for folder in folders:
             place = _place_of(folder)
             if place.parent.is_dir():
-                stack.enter_context(_opened(place)).lock(folder.resolve().name, folder)
+                stack.enter_context(_opened(place)).lock(resolved(folder).name, folder)
         for output in outputs:
             if output.absolute().parent.is_dir():
                 stack.enter_context(_claim(output, force=force))
@@ -82,7 +82,7 @@ def check_ours(files: Iterable[Path], *, force: bool = False) -> None:
 
 def _place_of(folder: Path) -> Path:
     """Return the record that says who works in a folder: beside it, if that may be."""
-    above = folder.resolve().parent
+    above = resolved(folder).parent
     return (above if os.access(above, os.W_OK) else folder) / RECORD
 
 
@@ -175,7 +175,7 @@ class _Record:
     def note(self, name: str, **states: State) -> None:
         """Write what is known of one output; of a missing one, nothing."""
         known = {key: state for key, state in states.items() if state}
-        with _locked(self.handle):
+        with drafts.naming(self.path), _locked(self.handle):
             entries = self._read()
             if known == entries.pop(name, {}):
                 return
@@ -235,9 +235,16 @@ def _opened(path: Path) -> Iterator[_Record]:
 
 
 def _handle(path: Path) -> int:
-    """Open the file; again, if another process removed it meanwhile."""
+    """Open the file; again, if another process removed it meanwhile.
+
+    Raises:
+        GraphError: it is a link, which might lead to a file of the user, or no file.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            raise GraphError(f"{path} is a link, a folder or a pipe: no record of ours")
+        handle = os.open(path, flags, 0o644)
         if _is_at(handle, path):
             return handle
         os.close(handle)
@@ -246,7 +253,7 @@ def _handle(path: Path) -> int:
 def _is_at(handle: int, path: Path) -> bool:
     """Return whether an open file is still the one of that name."""
     try:
-        return os.path.samestat(os.fstat(handle), path.stat())
+        return os.path.samestat(os.fstat(handle), path.lstat())
     except FileNotFoundError:
         return False
 

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from me2e_compress import graph
+from me2e_compress import drafts, graph
 from me2e_compress.manager import Report
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.quantization.plan import plan_of, save_plan
@@ -174,11 +174,13 @@ def write_result(
 ) -> CompressResult:
     """Write the graph and its plan; the report last, it vouches for the others."""
     plan = plan_of(report.model)  # first: what the file brought may be none
-    graph.save(with_own_domains(report.model), output)
-    if plan is not None:
-        save_plan(plan, beside(output, "plan"))
     weights = {"weights": named_weights(report.model.metadata_props)}
-    record = report.record(source, output) | weights | loss_record(report, int8, loss)
-    write_json(beside(output, "report"), record, indent=2)
+    with drafts.all_or_none():
+        graph.save(with_own_domains(report.model), output)
+        if plan is not None:
+            save_plan(plan, beside(output, "plan"))
+        about = weights | loss_record(report, int8, loss)
+        record = report.record(source, output) | about
+        write_json(beside(output, "report"), record, indent=2)
     sizes = graph.file_bytes(source), graph.file_bytes(output)
     return CompressResult(source, output, report, record, *sizes, int8, loss, seconds)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from me2e_compress import drafts
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, MissingExtraError, RecipeError
 from me2e_compress.metrics.deadlines import BUDGET_MS
@@ -135,12 +136,13 @@ def profile(
             trace = dataclasses.replace(trace, modules_us=found.modules_us)
             operators = found.operators_us
         energy = _energy(source, recording, options, listener)
-        if figure is not None:
-            draw(trace, source.stem, figure)
-        if written is not None:
-            trace.save(written)
-        if energy is not None and joules is not None:
-            energy.save(joules)
+        with drafts.all_or_none():
+            if figure is not None:
+                draw(trace, source.stem, figure)
+            if written is not None:
+                trace.save(written)
+            if energy is not None and joules is not None:
+                energy.save(joules)
     return ProfileResult(
         *(source, trace, written, load.cores, load.of, operators, figure),
         energy=energy,

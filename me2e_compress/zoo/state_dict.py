@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from me2e_compress.documents import MalformedError, reading
+from me2e_compress.documents import MalformedError, check_regular, reading
 from me2e_compress.errors import GraphError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -84,8 +84,7 @@ def read_state_dict(path: Path) -> StateDict:
     if importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "zoo")
     with reading(path, GraphError, "not read as weights"):
-        if path.is_dir():
-            raise MalformedError("it is a folder")
+        check_regular(path)
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         named = path.suffix == SAFETENSORS

@@ -1,7 +1,9 @@
 """Ctrl-C and SIGTERM: one line, and the exit code that shells know."""
 
 import signal
+import sys
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,6 +30,12 @@ def hears_ctrl_c() -> Iterator[None]:
     [
         ("calibrate", "in.onnx frames -o out", "interrupted; run again to go on"),
         ("compare", "in.onnx in.onnx frames", "interrupted"),
+        (
+            "frames",
+            "in.onnx -o out",
+            "interrupted; run again to go on after the last whole scene, if there is"
+            " one",
+        ),
     ],
 )
 def test_it_ends_in_one_line(
@@ -53,6 +61,40 @@ def test_it_ends_in_one_line(
 
     assert capsys.readouterr().err == f"me2e-compress: {said}\n"
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.usefixtures("hears_ctrl_c")
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
+def test_a_signal_that_python_loses_ends_the_run_all_the_same(
+    command: Command,
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+    code: int,
+) -> None:
+    """What is raised in a weak reference's callback goes no further."""
+
+    class Large:
+        pass
+
+    def lose(path: Path) -> None:
+        large = Large()
+        kept = weakref.ref(large, lambda _: signal.raise_signal(number))
+        del large
+        assert kept() is None
+        for _ in range(500):
+            time.sleep(0.01)
+
+    monkeypatch.chdir(files)
+    monkeypatch.setattr("me2e_compress.graph.load", lose)
+    before, hook = sorted(files.iterdir()), sys.unraisablehook
+
+    assert command("compress", "in.onnx", "-o", "out.onnx", "-r", "exact") == code
+
+    assert sorted(files.iterdir()) == before
+    assert sys.unraisablehook is hook
 
 
 def test_processes_are_started_in_one_place_alone() -> None:

@@ -114,7 +114,8 @@ def test_libraries_of_the_study_and_of_the_command_line(models: Path) -> None:
         (models / name).touch()
     keys = 'provider = "cpu"\nplugins = ["beside.so"]\n'
 
-    study = load_study(write(models, keys + GOOD), plugins=[models / "other.so"])
+    toml = write(models, keys + GOOD)
+    study = load_study(toml, plugins=[models / "other.so"], trust_code=True)
 
     libraries = (models / "beside.so", models / "other.so")
     assert study.provider == CpuProvider(plugins=libraries)

@@ -156,6 +156,7 @@ class _Clip(Sequence[LogMoment]):
 
 def _annotation(path: Path) -> Mapping[str, Any]:
     try:
+        documents.check_regular(path)
         with gzip.open(path) as file:
             text = file.read(LARGEST_BYTES + 1)
         if len(text) > LARGEST_BYTES:

@@ -181,6 +181,7 @@ def _agent(row: Row, path: Path) -> Agent:
 
 def _objects(path: Path) -> Iterator[dict[str, Any]]:
     decode = json.JSONDecoder().raw_decode
+    documents.check_regular(path)
     with path.open(encoding="utf-8") as file:
         text, at = file.read(PIECE), 0
         at = _past(text, at, " \t\r\n")

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from me2e_compress.calibration.logs.base import Floats
 from me2e_compress.calibration.pixels import PixelInput
+from me2e_compress.documents import MalformedError, check_regular
 from me2e_compress.errors import FramesError
 
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG"
@@ -47,9 +48,12 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
     import cv2  # takes a tenth of a second to import
 
     try:
+        check_regular(path)
         content = path.read_bytes()
     except OSError as error:
         raise FramesError(f"{path}: {error.strerror}") from error
+    except MalformedError as error:
+        raise FramesError(f"{path}: {error}") from error
     if not _is_whole(content):
         raise FramesError(f"{path}: the picture breaks off, or is no JPEG or PNG")
     found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)

@@ -28,6 +28,9 @@ Weigh = Annotated[
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="count drives and hours, drive nothing")
 ]
+TrustCode = Annotated[
+    bool, typer.Option("--trust-code", help="run Python and libraries that it names")
+]
 
 
 def study(
@@ -40,6 +43,7 @@ def study(
     dry_run: DryRun = False,
     provider: Provider = None,
     plugins: given.Plugins = None,
+    trust_code: TrustCode = False,
     workers: given.Workers = 1,
     engine: given.Engine = "local",
     address: given.Address = None,
@@ -56,7 +60,8 @@ def study(
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
     from me2e_compress.workflows.checks import check_folder
 
-    asked = load_study(definition, routes, provider, plugins or ())
+    more = plugins or ()
+    asked = load_study(definition, routes, provider, more, trust_code=trust_code)
     if tables is not None:
         asked = asked.of_blocks(tables.split(","))
     inputs = (study_path(definition), *asked.inputs())
@@ -71,9 +76,10 @@ def study(
         ("--records", records),
         *(("--weigh", each) for each in weigh or ()),
         ("--provider", provider),
-        *(("--plugins", each) for each in plugins or ()),
+        *(("--plugins", each) for each in more),
     ]
     chosen = [str(word) for each in options if each[1] is not None for word in each]
+    chosen += ["--trust-code"] * trust_code
     words = ("me2e-compress", "study", str(definition), "-o", str(output), *chosen)
     if records is None:
         tell(ahead.headline)

@@ -30,7 +30,8 @@ def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
         OSError: It cannot be read.
     """
     found = list[InferenceRecord]()
-    for number, line in enumerate(documents.content(path).splitlines(), 1):
+    lines = documents.content(path, documents.LARGEST_LOG_BYTES).splitlines()
+    for number, line in enumerate(lines, 1):
         try:
             noted = _Line.model_validate(documents.from_json(line))
         except (documents.MalformedError, ValidationError) as error:

@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -189,7 +190,7 @@ class ResultsFolder:
 
 def log_beside(folder: Path) -> Path:
     """Return where the log of a folder of results goes."""
-    resolved = folder.resolve()
+    resolved = Path(os.path.realpath(folder))
     return resolved.with_name(f"{resolved.name}.log")
 
 

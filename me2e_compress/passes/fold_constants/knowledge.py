@@ -16,6 +16,9 @@ from me2e_compress.rewrite import Array, has_subgraph, is_standard
 SMALL = 1024
 """Arrays up to so many elements are computed at once: shapes and indices are."""
 
+LARGEST = 1 << 30
+"""Bytes of a value that is computed here, at most: a chain of Concats claims any."""
+
 NEVER = frozenset(
     {
         "Bernoulli",
@@ -170,7 +173,8 @@ class Sweep:
 
     def _add(self, node: ir.Node) -> None:
         """Enter a constant node, beside its equals if it has any."""
-        if not all(_is_native(value) for value in node.outputs if value.name):
+        named = [value for value in node.outputs if value.name]
+        if not all(_is_native(each) and _bytes(each) <= LARGEST for each in named):
             return
         small = self._evaluate(node)
         inputs = tuple(
@@ -237,6 +241,13 @@ def _is_native(value: ir.Value) -> bool:
     if isinstance(value.type, ir.SequenceType | ir.OptionalType):
         return value.type.elem_type.dtype in NATIVE
     return value.dtype in NATIVE
+
+
+def _bytes(value: ir.Value) -> float:
+    shape = static_shape(value)
+    if shape is None or value.dtype is None:
+        return 0
+    return math.prod(shape) * value.dtype.itemsize
 
 
 def _is_inference(node: ir.Node, opset: int) -> bool:

@@ -6,6 +6,7 @@ asked then.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,6 +25,8 @@ NATIVE = frozenset(
 )
 """The element types that numpy itself computes with."""
 
+MOST_ELEMENTS = 1 << 20
+"""Of what a rule makes of numbers, whatever shape the file claims."""
 OLDEST_OPSET = 7
 """Broadcasting followed other rules before."""
 
@@ -176,6 +179,8 @@ def _range(call: Call) -> Any:
     start, limit, delta = call.array(0), call.array(1), call.array(2)
     if start.dtype.kind not in "iu" or not delta.item():
         return None
+    if (limit.item() - start.item()) / delta.item() > MOST_ELEMENTS:
+        return None
     return np.arange(start.item(), limit.item(), delta.item(), dtype=start.dtype)
 
 
@@ -183,6 +188,8 @@ def _constant_of_shape(call: Call) -> Any:
     given = call.node.attributes.get("value")
     fill = np.zeros(1, np.float32) if given is None else given.as_tensor().numpy()
     shape = [int(size) for size in call.array(0).reshape(-1)]
+    if math.prod(shape) > MOST_ELEMENTS:
+        return None
     return np.full(shape, fill.reshape(-1)[0], dtype=fill.dtype)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import onnx_ir as ir
 import pydantic
 
+from me2e_compress import documents
 from me2e_compress.display import Displayed, Table, table
 from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED
@@ -193,7 +194,9 @@ def load_plan(path: Path) -> QuantPlan:
     """
     if not path.is_file():
         raise RecipeError(f"{path}: no such plan")
-    return _parse(path.read_bytes(), str(path))
+    with documents.reading(path, RecipeError, "not a plan"):
+        content = documents.content(path)
+    return _parse(content, str(path))
 
 
 def stamp_plan(model: ir.Model, plan: QuantPlan) -> None:

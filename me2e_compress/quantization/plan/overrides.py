@@ -115,7 +115,9 @@ class Overrides(_Strict):
         """
         if not path.is_file():
             raise RecipeError(f"{path}: no such file of overrides")
-        return cls.parse(path.read_bytes(), str(path))
+        with documents.reading(path, RecipeError, "not TOML"):
+            content = documents.content(path)
+        return cls.parse(content, str(path))
 
     @classmethod
     def parse(cls, text: str | bytes, origin: str = "overrides") -> Self:

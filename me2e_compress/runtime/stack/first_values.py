@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from me2e_compress.documents import check_regular
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.frames import UNREADABLE, Array
 from me2e_compress.runtime.recurrence import SessionPort
@@ -22,6 +23,7 @@ def read_value(path: Path, name: str, where: str) -> Array:
         GraphError: it cannot be read, or has no such array.
     """
     try:
+        check_regular(path)
         held = np.load(path, allow_pickle=False)
         if isinstance(held, np.ndarray):
             return np.asarray(held)

@@ -1,6 +1,7 @@
 """Pictures of recorded moments, and their PNG and GIF files."""
 
 import os
+import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -223,23 +224,23 @@ def _palette(images: list[Image.Image]) -> Image.Image:
 def _replace(
     path: Path, kind: str, frames: list[Image.Image], duration_ms: int
 ) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        if kind == "GIF":
-            frames[0].save(
-                partial,
-                kind,
-                save_all=True,
-                append_images=frames[1:],
-                duration=duration_ms,
-                loop=0,
-                optimize=False,
-            )
-        else:
-            frames[0].save(partial, kind)
-        os.replace(partial, path)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as near:
+            draft = Path(near) / path.name
+            if kind == "GIF":
+                frames[0].save(
+                    draft,
+                    kind,
+                    save_all=True,
+                    append_images=frames[1:],
+                    duration=duration_ms,
+                    loop=0,
+                    optimize=False,
+                )
+            else:
+                frames[0].save(draft, kind)
+            os.replace(draft, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise EvaluationError(
             f"{path}: the picture cannot be written: {error.strerror or error}"
         ) from error

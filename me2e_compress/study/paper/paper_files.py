@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from me2e_compress import drafts
 from me2e_compress.display import in_markdown
 from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_json
@@ -37,7 +38,10 @@ def write_paper(
     text = heading + "\n".join(table.markdown() for table in result.tables())
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with writing([report, tables, record], force=force):
+        with (
+            writing([report, tables, record], force=force),
+            drafts.all_or_none(),
+        ):
             write_json(record, result.to_json(), indent=1)
             write_bytes(tables, text.encode())
             write_bytes(report, paper_html(result, command).encode())

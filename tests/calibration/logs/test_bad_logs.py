@@ -29,6 +29,7 @@ from tests.calibration.logs.small_logs import (
     write_bench2drive,
     write_nuscenes,
 )
+from tests.profiles import scaled
 
 PIXELS = PixelInput(mean=(0, 0, 0), std=(1, 1, 1), order="bgr", rows=32, columns=64)
 FORMS = {"img": InputForm((6, 3, 32, 64), np.dtype(np.float32))}
@@ -239,7 +240,9 @@ def test_a_half_written_jpeg_is_no_picture(tmp_path: Path, share: float) -> None
 WORDS = st.text('"\\[]{},é\n ', max_size=6)
 
 
-@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=scaled(20), suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     found=st.lists(st.fixed_dictionaries({"token": WORDS, "a": WORDS}), max_size=6),
     more=st.integers(1, 40),

@@ -1,0 +1,59 @@
+"""Folding computes nothing that is larger than it may be."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.graph import static_shape
+from me2e_compress.modules import ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.passes.fold_constants import (
+    FoldConstants,
+    evaluation,
+    knowledge,
+    table,
+)
+from me2e_compress.passes.fold_constants.knowledge import Knowledge
+from me2e_compress.rewrite import Array
+from me2e_compress.runtime.opening import REFUSALS
+
+
+def test_a_value_beyond_the_limit_stays_computed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lines = [f"c{at + 1} = Concat<axis = 0>(c{at}, c{at})" for at in range(40)]
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "g (float[1,4] x) => (float[1,4] y) <float[1,4] c0 = {1, 1, 1, 1}> {"
+        f" {' '.join(lines)} r = ReduceMax<axes = [0], keepdims = 1>(c40)"
+        " y = Add(x, r) }"
+    )
+    rows = list[int]()
+
+    def evaluate(
+        values: Sequence[ir.Value], known: Knowledge, opsets: Mapping[str, int]
+    ) -> tuple[dict[ir.Value, Array], list[ir.Node]]:
+        made = [one.nodes[0].outputs[0] for one in known.expressions]
+        rows.extend((static_shape(each) or (0,))[0] for each in made)
+        return {}, []
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    found = FoldConstants().run(model, Context(ModuleMap.whole())).model
+    assert max(rows) * 16 == knowledge.LARGEST
+    assert [node.op_type for node in found.graph][-2:] == ["ReduceMax", "Add"]
+
+
+def test_the_table_makes_no_vector_that_the_file_does_not_tell_of() -> None:
+    numbers = [np.array(each, np.int64) for each in (0, 2**40, 1)]
+    values = [ir.Value(name=f"v{at}") for at in range(3)]
+    for node, inputs in (
+        (ir.node("Range", values), numbers),
+        (ir.node("ConstantOfShape", values[:1]), [np.array([2**40])]),
+    ):
+        assert table.evaluate(node, inputs, 17) is None
+
+
+def test_memory_that_runs_out_is_a_refusal() -> None:
+    assert issubclass(MemoryError, REFUSALS)
