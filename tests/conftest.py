@@ -1,5 +1,7 @@
+import gc
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import onnx
@@ -10,11 +12,11 @@ from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime import first_opening
 from me2e_compress.zoo import truth
-from me2e_compress.zoo.export import build, export
-from me2e_compress.zoo.stacks import find
+from tests import profiles
 
 if TYPE_CHECKING:
     from me2e_compress.zoo.vad.stack import VadTiny
+    from tests.zoo.vad.sizes import VadSize
 
 DRIVER = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -36,6 +38,34 @@ optional = ["occ_head"]
 role = "prediction"
 optional = ["plan_head"]
 """
+
+
+profiles.register()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let what is compiled or remembered lie in a folder of this run, not the user's.
+
+    Before collection, since a test that asks whether kernels compile is skipped by it;
+    workers get the folder from the process that starts them.
+    """
+    if hasattr(config, "workerinput"):
+        return
+    folder, patch = TemporaryDirectory(prefix="me2e-tests-"), pytest.MonkeyPatch()
+    patch.setenv("XDG_CACHE_HOME", folder.name)
+    config.add_cleanup(patch.undo)
+    config.add_cleanup(folder.cleanup)
+
+
+def pytest_collection() -> None:
+    """Look for no garbage while modules are imported and tests are made of them."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Leave what is there now out of every later search: it stays to the end."""
+    gc.enable()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
@@ -65,24 +95,31 @@ def context(driver_map: ModuleMap) -> Context:
     return Context(driver_map)
 
 
+@pytest.fixture(
+    scope="session",
+    params=["small", pytest.param("published", marks=pytest.mark.slow)],
+)
+def vad_size(request: pytest.FixtureRequest) -> "VadSize":
+    """How large VAD-tiny is: what runs at its published size is slow."""
+    from tests.zoo.vad.sizes import SIZES
+
+    return SIZES[request.param]
+
+
 @pytest.fixture(scope="session")
-def vad_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def vad_tiny(vad_size: "VadSize", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The exported reference stack, seed 0, opset 17, nuScenes heads."""
-    return export("vad-tiny", tmp_path_factory.mktemp("zoo") / "vad-tiny.onnx")
+    return vad_size.export(tmp_path_factory.mktemp("zoo") / "vad-tiny.onnx")
 
 
 @pytest.fixture(scope="session")
-def vad_torch() -> "VadTiny":
+def vad_torch(vad_size: "VadSize") -> "VadTiny":
     """The same in torch."""
-    from me2e_compress.zoo.vad.stack import VadTiny
-
-    model = build("vad-tiny")
-    assert isinstance(model, VadTiny)
-    return model
+    return vad_size.build()
 
 
 @pytest.fixture(scope="session")
-def vad_truth(vad_tiny: Path, vad_torch: "VadTiny") -> truth.Truth:
+def vad_truth(vad_size: "VadSize", vad_tiny: Path, vad_torch: "VadTiny") -> truth.Truth:
     """What its trace knew: the module of every node, and torch's own MACs."""
     plain = onnx.load(vad_tiny, load_external_data=False)
-    return truth.truth_of(find("vad-tiny"), vad_torch, plain=plain)
+    return truth.truth_of(vad_size.stack, vad_torch, plain=plain)

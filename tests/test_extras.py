@@ -53,7 +53,9 @@ def test_a_half_installed_extra_is_one_line(
         env={"PYTHONPATH": f"{package.parent}:{ROOT}", "HOME": str(tmp_path)},
     )
     assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
+    # a busy machine is warned of where latency is measured
+    said = done.stderr.splitlines()
+    (line,) = (each for each in said if not each.startswith("warning: "))
     assert line.startswith(f"me2e-compress: {module} is installed, but cannot be")
     assert reason in line
     (extra, *_) = (name for name, brings in MODULES.items() if module in brings)

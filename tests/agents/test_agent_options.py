@@ -14,6 +14,7 @@ from me2e_compress.agents.graph_agent import GraphAgentOptions
 from me2e_compress.agents.real_time import RealTimeOptions
 from me2e_compress.errors import EvaluationError
 from tests.agents.small_leaderboard import written
+from tests.profiles import scaled
 
 KINDS: list[type[AgentOptions]] = [RealTimeOptions, GraphAgentOptions]
 KEYS = [*RealTimeOptions.model_fields, *GraphAgentOptions.model_fields, "pid.aim_m"]
@@ -46,7 +47,7 @@ def refusal(kind: type[AgentOptions], path: Path) -> str | None:
     st.dictionaries(st.sampled_from(KEYS), st.sampled_from(VALUES), max_size=5),
     st.one_of(st.just(""), st.text(max_size=20)),
 )
-@settings(max_examples=60)
+@settings(max_examples=scaled(60))
 def test_options_are_read_or_refused_in_one_line(
     kind: type[AgentOptions], table: dict[str, str], end: str
 ) -> None:

@@ -29,6 +29,7 @@ from tests.agents.small_leaderboard import (
     written,
 )
 from tests.evaluators.bench2drive.files import checkpoint, record, write
+from tests.profiles import scaled
 
 NUMBERED = Path(__file__).with_name("numbered_agent.py")
 BRAKING = (0.0, 0.0, 1.0)
@@ -75,7 +76,7 @@ def seen_as(decision: int) -> tuple[float, float, float]:
     st.lists(st.integers(0, 400_000), min_size=24, max_size=24),
     st.sampled_from(LatencyModel),
 )
-@settings(max_examples=25)
+@settings(max_examples=scaled(25))
 def test_a_control_acts_when_the_evaluators_rule_says(
     latencies_us: list[int], model: LatencyModel
 ) -> None:
@@ -111,11 +112,15 @@ def test_measured_latency_holds_the_control(board: Leaderboard, tmp_path: Path) 
 def test_the_trace_is_one_that_evaluate_takes(
     board: Leaderboard, tmp_path: Path
 ) -> None:
-    agent = board.drive(real_time, config(tmp_path), 5)
+    agent = board.make(real_time, f"{config(tmp_path)}+{SAVE_NAME}")
+    ticks = count(0, 7_000_000)
+    agent.now_ns = lambda: next(ticks)
+    board.run(agent, 5)
+    agent.destroy()
 
     source = parse_latency(f"trace:{agent.save_path / 'latency.json'}")
 
-    assert source.on_route("any")(DecisionFacts(0)) >= 0
+    assert source.on_route("any")(DecisionFacts(0)) == 7_000
 
 
 @pytest.mark.parametrize("name", ["vad.onnx", "vad.pth"])

@@ -15,6 +15,7 @@ from me2e_compress.calibration.exchange import (
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import FramesError, RecipeError
+from tests.profiles import scaled
 
 NAMES = ("/head/MatMul output", "a: b", "image")
 
@@ -60,7 +61,7 @@ def test_what_came_from_a_table_is_of_extremes(tmp_path: Path) -> None:
     assert "-MinMaxCalibration\n" in (tmp_path / "c").read_text()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=scaled(20))
 @given(reach=st.floats(1e-30, 1e30))
 def test_scales_survive_the_way_through_a_cache(
     tmp_path_factory: pytest.TempPathFactory, reach: float

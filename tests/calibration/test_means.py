@@ -15,6 +15,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import run_once
 from tests.frames import record
 from tests.nets import conv_attention, image
+from tests.profiles import scaled
 
 KINDS = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -65,7 +66,7 @@ def test_the_mean_of_a_recurrent_model_over_scenes(tmp_path: Path) -> None:
     np.testing.assert_allclose(found_mean, np.mean(seen, axis=0), atol=1e-5)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=scaled(15))
 @given(
     st.lists(
         st.lists(st.floats(-3, 3, width=32), min_size=4, max_size=4),

@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
 from tests.frames import record
@@ -52,32 +54,45 @@ def test_a_killed_calibration_goes_on_where_it_was(
     assert not path.exists()
 
 
+@dataclasses.dataclass(frozen=True)
+class Other:
+    """What a later calibration differs in from the one that was killed."""
+
+    tensors: tuple[str, ...] = TENSORS
+    method: str = "mse"
+    optimize: bool = True
+    model: int = 0
+    first_image: int = 0
+    last_frames: int = 6
+
+
 @pytest.mark.parametrize(
-    ("tensors", "method", "seed", "message"),
+    ("other", "message"),
     [
-        (TENSORS[:1], "mse", 0, "another list of tensors"),
-        (TENSORS, "max-min", 0, "another kind of statistics"),
-        (TENSORS, "mse", 1, "another model"),
+        (Other(tensors=TENSORS[:1]), "another list of tensors"),
+        (Other(method="max-min"), "another kind of statistics"),
+        (Other(optimize=False), "another optimization level"),
+        (Other(model=1), "another model"),
+        (Other(first_image=1), "another recording"),
+        (Other(last_frames=2), "another choice of frames"),
     ],
 )
 def test_the_checkpoint_of_another_calibration_is_refused(
-    folder: Path,
-    tmp_path: Path,
-    tensors: tuple[str, ...],
-    method: str,
-    seed: int,
-    message: str,
+    folder: Path, tmp_path: Path, other: Other, message: str
 ) -> None:
     path = tmp_path / "standing.npz"
     with pytest.raises(KeyboardInterrupt):
         Calibrator("mse", threads=1, checkpoint=path, every=1).collect(
             conv_attention(), TENSORS, Killed(folder, 2)
         )
+    images = [image(seed + other.first_image) for seed in range(6)]
+    whole = CalibrationSet(record(tmp_path / "other", images, (0, 4)))
+    frames = FrameSubset(whole, tuple(range(6))[-other.last_frames :])
 
-    with pytest.raises(FramesError, match=rf"standing.npz: stale: .*{message}"):
-        Calibrator(method, threads=1, checkpoint=path).collect(
-            conv_attention(seed), tensors, CalibrationSet(folder)
-        )
+    with pytest.raises(FramesError, match=f"stale: a checkpoint of {message};"):
+        Calibrator(
+            other.method, threads=1, optimize=other.optimize, checkpoint=path
+        ).collect(conv_attention(other.model), other.tensors, frames)
 
 
 def test_a_file_that_is_no_checkpoint_is_refused(folder: Path, tmp_path: Path) -> None:

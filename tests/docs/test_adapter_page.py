@@ -1,6 +1,7 @@
 """The adapters of docs/adapter.md fit the graphs that it shows them with."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from me2e_compress.driving.onnx_policy import recurrent_of
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.session import DTYPES, Session
 from tests.docs.pages import ROOT, Block, blocks
-from tests.driving.observed import motion, observation
+from tests.driving.observed import motion, observation, observed
 from tests.evaluators.highway.drivers import straight_on
 
 PAGE = ROOT / "docs" / "adapter.md"
@@ -59,4 +60,9 @@ def test_the_shipped_adapter_is_what_the_page_shows(tmp_path: Path) -> None:
 
 def test_a_source_can_be_added_as_the_page_says() -> None:
     (block,) = blocks(PAGE, "python")
-    exec(compile(block.text, "adapter.md", "exec"), {"__name__": "adapter_page"})
+    page: dict[str, Any] = {"__name__": "adapter_page"}
+
+    exec(compile(block.text, "adapter.md", "exec"), page)
+
+    source = page["StoppingDistance"](braking_mps2=3.0)
+    assert source.value(observed()) == 6.0**2 / (2 * 3.0)

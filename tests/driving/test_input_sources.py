@@ -1,4 +1,5 @@
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -82,14 +83,35 @@ def test_the_lidar_pose_takes_points_to_the_world() -> None:
     np.testing.assert_array_equal(column, rotation.T)
 
 
-@pytest.mark.parametrize("axes", list(Axes))
-def test_intrinsics_and_extrinsics_make_the_projection(axes: Axes) -> None:
-    k, lidar2cam = value("intrinsics{homogeneous=true}", axes), value("lidar2cam", axes)
+@pytest.mark.parametrize(
+    ("axes", "point"),
+    [
+        (Axes.FORWARD_LEFT, (20.0, 5.0)),
+        (Axes.RIGHT_FORWARD, (-5.0, 20.0)),
+        (Axes.FORWARD_RIGHT, (20.0, -5.0)),
+        (Axes.RIGHT_BACKWARD, (-5.0, -20.0)),
+    ],
+)
+def test_the_front_camera_sees_a_point_on_the_ground(
+    axes: Axes, point: tuple[float, float]
+) -> None:
+    """20 m ahead and 5 m to the left; the camera is 1.5 m ahead and 1.6 m up."""
+    ground, seen = (*point, 0.0, 1.0), np.array([-5.0, 1.6, 18.5])
+    focal = 80 / math.tan(math.radians(35))
+    k = np.array([[focal, 0, 80], [0, focal, 0.42 * 90], [0, 0, 1]])
 
-    np.testing.assert_allclose(
-        k @ lidar2cam, value("lidar2img", axes), rtol=1e-4, atol=1e-2
-    )
+    lidar2cam, lidar2img = value("lidar2cam", axes)[0], value("lidar2img", axes)[0]
+
+    np.testing.assert_allclose((lidar2cam @ ground)[:3], seen, atol=1e-4)
+    np.testing.assert_allclose((lidar2img @ ground)[:3], k @ seen, rtol=1e-4)
+
+
+@pytest.mark.parametrize("axes", list(Axes))
+def test_intrinsics_are_those_of_the_rig_in_any_axes(axes: Axes) -> None:
+    k = value("intrinsics{homogeneous=true}", axes)
+
     np.testing.assert_allclose(k[:, :3, :3], RIG.intrinsics, rtol=1e-4)
+    np.testing.assert_array_equal(k[:, 3], [[0, 0, 0, 1]] * 6)
 
 
 def test_in_our_axes_the_extrinsics_are_those_of_the_rig() -> None:

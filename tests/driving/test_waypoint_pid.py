@@ -80,6 +80,14 @@ def test_it_aims_some_metres_ahead() -> None:
     assert far.steer < 0.0
 
 
+def test_it_aims_4_m_ahead_unless_told_otherwise() -> None:
+    plan = np.array([[3, 0], [3.9, 0.6], [4.2, 1.6], [6, 3], [8, 4], [10, 5]])
+    steers = [first(plan, 4.0, (-20.0, 20.0), aim_m=aim).steer for aim in (3, 4, 5)]
+
+    assert first(plan, 4.0, (-20.0, 20.0)).steer == steers[1]
+    assert len(set(steers)) == 3
+
+
 def test_a_node_more_nearly_ahead_is_followed() -> None:
     assert first(straight(4.0, left=-0.4), 4.0, AHEAD).steer == 0.0
 

@@ -48,6 +48,12 @@ def test_a_step_says_what_its_pass_did(chain: ir.Model, context: Context) -> Non
     assert step.after.weight_bytes == 8 * 4
 
 
+def test_a_step_begins_where_the_last_ended(chain: ir.Model, context: Context) -> None:
+    steps = run(chain, context, passes.DropsReluOfSigmoid(), passes.Idle()).steps
+    sizes = [(step.before.nodes, step.after.nodes) for step in steps]
+    assert sizes == [(8, 8), (8, 7), (7, 7)]
+
+
 def test_the_given_model_stays_as_it_is(chain: ir.Model, context: Context) -> None:
     before = graph.digest(chain)
     run(chain, context, passes.DropsReluOfSigmoid(), passes.Halves())

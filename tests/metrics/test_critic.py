@@ -30,6 +30,11 @@ def test_the_example_by_hand() -> None:
     assert critic_weights(BY_HAND) == pytest.approx(contents / contents.sum())
 
 
+@pytest.mark.parametrize("unit", [1e-15, 1e15])
+def test_the_unit_of_all_measures_does_not_matter(unit: float) -> None:
+    assert critic_weights(unit * BY_HAND) == pytest.approx(critic_weights(BY_HAND))
+
+
 def test_a_constant_measure_weighs_nothing_and_changes_nothing() -> None:
     constant = np.full((4, 1), 0.7)
 

@@ -59,6 +59,15 @@ def test_the_example_by_hand() -> None:
     assert found.ranking == ("b", "a")
 
 
+def test_a_collision_leaves_the_driving_score_alone() -> None:
+    """Half of everything: (1/2) / 4, and not (1/2 + 1/2 + 1/2 - 1/2) / 4."""
+    half = (70, 100, 0.5, 7.5)
+
+    found = eer({"a": measures(half, half, crashed="x.")}, EQUAL)
+
+    assert found.routes["a"] == pytest.approx([100 / 8, 100 / 4])
+
+
 def test_smallest_and_largest_of_all_routes_are_the_scale() -> None:
     scale = eer(BY_HAND).scale
 
@@ -197,3 +206,10 @@ def test_without_a_record_nothing_is_made_up() -> None:
 
     assert np.isnan(found.table()[0, 1:]).all()
     assert found.crashed.tolist() == [True]
+
+
+@pytest.mark.parametrize("kind", InfractionKind)
+def test_of_all_infractions_a_collision_alone_is_a_crash(kind: InfractionKind) -> None:
+    found = route_measures([drive(infraction(kind, 50.0)), drive()], 1.0)
+
+    assert found.crashed.tolist() == [kind.name.startswith("COLLISION"), False]

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import onnx_ir as ir
 import pytest
-import torch
 
 from me2e_compress import graph
 from me2e_compress.modules import Assignment, ModuleMap, assign
@@ -34,15 +33,13 @@ class Reference:
 
 
 @pytest.fixture(scope="session")
-def vad(vad_tiny: Path, vad_truth: truth.Truth) -> Reference:
+def vad(vad_tiny: Path, vad_torch: VadTiny, vad_truth: truth.Truth) -> Reference:
     """VAD-tiny with nuScenes heads, seed 0, opset 17."""
     model = graph.load(vad_tiny)
-    with torch.device("meta"):
-        shapes = VadTiny()
     return Reference(
         model,
         assign(model, ModuleMap.load("vad")),
         vad_truth,
-        {name: tensor.numel() for name, tensor in shapes.named_parameters()},
-        {name: tensor.numel() for name, tensor in shapes.state_dict().items()},
+        {name: tensor.numel() for name, tensor in vad_torch.named_parameters()},
+        {name: tensor.numel() for name, tensor in vad_torch.state_dict().items()},
     )

@@ -20,6 +20,7 @@ from me2e_compress.operators import (
 from me2e_compress.operators.attention_layouts import RawAttention
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from tests.operators.running import body_and_reference, graph_of, run
+from tests.profiles import scaled
 
 OPERATOR = DeformableAttention()
 SHAPES = ["spatial_shapes", "level_start_index"]
@@ -78,7 +79,7 @@ def arrays_of(dialect: Dialect, call: dict[str, Any]) -> dict[str, npt.NDArray[A
     }
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=scaled(10))
 @given(
     dialect=dialects,
     call=calls,
@@ -124,7 +125,7 @@ def test_in_float64_the_body_is_the_reference_to_rounding(name: str) -> None:
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-12)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=scaled(10))
 @given(call=calls, one=dialects, other=dialects)
 def test_a_round_trip_through_another_dialect_gives_the_same(
     call: dict[str, Any], one: Dialect, other: Dialect

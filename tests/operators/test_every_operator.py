@@ -23,6 +23,7 @@ from me2e_compress.operators import (
 )
 from me2e_compress.operators.grid_sampler import ScaledGrid
 from tests.operators.running import body_and_reference, graph_of, run
+from tests.profiles import scaled
 
 Arrays = dict[str, npt.NDArray[Any]]
 Draw = Callable[[Dialect, np.random.Generator], tuple[Arrays, Mapping[str, Any]]]
@@ -187,7 +188,7 @@ def test_maps_that_are_all_empty() -> None:
     hold(operator, operator.own, seed=1301, opset=13, known=False)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=scaled(15))
 @given(row=rows, seed=seeds, opset=st.sampled_from([13, 17, 20]), known=st.booleans())
 def test_the_body_is_the_reference(
     row: tuple[Operator, Dialect], seed: int, opset: int, known: bool

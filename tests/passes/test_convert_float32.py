@@ -3,7 +3,7 @@
 import onnx
 import onnx_ir as ir
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.passes.convert_float32 import ConvertFloat32
@@ -33,6 +33,15 @@ HEAD = '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>\n'
 )
 def test_where_nothing_is_to_be_done(text: str) -> None:
     assert apply(ConvertFloat32(), read(HEAD + text)).changes == 0
+
+
+def test_a_cast_casts_to_the_new_type() -> None:
+    text = "g (int32[2] x) => (float16[2] y) { a = Cast<to = 10>(x) y = Relu(a) }"
+
+    found = apply(ConvertFloat32(), read(HEAD + text)).model.graph
+
+    to = [each.attributes.get_int("to") for each in found if each.op_type == "Cast"]
+    assert to == [1, 10]
 
 
 def test_what_is_unread_goes_with_a_change() -> None:
@@ -77,7 +86,6 @@ def models(draw: st.DrawFn) -> ir.Model:
     )
 
 
-@settings(deadline=None)  # the machine may be busy
 @given(models())
 def test_what_it_claims_it_did_and_only_once(model: ir.Model) -> None:
     result = apply(ConvertFloat32(), model)

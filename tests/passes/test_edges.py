@@ -20,6 +20,7 @@ from me2e_compress.passes.edges import Edge
 from me2e_compress.passes.parts import stretched
 from me2e_compress.runtime.session import run_once
 from tests.nets import net
+from tests.profiles import scaled
 
 Numbers = npt.NDArray[np.float32]
 
@@ -323,7 +324,7 @@ def test_a_substitute_for_a_reader_says_by_what() -> None:
     st.sampled_from(["append", "add"]),
     st.sampled_from(["plan", "lanes", "taken"]),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=scaled(25))
 def test_what_does_not_depend_on_the_reader_stays(
     source: str, reader: str, how: str, output: str
 ) -> None:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 
 from me2e_compress.graph import provenance
 from me2e_compress.passes.eliminate_redundant import EliminateRedundant
-from tests.passes.small import NO_MODULES, apply, compute, ops, read
+from tests.passes.small import apply, compute, ops, read
+from tests.profiles import scaled
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
 
@@ -68,13 +69,8 @@ def test_identities_go(call: str, weights: dict[str, Any]) -> None:
         ("Dropout(a, r, t)", {"r": np.float32(0.5), "t": np.bool_(True)}, "trains"),
         ("Clip(a, c)", ONE, "has a bound"),
         (
-            "Slice(a, s, e, x0, t)",
-            {
-                "s": np.array([-1]),
-                "e": np.array([-99]),
-                "x0": np.array([0]),
-                "t": np.array([-1]),
-            },
+            "Slice(a, s, e, x0, s)",
+            {"s": np.array([-1]), "e": np.array([-99]), "x0": np.array([0])},
             "reverses",
         ),
     ],
@@ -83,8 +79,7 @@ def test_what_only_looks_like_an_identity_stays(
     call: str, weights: dict[str, Any], why: str
 ) -> None:
     model = read(one(call, out="float[A,B]"), **weights)
-    EliminateRedundant().run(model, NO_MODULES)
-    assert len(ops(model)) == 3, why
+    assert apply(EliminateRedundant(), model).changes == 0, why
 
 
 MERGES: list[tuple[str, str, list[str] | None]] = [
@@ -312,7 +307,7 @@ STEPS = (
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=scaled(60))
 @given(st.lists(st.sampled_from(STEPS), min_size=1, max_size=12))
 def test_random_chains_keep_every_bit(steps: list[str]) -> None:
     lines, last = [], "x"

@@ -13,6 +13,7 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fold_constants.choice import ENTRY_BYTES
 from me2e_compress.passes.work import work
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
+from tests.profiles import scaled
 
 SHAPE_CHAIN = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -285,7 +286,7 @@ def programs(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     return text, {name: array for name, array in weights.items() if name in body}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=scaled(60))
 @given(programs(), st.sampled_from([0, 40, 512, 10**6]))
 def test_random_programs_keep_their_meaning_and_their_price(
     program: tuple[str, dict[str, Any]], bytes_per_node: int

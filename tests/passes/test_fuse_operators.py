@@ -18,6 +18,7 @@ from me2e_compress.passes.base import PassResult
 from me2e_compress.passes.fuse_operators import FuseOperators, numeric_check
 from tests.passes.decomposed import Sizes, decomposed
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
+from tests.profiles import scaled
 
 FUSED = "MultiScaleDeformableAttention"
 SEED = 3
@@ -85,7 +86,7 @@ def test_it_stands_for_all_that_it_was() -> None:
     assert set(past.origins) == names
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=scaled(12))
 @given(
     st.builds(
         Sizes,

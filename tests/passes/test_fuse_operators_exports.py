@@ -2,7 +2,6 @@
 
 import warnings
 from pathlib import Path
-from typing import Any
 
 import onnx_ir as ir
 import pytest
@@ -46,41 +45,6 @@ def test_every_deformable_attention_of_vad_tiny(vad_tiny: Path) -> None:
     # three encoder layers have two each, two decoders of three layers one a layer
     assert result.steps[-1].changes == len(fused(result.model)) == 12
     assert moves(result.model) == []
-
-
-def test_every_deformable_attention_of_deformable_detr(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
-    transformers = pytest.importorskip("transformers")
-    backbone = transformers.ResNetConfig(
-        depths=[1, 1, 1, 1], layer_type="basic", hidden_sizes=[16, 32, 64, 128],
-        embedding_size=16, out_features=["stage2", "stage3", "stage4"],
-    )  # fmt: skip
-    config = transformers.DeformableDetrConfig(
-        backbone_config=backbone, d_model=64, encoder_layers=2, decoder_layers=3,
-        encoder_ffn_dim=64, decoder_ffn_dim=64, num_queries=20,
-        attn_implementation="eager",
-    )  # fmt: skip
-    network = transformers.DeformableDetrForObjectDetection(config).eval()
-    file = tmp_path / "detr.onnx"
-    image = torch.randn(1, 3, 96, 128)
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")
-        network.forward = _tensors(network.forward)
-        torch.onnx.export(
-            network, (image,), str(file), opset_version=17, dynamo=False,
-            input_names=["x"], output_names=["logits", "boxes"],
-        )  # fmt: skip
-    result = compressed(file)
-    assert result.steps[-1].changes == len(fused(result.model)) == 2 + 3
-    assert moves(result.model) == []
-
-
-def _tensors(forward: Any) -> Any:
-    def call(x: Any) -> Any:
-        found = forward(x)
-        return found.logits, found.pred_boxes
-
-    return call
 
 
 @pytest.mark.parametrize("dynamo", [False, True])

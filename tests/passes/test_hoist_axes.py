@@ -3,7 +3,7 @@
 import onnx_ir as ir
 import pytest
 
-from tests.passes.hoisted import graph_of, hoist, integers, normal
+from tests.passes.hoisted import graph_of, hoist, integers, normal, products
 
 REPEATED = "b = Expand(a, many)  c = Reshape(b, flat)"
 ALONG_AXIS = {
@@ -62,6 +62,52 @@ def test_an_axis_of_a_softmax_may_not_be_negative_before_opset_11() -> None:
     model = hoist(text, many=integers(20, 5, 4, 32), flat=integers(400, 32))
 
     assert of("Softmax", model).attributes.get_int("axis") == 3
+
+
+@pytest.mark.parametrize("version", [11, 12, 13, 17])
+@pytest.mark.parametrize("operator", ["Softmax", "LogSoftmax"])
+def test_the_default_axis_of_a_softmax_is_the_second_before_opset_13(
+    operator: str, version: int
+) -> None:
+    text = graph_of(
+        "(float[1,4,32] a) => (float[20,4,32] y)",
+        f"b = Expand(a, many)  y = {operator}(b)",
+        version,
+    )
+
+    model = hoist(text, many=integers(20, 4, 32))
+
+    rows = 1 if version >= 13 else 20
+    assert of(operator, model).outputs[0].shape == (rows, 4, 32)
+
+
+@pytest.mark.parametrize(("scale", "rows"), [((32,), 1), ((6, 32), 6)])
+def test_a_scale_for_every_row_is_not_moved_with_one_row(
+    scale: tuple[int, ...], rows: int
+) -> None:
+    text = graph_of(
+        "(float[20,1,32] a) => (float[20,6,32] y)",
+        "b = Expand(a, many)  y = LayerNormalization<axis = -1>(b, g)",
+    )
+
+    model = hoist(text, many=integers(20, 6, 32), g=normal(*scale))
+
+    assert of("LayerNormalization", model).outputs[0].shape == (20, rows, 32)
+
+
+@pytest.mark.parametrize("attributes", ["alpha = 0.5", "beta = 3.0", "transB = 1"])
+def test_a_gemm_of_repeated_rows_keeps_its_attributes(attributes: str) -> None:
+    text = graph_of(
+        "(float[1,5,4,32] a) => (float[400,32] y)",
+        f"{REPEATED} y = Gemm<{attributes}>(c, w, v)",
+    )
+
+    model = hoist(
+        text, many=integers(20, 5, 4, 32), flat=integers(400, 32),
+        w=normal(32, 32), v=normal(32),
+    )  # fmt: skip
+
+    assert products(model) == 5 * 4 * 32 * 32
 
 
 def test_a_transposed_constant_of_one_number_is_no_scaled_head() -> None:

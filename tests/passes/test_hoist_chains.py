@@ -19,6 +19,7 @@ from tests.passes.hoisted import (
     products,
 )
 from tests.passes.small import NO_MODULES, read
+from tests.profiles import scaled
 
 MOVES = (
     "expand",
@@ -105,7 +106,7 @@ ONE_ROW_OF_TWO = (
 
 @hypothesis.given(chains())
 @hypothesis.example(ONE_ROW_OF_TWO)
-@hypothesis.settings(max_examples=60, deadline=None)
+@hypothesis.settings(max_examples=scaled(60))
 def test_any_chain_in_front_of_a_product(drawn: tuple[str, dict[str, Any]]) -> None:
     """Products this small never pay: here one costs what starting a node does."""
     text, weights = drawn

@@ -11,6 +11,7 @@ from me2e_compress import graph
 from me2e_compress.passes import PassResult
 from me2e_compress.passes.fuse_basic import FuseBasic
 from tests.passes.small import apply, compute, ops, read
+from tests.profiles import scaled
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
 
@@ -83,7 +84,7 @@ def test_copies_that_cost_more_than_their_nodes_are_worth_are_not_made() -> None
     assert "left 4: Conv that shares its weights" in result.notes
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=scaled(25))
 @given(st.text("bc-", min_size=1, max_size=4), st.integers(1, 5))
 def test_whatever_follows_the_outputs_stay(followers: str, channels: int) -> None:
     before, after, _ = fused(followers, channels)

@@ -228,30 +228,6 @@ def test_a_layer_behind_a_layer_is_no_position() -> None:
     assert (found["h"].rule, found["o"].rule) == ("layer", "coordinates")
 
 
-@pytest.mark.parametrize(
-    ("queries", "keys", "remark"),
-    [
-        (512, 300, "close to the limit of 512"),
-        (300, 530, "close to the limit of 512"),
-        (901, 300, "one within the limit of 512, one beyond"),
-        (300, 300, ""),
-        (900, 900, ""),
-    ],
-)
-def test_borderline_attention_is_reported(queries: int, keys: int, remark: str) -> None:
-    text = OPSETS + (
-        f"a (float[{queries},32] q, float[32,{keys}] k, float[{keys},32] v)"
-        f" => (float[{queries},32] y)"
-        " { s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v) }"
-    )
-    plan = make_plan(net(text, {}), HEAD, RULE_SETS.parse("safe"))
-
-    assert [remark in each.borderline for each in plan.decisions] == [
-        True, not remark, True,
-    ]  # fmt: skip
-    assert len(plan.borderline) == (2 if remark else 0)
-
-
 @dataclass(frozen=True)
 class OnlySmall(Rule):
     """Products of more than some columns stay float."""

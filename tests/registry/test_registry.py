@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 import pydantic
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import MissingExtraError, StudyError
@@ -170,7 +170,6 @@ def test_items_are_parted_by_commas() -> None:
 SHORT = st.text(max_size=6)
 
 
-@settings(deadline=None)
 @given(
     st.builds(
         Square,
@@ -189,7 +188,6 @@ def test_text_and_items_are_the_same_thing(square: Square) -> None:
     assert SHAPES.parse_all(SHAPES.text_all([square, square])) == (square, square)
 
 
-@settings(deadline=None)
 @given(st.floats(allow_nan=False), st.booleans())
 def test_a_single_number_stands_behind_a_colon(radius: float, defaults: bool) -> None:
     text = SHAPES.text(Circle(radius), defaults=defaults)

@@ -3,7 +3,7 @@
 import numpy as np
 import onnx_ir as ir
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress import rewrite
@@ -150,7 +150,6 @@ def models(draw: st.DrawFn) -> ir.Model:
 
 
 @pytest.mark.parametrize("current", [EliminateRedundant(), FuseBasic()])
-@settings(deadline=None)  # the machine may be busy
 @given(model=models())
 def test_a_second_run_changes_nothing(current: Pass, model: ir.Model) -> None:
     once = apply(current, model).model

@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from onnx.reference import ReferenceEvaluator
 
@@ -49,7 +49,6 @@ def hold(model: ir.Model, ports: object, expected: list[Any]) -> None:
         np.testing.assert_array_equal(got, want)
 
 
-@settings(deadline=None)  # the machine may be busy
 @given(models(), st.data())
 def test_put(model: ir.Model, data: st.DataObject) -> None:
     ports, expected = graph.interface(model), answers(model)
@@ -63,7 +62,6 @@ def test_put(model: ir.Model, data: st.DataObject) -> None:
     assert zero.name != "v0"
 
 
-@settings(deadline=None)  # the machine may be busy
 @given(models())
 def test_bypass_and_remove_dead(model: ir.Model) -> None:
     ports, expected = graph.interface(model), answers(model)
@@ -79,7 +77,6 @@ def test_bypass_and_remove_dead(model: ir.Model) -> None:
     assert rewrite.remove_dead(model.graph) == 0
 
 
-@settings(deadline=None)  # the machine may be busy
 @given(models(), st.data())
 def test_replace_value_refuses_what_would_change_the_interface(
     model: ir.Model, data: st.DataObject

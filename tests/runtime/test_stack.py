@@ -14,6 +14,7 @@ from me2e_compress.runtime.session import Session, replay
 from me2e_compress.runtime.stack.split_stack import SplitStack, digest_of_files
 from me2e_compress.runtime.stack.stack_file import PartEntry, StackFile, StateEntry
 from me2e_compress.runtime.stack.stack_session import StackSession, open_session
+from tests.profiles import scaled
 from tests.stacks import HEAD, HEAD_FIRST, THREE_FILES, TWO_PARTS, ones, write_stack
 
 
@@ -148,7 +149,7 @@ FILE = st.none() | NAME.map(lambda name: Path(f"{name}.onnx"))
     state=st.dictionaries(TEXT, st.tuples(st.none() | TEXT, TEXT), max_size=2),
     metadata=st.dictionaries(TEXT, TEXT, max_size=2),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=scaled(40))
 def test_what_is_written_is_read_again(
     parts: list[tuple[str, Path | None, str | None]],
     edges: dict[str, str],

@@ -1,11 +1,25 @@
 """The driver that ships is a policy by its name, everywhere."""
 
+from pathlib import Path
+
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.evaluators.highway.drivers import image_size_of
-from me2e_compress.passes import PASSES
-from me2e_compress.study import Variant
+from me2e_compress.study import load_study
 from me2e_compress.workflows.evaluate import driver_of
 from me2e_compress.zoo.shipped import shipped
+
+STUDY = """
+title = "Half of it"
+baseline = "half"
+routes = 1
+[[variant]]
+name = "half"
+policy = "highway"
+passes = "convert-float16"
+[[condition]]
+name = "ideal"
+latency = "none"
+"""
 
 
 def test_it_is_found_by_name() -> None:
@@ -15,8 +29,13 @@ def test_it_is_found_by_name() -> None:
     assert driver.fingerprint() == driver_named(str(shipped("highway"))).fingerprint()
 
 
-def test_a_study_may_compress_it() -> None:
-    assert Variant("small", "highway", (PASSES.parse("fuse-basic"),)).is_model
+def test_a_study_may_compress_it(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+
+    (half,) = load_study(tmp_path / "study.toml").variants
+
+    assert Path(half.policy) == shipped("highway")
+    assert [each.name for each in half.passes] == ["convert-float16"]
 
 
 def test_evaluate_takes_its_file() -> None:

@@ -24,6 +24,7 @@ from tests.evaluators.bench2drive.files import (
     recording,
     write,
 )
+from tests.profiles import scaled
 
 GOOD = record(1711)
 OTHER = record(2082, "Accident", score=(60.0, 1.0, 60.0), status="Failed - TickRuntime")
@@ -364,7 +365,9 @@ FILES = {
 }
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=scaled(60)
+)
 @given(
     st.sampled_from(list(FILES)),
     st.floats(0.0, 1.0),

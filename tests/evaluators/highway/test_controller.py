@@ -26,6 +26,7 @@ from tests.evaluators.highway.tiny_world import (
     ego_at,
     straight,
 )
+from tests.profiles import scaled
 
 LENGTH_M = 5.0
 
@@ -146,7 +147,7 @@ def test_it_returns_to_the_line_without_swinging() -> None:
 
 
 @given(st.floats(-7.0, 2.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=scaled(20))
 def test_a_steady_acceleration_is_asked_for_exactly(rate: float) -> None:
     """Where nothing lags any more, the plan's acceleration comes out."""
     times, speed = 0.5 * np.arange(1, 7), 22.0

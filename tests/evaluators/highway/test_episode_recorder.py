@@ -3,10 +3,20 @@
 from types import SimpleNamespace
 from typing import cast
 
+import numpy as np
 import pytest
 
-from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
-from me2e_compress.simulator.scene import Actor, ActorKind, Scene
+from me2e_compress.evaluators.highway.episode_recorder import (
+    EpisodeRecorder,
+    junction_m,
+)
+from me2e_compress.simulator.scene import (
+    Actor,
+    ActorKind,
+    Command,
+    RoutePath,
+    Scene,
+)
 from me2e_compress.simulator.world import World
 from tests.evaluators.highway.tiny_world import actor, ego_at
 
@@ -45,3 +55,32 @@ def test_the_traffic_is_the_mean_of_moving_and_standing_vehicles() -> None:
 )
 def test_what_is_no_vehicle_in_traffic_is_left_out(kind: ActorKind) -> None:
     assert traffic_speed(actor(10.0, speed=1.0, kind=kind)) is None
+
+
+@pytest.mark.parametrize(
+    ("commands", "goal_m", "expected"),
+    [
+        ("FFFLLFFFFF", 9.0, 3 + 20.0),
+        ("FFFFRFFFFF", 9.0, 4 + 20.0),
+        ("FSFFRFFFFF", 9.0, 1 + 20.0),
+        ("FFFCDFFFFF", 9.0, None),
+        ("FFFFFFFFLL", 9.0, 8 + 20.0),
+        ("FFFFFFFFFL", 9.0, None),
+        ("FFFFFFFFFL", 9.5, 9 + 20.0),
+    ],
+)
+def test_a_junction_is_20_m_behind_the_first_turn_that_comes_before_the_goal(
+    commands: str, goal_m: float, expected: float | None
+) -> None:
+    names = {
+        "F": Command.FOLLOW,
+        "L": Command.LEFT,
+        "R": Command.RIGHT,
+        "S": Command.STRAIGHT,
+        "C": Command.CHANGE_LEFT,
+        "D": Command.CHANGE_RIGHT,
+    }
+    ahead = np.array([names[each] for each in commands], np.int64)
+    path = SimpleNamespace(commands=ahead, goal_m=goal_m)
+
+    assert junction_m(cast(RoutePath, path)) == expected

@@ -28,6 +28,7 @@ from tests.evaluators.highway.tiny_world import (
     signal_at,
     straight,
 )
+from tests.profiles import scaled
 
 RED = SignalState.RED
 
@@ -174,7 +175,7 @@ def test_it_drives_round_a_ring(radius: float) -> None:
     st.floats(0.0, 14.0),
     st.floats(-0.5, 0.5),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=scaled(40))
 def test_it_plans_from_any_state(
     y: float, heading: float, speed: float, steering: float
 ) -> None:

@@ -15,6 +15,7 @@ from me2e_compress.runtime import fused_nodes
 from me2e_compress.runtime.session import Session
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import arrays_of
+from tests.profiles import scaled
 
 pytestmark = pytest.mark.skipif(
     kernels.why_not() is not None, reason=str(kernels.why_not())
@@ -37,7 +38,7 @@ calls = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=scaled(20))
 @given(
     dialect=st.sampled_from(OPERATOR.all_dialects()),
     call=calls,

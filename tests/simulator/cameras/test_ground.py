@@ -13,6 +13,7 @@ from me2e_compress.simulator.cameras import (
     paint_texture,
 )
 from me2e_compress.simulator.scene import Ego, Roadmap
+from tests.profiles import scaled
 from tests.simulator.cameras import town
 
 FRONT = CAMERA_NAMES.index("FRONT")
@@ -43,7 +44,7 @@ def centroid(polygon: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.asarray(((a + b) * cross[:, None]).sum(axis=0) / (3 * cross.sum()))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=scaled(25))
 @given(
     distance=st.floats(6.0, 22.0),
     azimuth=st.floats(-np.pi, np.pi),

@@ -20,6 +20,7 @@ from me2e_compress.simulator.scene import (
     ActorKind,
     SignalState,
 )
+from tests.profiles import scaled
 from tests.simulator.cameras import town
 
 Floats = npt.NDArray[np.float64]
@@ -248,7 +249,7 @@ def test_what_is_far_away_is_not_drawn(cameras: Cameras) -> None:
     np.testing.assert_array_equal(cameras.render(far), cameras.render(town.scene()))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=scaled(30))
 @given(
     st.lists(
         st.tuples(

@@ -9,6 +9,7 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules.paper_rules import PaperRules
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.nets import net
+from tests.profiles import scaled
 from tests.targets.onnxruntime.lowered import (
     FULL,
     TOKENS,
@@ -32,7 +33,7 @@ def test_linear_layers_get_int8_kernels_at_every_rank() -> None:
     assert not {"Gemm", "MatMul", "Relu"} & set(found)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=scaled(20))
 @given(seed=st.integers(0, 2**32 - 1), reach=st.floats(0.5, 8.0))
 def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) -> None:
     model = linear(seed)

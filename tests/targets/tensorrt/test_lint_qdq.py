@@ -181,6 +181,11 @@ PAIR = "<float s = {0.5}, float t = {0.25}, int8 z = {0}, uint8 u = {0}, int32 i
             ("error", "integer-pair", "a dequantized tensor is cast to an index or"),
         ),
         (
+            "m (float[2] x) => (int32[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"
+            " d = DequantizeLinear(q, s, z) y = Cast<to=6>(d) }",
+            ("error", "integer-pair", "a dequantized tensor is cast to an index or"),
+        ),
+        (
             "m (float[2] x) => (float[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"
             " y = DequantizeLinear(q, s, z) }",
             ("warning", "output-pair", "graph output y is rounded"),

@@ -17,6 +17,7 @@ from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.weights import quantize_weight
 from tests.nets import MODULES, PAPER, conv_attention, net
+from tests.profiles import scaled
 
 FULL = QuantScheme.named("full", MODULES)
 
@@ -142,7 +143,7 @@ def fake_quantized(x: Floats, scale: Floats) -> npt.NDArray[np.float64]:
     return np.asarray(steps * scale.astype(np.float64))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=scaled(20))
 @given(seed=st.integers(0, 2**32 - 1), reach=st.floats(0.5, 8.0))
 def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) -> None:
     model = layers(seed)
@@ -161,7 +162,7 @@ def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) ->
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=scaled(50))
 @given(seed=st.integers(0, 2**32 - 1), axis=st.integers(0, 2))
 def test_a_weight_is_off_by_half_a_step_at_most(seed: int, axis: int) -> None:
     weight = np.random.default_rng(seed).standard_normal((3, 4, 5)).astype(np.float32)
