@@ -136,6 +136,7 @@ class _Job:
             "choice of frames": list(blank.frames),
             "list of tensors": list(blank.tensors),
             "optimization level": settings.optimize,
+            "provider": settings.provider.name,
             "kind of statistics": "counts" if passes == 2 else "extremes",
         }
         self.checkpoint = CalibrationCheckpoint(

@@ -97,7 +97,7 @@ def prepare_variant(
     if not source.is_file():
         raise StudyError(f"variant {variant.name}: {source}: no such model")
     if variant.passes:
-        model = _compressed(study, variant, workspace, listener)
+        model = _compressed(study, variant, source, workspace, listener)
     driver = replace(
         driver,
         path=model,
@@ -153,13 +153,16 @@ class _Report(BaseModel):
 
 
 def _compressed(
-    study: Study, variant: Variant, workspace: Workspace, listener: Listener
+    study: Study,
+    variant: Variant,
+    source: Path,
+    workspace: Workspace,
+    listener: Listener,
 ) -> Path:
     """Apply the passes, unless the same was done before; the report is written last.
 
     What is there is taken if it is still the file that its report was written of.
     """
-    source = Path(variant.policy)
     frames = None if study.frames is None else CalibrationSet(study.frames)
     path = workspace.model(variant, _key(study, variant, source, frames))
     if path.is_file() and beside(path, "report").is_file():

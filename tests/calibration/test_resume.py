@@ -1,5 +1,6 @@
 import dataclasses
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.providers import CPU, CpuProvider, Provider
 from tests.frames import record
 from tests.nets import conv_attention, image
 
@@ -55,12 +57,20 @@ def test_a_killed_calibration_goes_on_where_it_was(
 
 
 @dataclasses.dataclass(frozen=True)
+class Elsewhere(CpuProvider):
+    """The same kernels under another name."""
+
+    name: ClassVar[str] = "elsewhere"
+
+
+@dataclasses.dataclass(frozen=True)
 class Other:
     """What a later calibration differs in from the one that was killed."""
 
     tensors: tuple[str, ...] = TENSORS
     method: str = "mse"
     optimize: bool = True
+    provider: Provider = CPU
     model: int = 0
     first_image: int = 0
     last_frames: int = 6
@@ -72,6 +82,7 @@ class Other:
         (Other(tensors=TENSORS[:1]), "another list of tensors"),
         (Other(method="max-min"), "another kind of statistics"),
         (Other(optimize=False), "another optimization level"),
+        (Other(provider=Elsewhere()), "another provider"),
         (Other(model=1), "another model"),
         (Other(first_image=1), "another recording"),
         (Other(last_frames=2), "another choice of frames"),
@@ -91,8 +102,9 @@ def test_the_checkpoint_of_another_calibration_is_refused(
 
     with pytest.raises(FramesError, match=f"stale: a checkpoint of {message};"):
         Calibrator(
-            other.method, threads=1, optimize=other.optimize, checkpoint=path
-        ).collect(conv_attention(other.model), other.tensors, frames)
+            other.method, threads=1, optimize=other.optimize, checkpoint=path,
+            provider=other.provider,
+        ).collect(conv_attention(other.model), other.tensors, frames)  # fmt: skip
 
 
 def test_a_file_that_is_no_checkpoint_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -16,7 +16,9 @@ FORMS = {
         {"root": np.sqrt(2), "one": 1.0},
         0.5,
     ),
-    "Sigmoid": ("a = Neg(x) b = Exp(a) c = Add(b, k) y = Div(one, c)", {"one": 1.0}, 1.0),
+    "Sigmoid": (
+        "a = Neg(x) b = Exp(a) c = Add(b, k) y = Div(one, c)", {"one": 1.0}, 1.0,
+    ),
     "Softplus": ("a = Exp(x) b = Add(a, k) y = Log(b)", {}, 1.0),
     "Clip": ("a = Relu(x) y = Min(a, k)", {}, 0.5),
     "LayerNormalization": (

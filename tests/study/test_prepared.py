@@ -50,6 +50,16 @@ def no_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PassManager, "run", run)
 
 
+def test_passes_are_run_on_a_model_that_ships(make: Make, tmp_path: Path) -> None:
+    variant = Variant("small", "highway", recipe.parse("eliminate-redundant"))
+    study = make(variants=(variant,), baseline="small")
+
+    found = made(study, tmp_path)
+
+    assert found.model is not None
+    assert found.model.parent == tmp_path / "models"
+
+
 def test_passes_make_a_model_of_their_own(study: Study, tmp_path: Path) -> None:
     source = Path(study.variants[0].policy)
     before = source.read_bytes()
