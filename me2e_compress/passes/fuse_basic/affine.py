@@ -90,12 +90,14 @@ def _arithmetic(match: Match) -> _Affine | None:
     one, zero = np.ones(1), np.zeros(1)
     if node.op_type == "Add":
         return _Affine(one, numbers)
-    if node.op_type == "Mul":
-        return _Affine(numbers, zero)
     if node.op_type == "Sub":
         first = match[LAYER] is node.inputs[0]
         return _Affine(one, -numbers) if first else _Affine(-one, numbers)
-    return _Affine(1 / numbers, zero) if numbers.all() else None
+    if not numbers.all():
+        return None
+    factor = numbers if node.op_type == "Mul" else 1 / numbers
+    # zero times a sum would lose the sign of its zeros
+    return _Affine(factor, zero) if factor.all() else None
 
 
 def _is_per_channel(match: Match) -> bool:

@@ -41,7 +41,10 @@ def _is_per_column(match: Match, facts: Facts) -> bool:
     weight, factor = match.array(WEIGHT).shape, match.array(FACTOR).shape
     if len(weight) != 2 or factor not in ((), (1,), (weight[1],)):
         return False
-    return match.root.op_type == "Mul" or bool(match.numbers(FACTOR).all())
+    factor = match.numbers(FACTOR)  # zero times a sum loses its sign
+    return bool(factor.all()) and (
+        match.root.op_type == "Mul" or bool(np.isfinite(factor).all())
+    )
 
 
 def _shares(match: Match, facts: Facts) -> str | None:
