@@ -1,3 +1,4 @@
+import dataclasses
 import math
 from typing import Any
 
@@ -368,3 +369,12 @@ def test_the_way_to_a_plugin_of_tensorrt_is_checked() -> None:
 def test_a_tolerance_that_is_none_is_refused(tolerance: float) -> None:
     with pytest.raises(RecipeError, match="tolerance"):
         FuseOperators(tolerance=tolerance)
+
+
+def test_a_proof_is_no_zero_against_a_zero() -> None:
+    # With this seed the only position drawn first lies outside of the feature map.
+    model = decomposed(Sizes(n=1, q=1, m=1, p=1, d=1, levels=((2, 3),)))
+    infer_shapes(model)
+    with np.errstate(invalid="raise"):
+        FuseOperators().run(model, dataclasses.replace(NO_MODULES, seed=7))
+    assert FUSED in ops(model)

@@ -23,7 +23,8 @@ def test_a_factor_of_zero_stays_behind_its_layer(
     call, kind = LAYERS[layer]
     text = (
         '<ir_version: 9, opset_import: ["" : 17]>\n'
-        f"g ({kind} x) => ({kind} y) {{ a = {call} c = {factor}(a, z) y = Reciprocal(c) }}"
+        f"g ({kind} x) => ({kind} y)"
+        f" {{ a = {call} c = {factor}(a, z) y = Reciprocal(c) }}"
     )
     draws = np.random.default_rng(4)
     given = {
