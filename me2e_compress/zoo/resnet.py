@@ -113,9 +113,9 @@ class ResNet(nn.Module):
 class ResNet50(ResNet):
     """Images to the C5 feature map."""
 
-    def __init__(self) -> None:
-        super().__init__(Bottleneck, BLOCKS)
+    def __init__(self, width: int = STEM) -> None:
+        super().__init__(Bottleneck, BLOCKS, width)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Map [N, 3, H, W] to [N, 2048, H / 32, W / 32]."""
+        """Map [N, 3, H, W] to [N, 32 * width, H / 32, W / 32]."""
         return self.stages(images)[-1]

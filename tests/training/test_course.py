@@ -230,7 +230,18 @@ def test_other_workers_are_another_course(tmp_path: Path) -> None:
 
 def test_more_workers_than_it_trains_with_do_not_matter(tmp_path: Path) -> None:
     claim(tmp_path, FULL.on(4))
+    manifest = tmp_path / "course.json"
+    before = manifest.read_bytes()
+
     claim(tmp_path, FULL.on(8))
+
+    workers = {
+        training["workers"]
+        for each in json.loads(before)["rounds"]
+        for training in each["trainings"]
+    }
+    assert max(workers) == 4
+    assert manifest.read_bytes() == before
 
 
 def test_frames_of_an_episode_named_twice_count_once(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from me2e_compress.errors import TrainingError
 from me2e_compress.evaluators.highway.observe import can_bus_of
 from me2e_compress.simulator.scene import Ego
 from me2e_compress.training.data import Episodes, Sequences
+from tests.profiles import scaled
 from tests.training.made import SIZE, arrays_of, write
 
 LENGTHS = (3, 9, 1, 14)
@@ -25,7 +26,6 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Episodes:
     return Episodes(files, SIZE)
 
 
-@settings(deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     length=st.integers(1, 5),
@@ -58,7 +58,7 @@ def ego(x: float, y: float, heading: float) -> Ego:
     return Ego(x, y, heading, 7.0, 0.5, -0.3, 0.1, 0.0, 5.0, 2.0)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=scaled(20))
 @given(seed=st.integers(0, 2**32 - 1), stride=st.integers(1, 3))
 def test_the_can_bus_is_what_the_policy_would_be_shown(
     tmp_path_factory: pytest.TempPathFactory, seed: int, stride: int

@@ -1,6 +1,7 @@
 """A folder of episodes: whole, resumable, the same bytes however it was made."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,7 +30,7 @@ from me2e_compress.training.episodes import (
 from me2e_compress.training.episodes import collection as room
 from tests.evaluators.highway.drivers import straight_on
 
-SHORT = ("HighwayExit", "ControlLoss")
+FEW = {name: SCENARIO_ABILITIES[name] for name in ("HighwayExit", "ControlLoss")}
 WHAT = Collection(seed=3, variants=1, every=40, image_size=(16, 24))
 
 
@@ -44,14 +45,22 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 @pytest.fixture
 def two_types(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only two of the 44 types, in this process and those it starts."""
-    few = {name: SCENARIO_ABILITIES[name] for name in SHORT}
-    monkeypatch.setattr(room, "SCENARIO_ABILITIES", few)
+    monkeypatch.setattr(room, "SCENARIO_ABILITIES", FEW)
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both of them; take copies."""
+    made = tmp_path_factory.mktemp("collected") / "data"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(room, "SCENARIO_ABILITIES", FEW)
+        collect(made, WHAT, None, 1, nobody)
+    return made
 
 
 @pytest.fixture
-def folder(tmp_path: Path, two_types: None) -> Path:
-    collect(tmp_path / "data", WHAT, None, 1, nobody)
-    return tmp_path / "data"
+def folder(tmp_path: Path, collected: Path, two_types: None) -> Path:
+    return Path(shutil.copytree(collected, tmp_path / "data"))
 
 
 def test_a_file_a_route(folder: Path) -> None:

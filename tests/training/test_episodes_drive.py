@@ -32,6 +32,8 @@ from me2e_compress.training.episodes.recording_policy import (
 )
 from tests.evaluators.highway.drivers import straight_on
 
+pytestmark = pytest.mark.xdist_group("episodes")
+
 SIZE = (24, 40)
 CALM = Collection(seed=3, variants=1, every=20, image_size=SIZE, noise=0.0)
 NOISY = replace(CALM, noise=1.0)
@@ -59,6 +61,13 @@ class Witness(Expert):
 @pytest.fixture(scope="module")
 def calm() -> Arrays:
     arrays = episode_of(CALM, task(STOP), None)
+    assert arrays is not None
+    return arrays
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Arrays:
+    arrays = episode_of(NOISY, task("T_Junction"), None)
     assert arrays is not None
     return arrays
 
@@ -216,10 +225,9 @@ def test_futures_are_known_until_the_end(calm: Arrays) -> None:
     assert known[-1] <= 2
 
 
-def test_noise_leaves_the_route() -> None:
-    calm, noisy = (episode_of(how, task("T_Junction"), None) for how in (CALM, NOISY))
+def test_noise_leaves_the_route(noisy: Arrays) -> None:
+    calm = episode_of(CALM, task("T_Junction"), None)
     assert calm is not None
-    assert noisy is not None
 
     assert np.abs(calm["lateral_m"]).max() + 0.1 < np.abs(noisy["lateral_m"]).max()
 
@@ -282,10 +290,8 @@ def test_turns_are_shared(tmp_path: Path) -> None:
     assert np.min(np.diff(speed)) < -1.5  # the student's
 
 
-def test_every_route_is_its_own_noise() -> None:
-    first = episode_of(NOISY, task("T_Junction"), None)
+def test_every_route_is_its_own_noise(noisy: Arrays) -> None:
     again = episode_of(NOISY, replace(task("T_Junction"), name="other"), None)
 
-    assert first is not None
     assert again is not None
-    assert not np.array_equal(first["pose"][:4], again["pose"][:4])
+    assert not np.array_equal(noisy["pose"][:4], again["pose"][:4])

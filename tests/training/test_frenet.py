@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.training.frenet import anchors_of, project
@@ -24,7 +24,6 @@ def there_and_back(
     return np.asarray(found)
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_on_a_straight_route_project_is_the_inverse_of_along(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -34,7 +33,6 @@ def test_on_a_straight_route_project_is_the_inverse_of_along(seed: int) -> None:
     assert back[..., 1] == pytest.approx(offset[0], abs=1e-4)
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_in_a_bend_it_nearly_is(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.simulator.cameras import PixelClass
@@ -78,7 +78,6 @@ def test_steps_after_the_end_of_the_route_are_unknown() -> None:
     assert known.int().tolist() == [[0] * 6, [1, 1, 1, 1, 0, 0]]
 
 
-@settings(deadline=None)
 @given(x=st.floats(-15.9, 47.9), y=st.floats(-23.9, 23.9))
 def test_an_agent_is_in_the_cell_whose_centre_is_nearest(x: float, y: float) -> None:
     arrays = batch(1)

@@ -1,64 +1,15 @@
 """All files of a stack are calibrated in one pass of the whole."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress import graph
-from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.part_frames import PartFrames
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.stack_calibrator import StackCalibrator
 from me2e_compress.errors import FramesError, GraphError, PreconditionError
-from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.session import Session
-from me2e_compress.runtime.stack.split_stack import SplitStack
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
 from tests.stacks import THREE_FILES, dense_frames, write_dense
-
-TENSORS = {
-    "head": ("next_bev", "far"),
-    "head.first_frame": ("far",),
-    "backbone": ("a",),
-}
-
-
-@pytest.mark.parametrize("method", ["max-min", "entropy"])
-def test_ranges_are_those_of_each_file_alone(tmp_path: Path, method: str) -> None:
-    stack = SplitStack.load(write_dense(tmp_path, THREE_FILES))
-    frames = CalibrationSet(dense_frames(tmp_path))
-    models = {name: graph.load(each.path) for name, each in stack.files.items()}
-
-    found = StackCalibrator(method).run(stack, models, TENSORS, frames)
-
-    assert found == {
-        name: Calibrator(method).run(
-            models[name], names, PartFrames(stack, name, frames)
-        )
-        for name, names in TENSORS.items()
-    }
-
-
-def test_every_file_runs_once_a_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stack = SplitStack.load(write_dense(tmp_path))
-    frames = CalibrationSet(dense_frames(tmp_path))
-    models = {name: graph.load(each.path) for name, each in stack.files.items()}
-    run, runs = Session.run, list[object]()
-
-    def counted(self: Session, *given: Any, **named: Any) -> dict[str, Array]:
-        runs.append(self)
-        return run(self, *given, **named)
-
-    monkeypatch.setattr(Session, "run", counted)
-    StackCalibrator().run(stack, models, {"head": ("far",), "backbone": ()}, frames)
-
-    assert len(runs) == len(models) * len(frames)
 
 
 def test_compress_takes_the_folder(

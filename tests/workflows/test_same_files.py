@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 
 import me2e_compress as me2e
+from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.claims import RECORD
 from me2e_compress.workflows.export import export_stack
 from me2e_compress.workflows.result import Result
 from me2e_compress.workflows.routes import RoutesOptions, examine_routes, make_routes
 from tests.cli.conftest import Command
+from tests.simulator.world.driving import route_of
 
 Call = Callable[[], object]
 MAP = "map.toml"
@@ -176,7 +178,7 @@ def test_results_that_are_there_are_scored_silently(
 def test_a_set_of_routes_is_examined_silently(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    make_routes(tmp_path / "routes.json", RoutesOptions(4, 1, STOP))
+    save_routes([route_of(STOP, 1)], tmp_path / "routes.json")
 
     found = examine_routes(tmp_path / "routes.json")
 

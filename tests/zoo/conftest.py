@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame, frames
+from tests.zoo.vad.sizes import VadSize
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -22,6 +23,12 @@ def scenes() -> list[Frame]:
 
 
 @pytest.fixture(scope="session")
-def no_bev() -> NDArray[np.float32]:
+def vad_scenes(vad_size: VadSize) -> list[Frame]:
+    """The same scenes as cameras of this size see them."""
+    return list(frames(vad_size.stack, 4, seed=7, scene_length=2))
+
+
+@pytest.fixture(scope="session")
+def no_bev(vad_size: VadSize) -> NDArray[np.float32]:
     """The recurrent state at the start of a scene."""
-    return np.zeros(VAD_TINY.inputs["prev_bev"], np.float32)
+    return np.zeros(vad_size.stack.inputs["prev_bev"], np.float32)

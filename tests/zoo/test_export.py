@@ -33,7 +33,7 @@ def graph(vad_tiny: Path) -> onnx.ModelProto:
 def drives(
     vad_tiny: Path,
     vad_torch: VadTiny,
-    scenes: list[Frame],
+    vad_scenes: list[Frame],
     no_bev: NDArray[np.float32],
 ) -> list[dict[str, float]]:
     """Relative error of every output, for a first frame and for the one after it."""
@@ -43,7 +43,7 @@ def drives(
         str(vad_tiny), options, providers=["CPUExecutionProvider"]
     )
     errors, bev = [], no_bev
-    for frame in scenes[:2]:
+    for frame in vad_scenes[:2]:
         feed = {**frame, "prev_bev": bev}
         got = session.run(None, feed)
         with torch.no_grad():

@@ -17,12 +17,13 @@ from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.operators import expand, find, fused_nodes, import_domains
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.workflows.export import ExportOptions, export_stack, in_dialect
-from me2e_compress.zoo import export as exporting
 from me2e_compress.zoo.bev.attention import DecoderAttention
-from me2e_compress.zoo.export import build, trace
+from me2e_compress.zoo.export import trace
 from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame
+from me2e_compress.zoo.vad.stack import VadTiny
 from tests.operators.running import run
+from tests.zoo.vad.sizes import VadSize
 
 DIALECTS = [each.name for each in DeformableAttention().all_dialects()]
 QUERIES = (1, 5, 256)
@@ -80,21 +81,27 @@ def test_the_driver_that_ships_is_one_file(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module", params=[13, 17])
 def vad(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest,
+    vad_size: VadSize,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
     path = tmp_path_factory.mktemp("fused") / f"own-{request.param}.onnx"
-    return exporting.export("vad-tiny", path, opset=request.param, fused=True)
+    return vad_size.export(path, opset=request.param, fused=True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dialect", ["tensorrt", "mmdeploy", "derryhub"])
 def test_vad_tiny_in_a_dialect_says_what_torch_says(
-    vad: Path, dialect: str, scenes: list[Frame], no_bev: NDArray[np.float32]
+    vad: Path,
+    dialect: str,
+    vad_torch: VadTiny,
+    vad_scenes: list[Frame],
+    no_bev: NDArray[np.float32],
 ) -> None:
     model = in_dialect(graph.load(vad), dialect)
     assert len(fused_nodes(model)) == 12
-    feed: dict[str, Any] = {**scenes[0], "prev_bev": no_bev}
+    feed: dict[str, Any] = {**vad_scenes[0], "prev_bev": no_bev}
     with torch.no_grad():
-        want = build("vad-tiny")(*(torch.from_numpy(each) for each in feed.values()))
+        want = vad_torch(*(torch.from_numpy(each) for each in feed.values()))
     got = run(expanded(model), feed)
     assert np.abs(got - want[0].numpy()).max() < 1e-4 * want[0].abs().max()

@@ -3,10 +3,15 @@ from pathlib import Path
 
 import onnx
 import pytest
+import torch
 from torch import nn
 
+from me2e_compress.zoo.export import example
+from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.truth import count_macs
 from me2e_compress.zoo.vad.config import HeadsName
 from me2e_compress.zoo.vad.stack import VadTiny
+from tests.zoo.vad.sizes import SIZES, VadSize
 
 pytestmark = pytest.mark.xdist_group("vad")
 
@@ -75,6 +80,26 @@ BENCH2DRIVE = NUSCENES | {
 }
 
 
+SHAPES = {
+    "bev_embed": (10000, 1, 256),
+    "all_cls_scores": (3, 1, 300, 10),
+    "all_bbox_preds": (3, 1, 300, 10),
+    "all_traj_preds": (3, 1, 300, 6, 12),
+    "all_traj_cls_scores": (3, 1, 300, 6),
+    "map_all_cls_scores": (3, 1, 100, 3),
+    "map_all_bbox_preds": (3, 1, 100, 4),
+    "map_all_pts_preds": (3, 1, 100, 20, 2),
+    "ego_fut_preds": (1, 3, 6, 2),
+}
+
+
+@pytest.fixture(scope="module")
+def published() -> VadTiny:
+    """The module at its published size; it holds no numbers."""
+    with torch.device("meta"):
+        return VadTiny()
+
+
 def part_of(name: str) -> str:
     short = name.removeprefix("pts_bbox_head.")
     (part,) = [part for part, starts in PARTS.items() if short.startswith(starts)]
@@ -92,14 +117,38 @@ def test_parameters_are_the_published_ones(
     heads: HeadsName, parts: dict[str, int], total: int
 ) -> None:
     counts: Counter[str] = Counter()
-    for name, parameter in VadTiny(heads).named_parameters():
+    with torch.device("meta"):
+        model = VadTiny(heads)
+    for name, parameter in model.named_parameters():
         counts[part_of(name)] += parameter.numel()
     assert dict(counts) == parts
     assert counts.total() == total
 
 
-def test_published_scopes_exist() -> None:
-    names = dict(VadTiny().named_modules())
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+def test_the_interface_has_the_sizes_of_the_configuration(size: VadSize) -> None:
+    inputs, config = size.stack.inputs, size.config
+    assert inputs["img"] == (1, 6, 3, *config.image_hw)
+    assert inputs["prev_bev"] == (config.grid.cells, 1, 256)
+
+
+def test_outputs_have_the_published_shapes(published: VadTiny) -> None:
+    with torch.no_grad():
+        outputs = published(*(each.to("meta") for each in example(VAD_TINY)))
+    shapes = zip(VAD_TINY.outputs, (tuple(each.shape) for each in outputs), strict=True)
+    assert dict(shapes) == SHAPES
+
+
+def test_macs_of_the_backbone_are_those_of_resnet_50(published: VadTiny) -> None:
+    """4.087 G a 224 x 224 image without the classifier, six images 384 x 640."""
+    macs = count_macs(VAD_TINY, published)
+    expected = 4.087e9 * (384 * 640) / (224 * 224) * 6
+    assert macs["backbone"] == pytest.approx(expected, rel=2e-3)
+    assert macs["neck"] == 6 * 240 * (2048 * 256 + 9 * 256 * 256)
+
+
+def test_published_scopes_exist(published: VadTiny) -> None:
+    names = dict(published.named_modules())
     for scope in (
         "img_backbone.layer1.0.conv1",
         "img_backbone.layer4.0.downsample.0",
@@ -135,8 +184,8 @@ def test_tensors_are_pairwise_distinct(vad_torch: VadTiny) -> None:
         assert other == name
 
 
-def test_attention_blocks_have_the_published_sizes() -> None:
-    layer = VadTiny().pts_bbox_head.transformer.encoder.layers[0]
+def test_attention_blocks_have_the_published_sizes(published: VadTiny) -> None:
+    layer = published.pts_bbox_head.transformer.encoder.layers[0]
     blocks = ("attentions.0", "attentions.1", "ffns.0", "")
     sizes = [_size(layer.get_submodule(block)) for block in blocks]
     assert sizes == [230_080, 180_928, 262_912, 675_456]

@@ -1,4 +1,4 @@
-"""What VAD-tiny's random weights see, at the published size."""
+"""What VAD-tiny's random weights see."""
 
 import numpy as np
 import pytest
@@ -10,20 +10,9 @@ from me2e_compress.zoo.stacks import VAD_TINY
 from me2e_compress.zoo.synthetic_frames import Frame
 from me2e_compress.zoo.vad.stack import VadTiny
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.xdist_group("vad")
 
 COMMAND = VAD_TINY.heads["nuscenes"]
-SHAPES = {
-    "bev_embed": (10000, 1, 256),
-    "all_cls_scores": (3, 1, 300, 10),
-    "all_bbox_preds": (3, 1, 300, 10),
-    "all_traj_preds": (3, 1, 300, 6, 12),
-    "all_traj_cls_scores": (3, 1, 300, 6),
-    "map_all_cls_scores": (3, 1, 100, 3),
-    "map_all_bbox_preds": (3, 1, 100, 4),
-    "map_all_pts_preds": (3, 1, 100, 20, 2),
-    "ego_fut_preds": (1, 3, 6, 2),
-}
 
 
 class Seen:
@@ -65,13 +54,10 @@ class Seen:
 
 
 @pytest.fixture(scope="module")
-def seen(vad_torch: VadTiny, scenes: list[Frame], no_bev: NDArray[np.float32]) -> Seen:
-    return Seen(vad_torch, scenes, no_bev)
-
-
-def test_outputs_have_the_published_shapes(seen: Seen) -> None:
-    shapes = {name: tuple(value.shape) for name, value in seen.first.items()}
-    assert shapes == SHAPES
+def seen(
+    vad_torch: VadTiny, vad_scenes: list[Frame], no_bev: NDArray[np.float32]
+) -> Seen:
+    return Seen(vad_torch, vad_scenes, no_bev)
 
 
 @pytest.mark.parametrize("camera", range(6))

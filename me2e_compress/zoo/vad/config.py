@@ -7,28 +7,14 @@ from me2e_compress.zoo.bev.sizes import BevGrid
 
 HeadsName = Literal["nuscenes", "bench2drive"]
 
-IMAGE_HW = (384, 640)
-"""Pixels: 0.4 of 900 x 1600, padded to a multiple of 32."""
+RANGE = (-15.0, -30.0, -2.0, 15.0, 30.0, 2.0)
 
-GRID = BevGrid(
-    hw=(100, 100),
-    pc_range=(-15.0, -30.0, -2.0, 15.0, 30.0, 2.0),
-    rotation_centre=(100.0, 100.0),
-)
+GRID = BevGrid((100, 100), RANGE, (100.0, 100.0))
 """The previous BEV turns about the centre of the 200 x 200 base model, which all public
 tiny models keep although it is the corner of their 100 x 100 grid."""
 
-FEATURE_HWS = ((IMAGE_HW[0] // 32, IMAGE_HW[1] // 32),)
-"""Rows and columns of the only feature level."""
-
 LAYERS = 3
 """Of the BEV encoder, of the detection decoder and of the map decoder."""
-
-
-AGENTS = 300
-
-VECTORS = 100
-VECTOR_POINTS = 20
 
 AGENT_MODES = 6
 STEPS = 6
@@ -39,6 +25,36 @@ MAP_SCORE = 0.5
 
 MAP_REACH = 0.2
 """An agent sees map vectors within this distance, in normalised BEV coordinates."""
+
+
+@dataclass(frozen=True)
+class VadConfig:
+    """Sizes; the defaults are the published ones.
+
+    Attributes:
+        image_hw: Pixels: 0.4 of 900 x 1600, padded to a multiple of 32.
+        stem: Channels of the first stage of the backbone.
+        grid: Cells of the bird's eye view.
+        agents: Queries of the detection decoder.
+        vectors: Of the map.
+        vector_points: Of a map vector.
+    """
+
+    image_hw: tuple[int, int] = (384, 640)
+    stem: int = 64
+    grid: BevGrid = GRID
+    agents: int = 300
+    vectors: int = 100
+    vector_points: int = 20
+
+    @property
+    def feature_hws(self) -> tuple[tuple[int, int], ...]:
+        """Rows and columns of the only feature level."""
+        height, width = self.image_hw
+        return ((height // 32, width // 32),)
+
+
+PUBLISHED = VadConfig()
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ trained model: an exporter merges equal ones.
 from collections.abc import Iterator
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from me2e_compress.zoo.bev.sizes import Sampling
 from me2e_compress.zoo.drawing import Gains, draw_weights, one_thread, take_statistics
-from me2e_compress.zoo.stacks import VAD_TINY
+from me2e_compress.zoo.stacks import VAD_TINY, Stack
 from me2e_compress.zoo.synthetic_frames import frames
 from me2e_compress.zoo.vad.config import HeadsName
 from me2e_compress.zoo.vad.stack import VadTiny
@@ -46,22 +46,37 @@ CALIBRATION_STRIDE = 2
 """Every second pixel is enough for the statistics of a channel."""
 
 
-def initialise(model: VadTiny, seed: int) -> None:
-    """Draw all parameters, then the statistics of the image branch, in place."""
+def initialise(model: VadTiny, images: Tensor, seed: int) -> None:
+    """Draw all parameters, then the statistics of the image branch, in place.
+
+    Args:
+        model: Of any size.
+        images: [N, 3, H, W], normalised.
+        seed: Of the parameters.
+    """
     draw_weights(model, Gains(GAINS, last_norm=r"bn3\.weight$"), seed)
     with one_thread():
-        _calibrate(model, seed)
+        _calibrate(model, images)
 
 
-def _calibrate(model: VadTiny, seed: int) -> None:
-    """Take normalisation statistics from rendered frames."""
-    step = CALIBRATION_STRIDE
-    images = torch.cat(
+def rendered(spec: Stack, seed: int, step: int = 1) -> Tensor:
+    """Return images of several scenes, [N, 3, H, W], every `step`-th of their pixels.
+
+    Args:
+        spec: Whose cameras see them.
+        seed: Of the scenes.
+        step: 1 for all pixels.
+    """
+    return torch.cat(
         [
             torch.from_numpy(frame["img"])[0, :, :, ::step, ::step]
-            for frame in frames(VAD_TINY, CALIBRATION_FRAMES, seed, scene_length=1)
+            for frame in frames(spec, CALIBRATION_FRAMES, seed, scene_length=1)
         ]
     )
+
+
+def _calibrate(model: VadTiny, images: Tensor) -> None:
+    """Take normalisation statistics from images."""
     features = take_statistics(model.img_backbone, images)
     for conv in _convolutions(model.img_neck):
         out = conv(features)
@@ -85,5 +100,5 @@ def build(
 ) -> VadTiny:
     """Build and initialise; the same seed gives the same bytes."""
     model = VadTiny(heads, sampling).requires_grad_(False).eval()
-    initialise(model, seed)
+    initialise(model, rendered(VAD_TINY, seed, CALIBRATION_STRIDE), seed)
     return model

@@ -10,12 +10,12 @@ from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.vad.config import (
     AGENT_MODES,
-    AGENTS,
     LAYERS,
     MAP_REACH,
     MAP_SCORE,
     STEPS,
     Heads,
+    VadConfig,
 )
 from me2e_compress.zoo.vad.perception import (
     AgentOutputs,
@@ -78,8 +78,8 @@ def nearest_points(points: Tensor) -> Tensor:
 class MotionHead(PerceptionHead):
     """Agents of six modes attend to each other and to the map."""
 
-    def __init__(self, heads: Heads, sampling: Sampling) -> None:
-        super().__init__(heads, sampling)
+    def __init__(self, heads: Heads, sampling: Sampling, config: VadConfig) -> None:
+        super().__init__(heads, sampling, config)
         self.motion_decoder = Interaction()
         self.motion_mode_query = nn.Embedding(AGENT_MODES, EMBED)
         self.pos_mlp_sa = nn.Linear(2, EMBED)
@@ -109,7 +109,7 @@ class MotionHead(PerceptionHead):
             social = self.motion_decoder(query, query, pos, pos)
             aware = self._read_map(social, centres, vectors, lanes)
             both = torch.cat([social, aware], -1)
-            both = both.view(1, AGENTS, AGENT_MODES, 2 * EMBED)
+            both = both.view(1, self.config.agents, AGENT_MODES, 2 * EMBED)
             steps = self.traj_branches[0](both)
             scores = self.traj_cls_branches[0](both).squeeze(-1)
             return MotionOutputs(

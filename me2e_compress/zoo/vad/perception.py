@@ -10,14 +10,7 @@ from me2e_compress.zoo.bev.decoder import in_metres
 from me2e_compress.zoo.bev.encoder import GridPosition
 from me2e_compress.zoo.bev.sizes import BOX_CODE, EMBED, Sampling
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.vad.config import (
-    AGENTS,
-    GRID,
-    LAYERS,
-    VECTOR_POINTS,
-    VECTORS,
-    Heads,
-)
+from me2e_compress.zoo.vad.config import LAYERS, Heads, VadConfig
 from me2e_compress.zoo.vad.transformer import PerceptionTransformer
 
 
@@ -66,16 +59,17 @@ def regressor(outputs: int, width: int = EMBED) -> nn.Sequential:
 class PerceptionHead(nn.Module):
     """Queries, the perception transformer, and the branches that read it."""
 
-    def __init__(self, heads: Heads, sampling: Sampling) -> None:
+    def __init__(self, heads: Heads, sampling: Sampling, config: VadConfig) -> None:
         super().__init__()
+        self.config = config
         self.code_weights = nn.Parameter(torch.empty(BOX_CODE))
         self.map_code_weights = nn.Parameter(torch.empty(4))
-        self.positional_encoding = GridPosition(GRID.hw)
-        self.transformer = PerceptionTransformer(sampling)
-        self.bev_embedding = nn.Embedding(GRID.cells, EMBED)
-        self.query_embedding = nn.Embedding(AGENTS, 2 * EMBED)
-        self.map_instance_embedding = nn.Embedding(VECTORS, 2 * EMBED)
-        self.map_pts_embedding = nn.Embedding(VECTOR_POINTS, 2 * EMBED)
+        self.positional_encoding = GridPosition(config.grid.hw)
+        self.transformer = PerceptionTransformer(sampling, config)
+        self.bev_embedding = nn.Embedding(config.grid.cells, EMBED)
+        self.query_embedding = nn.Embedding(config.agents, 2 * EMBED)
+        self.map_instance_embedding = nn.Embedding(config.vectors, 2 * EMBED)
+        self.map_pts_embedding = nn.Embedding(config.vector_points, 2 * EMBED)
         self.cls_branches = _repeat(classifier, heads.det_classes)
         self.reg_branches = _repeat(regressor, BOX_CODE)
         self.map_cls_branches = _repeat(classifier, heads.map_classes)
@@ -115,7 +109,9 @@ class PerceptionHead(nn.Module):
             branch(query)
             for branch, query in zip(self.cls_branches, queries, strict=True)
         ]
-        boxes = [in_metres(r, a, GRID) for r, a in zip(raw, at, strict=True)]
+        boxes = [
+            in_metres(r, a, self.config.grid) for r, a in zip(raw, at, strict=True)
+        ]
         return AgentOutputs(
             torch.stack(scores), torch.stack(boxes), queries[-1], at[-1][..., :2]
         )
@@ -123,12 +119,13 @@ class PerceptionHead(nn.Module):
     def _map(
         self, queries: list[Tensor], _raw: list[Tensor], at: list[Tensor]
     ) -> MapOutputs:
-        grouped = [q.view(1, VECTORS, VECTOR_POINTS, EMBED) for q in queries]
+        shape = 1, self.config.vectors, self.config.vector_points
+        grouped = [q.view(*shape, EMBED) for q in queries]
         scores = [
             branch(query.mean(2))
             for branch, query in zip(self.map_cls_branches, grouped, strict=True)
         ]
-        points = [a.view(1, VECTORS, VECTOR_POINTS, 2) for a in at]
+        points = [a.view(*shape, 2) for a in at]
         boxes = [_enclosing(p) for p in points]
         return MapOutputs(
             torch.stack(scores), torch.stack(boxes), torch.stack(points), grouped[-1]

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from me2e_compress.zoo.bev.decoder import Interaction
 from me2e_compress.zoo.bev.sizes import EMBED, Sampling
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.vad.config import AGENT_MODES, STEPS, Heads
+from me2e_compress.zoo.vad.config import AGENT_MODES, STEPS, Heads, VadConfig
 from me2e_compress.zoo.vad.motion import MotionHead, MotionOutputs
 from me2e_compress.zoo.vad.perception import AgentOutputs, regressor
 
@@ -16,8 +16,8 @@ Outputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, 
 class PlanningHead(MotionHead):
     """The whole head: the ego query attends to the agents, then to the map."""
 
-    def __init__(self, heads: Heads, sampling: Sampling) -> None:
-        super().__init__(heads, sampling)
+    def __init__(self, heads: Heads, sampling: Sampling, config: VadConfig) -> None:
+        super().__init__(heads, sampling, config)
         self.ego_modes = heads.ego_modes
         self.ego_query = nn.Embedding(1, EMBED)
         self.ego_agent_decoder = Interaction()

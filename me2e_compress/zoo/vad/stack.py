@@ -6,7 +6,7 @@ from me2e_compress.zoo.bev.neck import FeaturePyramid
 from me2e_compress.zoo.bev.sizes import Sampling
 from me2e_compress.zoo.regions import region
 from me2e_compress.zoo.resnet import ResNet50
-from me2e_compress.zoo.vad.config import HEADS, HeadsName
+from me2e_compress.zoo.vad.config import HEADS, PUBLISHED, HeadsName, VadConfig
 from me2e_compress.zoo.vad.planner import Outputs, PlanningHead
 
 
@@ -21,12 +21,15 @@ class VadTiny(nn.Module):
     """
 
     def __init__(
-        self, heads: HeadsName = "nuscenes", sampling: Sampling = "operator"
+        self,
+        heads: HeadsName = "nuscenes",
+        sampling: Sampling = "operator",
+        config: VadConfig = PUBLISHED,
     ) -> None:
         super().__init__()
-        self.img_backbone = ResNet50()
+        self.img_backbone = ResNet50(config.stem)
         self.img_neck = FeaturePyramid(self.img_backbone.channels[-1:])
-        self.pts_bbox_head = PlanningHead(HEADS[heads], sampling)
+        self.pts_bbox_head = PlanningHead(HEADS[heads], sampling, config)
 
     def forward(
         self, img: Tensor, lidar2img: Tensor, can_bus: Tensor, prev_bev: Tensor

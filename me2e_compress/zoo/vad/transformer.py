@@ -9,7 +9,7 @@ from me2e_compress.zoo.bev.encoder import BevEncoder
 from me2e_compress.zoo.bev.reference_points import cell_positions, ego_shift, turn
 from me2e_compress.zoo.bev.sizes import CAMERAS, EMBED, FEATURE_LEVELS, Sampling
 from me2e_compress.zoo.regions import region
-from me2e_compress.zoo.vad.config import FEATURE_HWS, GRID, IMAGE_HW, LAYERS
+from me2e_compress.zoo.vad.config import LAYERS, VadConfig
 
 
 class PerceptionTransformer(nn.Module):
@@ -17,18 +17,21 @@ class PerceptionTransformer(nn.Module):
 
     cells: Tensor
 
-    def __init__(self, sampling: Sampling) -> None:
+    def __init__(self, sampling: Sampling, config: VadConfig) -> None:
         super().__init__()
         self.sampling: Sampling = sampling
+        self.grid = config.grid
         self.level_embeds = nn.Parameter(torch.empty(FEATURE_LEVELS, EMBED))
         self.cams_embeds = nn.Parameter(torch.empty(CAMERAS, EMBED))
         self.can_bus_mlp = CanBusEncoder()
-        self.encoder = BevEncoder(GRID, IMAGE_HW, FEATURE_HWS, LAYERS, sampling)
+        self.encoder = BevEncoder(
+            config.grid, config.image_hw, config.feature_hws, LAYERS, sampling
+        )
         self.reference_points = nn.Linear(EMBED, 3)
-        self.decoder = Decoder(GRID.hw, LAYERS, sampling, height=True)
+        self.decoder = Decoder(config.grid.hw, LAYERS, sampling, height=True)
         self.map_reference_points = nn.Linear(EMBED, 2)
-        self.map_decoder = Decoder(GRID.hw, LAYERS, sampling, height=False)
-        self.register_buffer("cells", cell_positions(GRID), False)
+        self.map_decoder = Decoder(config.grid.hw, LAYERS, sampling, height=False)
+        self.register_buffer("cells", cell_positions(config.grid), False)
 
     def bev(
         self,
@@ -43,9 +46,9 @@ class PerceptionTransformer(nn.Module):
         tokens = features.flatten(2).transpose(1, 2)
         tokens = tokens + self.cams_embeds[:, None] + self.level_embeds[0]
         first = torch.logical_not(torch.any(prev_bev != 0))
-        previous = turn(prev_bev, can_bus, self.cells, GRID, self.sampling)
+        previous = turn(prev_bev, can_bus, self.cells, self.grid, self.sampling)
         query = query + self.can_bus_mlp(can_bus.unsqueeze(0))
-        shift = ego_shift(can_bus, GRID)
+        shift = ego_shift(can_bus, self.grid)
         bev: Tensor = self.encoder(
             query, pos, previous, first, shift, tokens, lidar2img
         )
