@@ -134,5 +134,5 @@ def test_what_onnxruntime_names_twice_in_a_branch_is_still_measured() -> None:
     )
     session = probed_session(model, ["y"], Extremes(), threads=1, optimize=True)
     feeds = {"s": np.array(True), "x": np.ones((2, 2, 3, 2), np.float32)}
-    low, high, _ = session.run(feeds, [READINGS])[READINGS].reshape(-1)
-    assert (low, high) == (5, 8)
+    readings = session.run(feeds, [READINGS])[READINGS].reshape(-1)
+    np.testing.assert_array_equal(readings[:2], [5, 8])

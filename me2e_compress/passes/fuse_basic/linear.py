@@ -41,10 +41,9 @@ def _is_per_column(match: Match, facts: Facts) -> bool:
     weight, factor = match.array(WEIGHT).shape, match.array(FACTOR).shape
     if len(weight) != 2 or factor not in ((), (1,), (weight[1],)):
         return False
-    factor = match.numbers(FACTOR)  # zero times a sum loses its sign
-    return bool(factor.all()) and (
-        match.root.op_type == "Mul" or bool(np.isfinite(factor).all())
-    )
+    numbers = match.numbers(FACTOR)  # zero times a sum loses its sign
+    divides = match.root.op_type == "Div"
+    return bool(numbers.all()) and not (divides and np.isinf(numbers).any())
 
 
 def _shares(match: Match, facts: Facts) -> str | None:

@@ -43,7 +43,7 @@ def _expanded(b: Builder, x: Val) -> Val:
 
 def _unsqueezed(b: Builder, x: Val) -> Val:
     """Write Unsqueeze, Expand and a view that drops or joins the new axis."""
-    axis = b.rng.randint(0, x.rank - 1)
+    axis = b.rng.randint(0, max(x.rank - 1, 0))
     count = _count(b, x)
     wide = sp.unsqueeze(b, x, axis)
     target = [1] * wide.rank
