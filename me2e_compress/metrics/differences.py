@@ -159,16 +159,22 @@ def difference(
 
 
 def _estimate(values: Sequence[float], types: Sequence[str], seed: int) -> Estimate:
-    """Return a mean of differences, its interval no narrower than n routes allow."""
+    """Return a mean of differences, its interval no narrower than n routes allow.
+
+    That over types drawn anew is no narrower than the one over these types.
+    """
     found = mean_estimate(values, types, POINTS, seed, WIDEST)
     if found.value is None or found.low is None or found.high is None:
         return found
-    low, high = unseen_interval(found.value, found.n, WIDEST)
+    least, most = unseen_interval(found.value, found.n, WIDEST)
+    low = found.low if least is None else min(least, found.low)
+    high = found.high if most is None else max(most, found.high)
+    if found.anew_low is None or found.anew_high is None:
+        return dataclasses.replace(found, low=low, high=high)
     return dataclasses.replace(
-        found,
-        low=found.low if low is None else min(low, found.low),
-        high=found.high if high is None else max(high, found.high),
-    )
+        found, low=low, high=high,
+        anew_low=min(low, found.anew_low), anew_high=max(high, found.anew_high),
+    )  # fmt: skip
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:

@@ -12,6 +12,8 @@ from me2e_compress.training.process_group import ProcessGroup
 from me2e_compress.zoo.highway.stack import Highway
 from tests.training.made import LITTLE
 
+pytestmark = pytest.mark.xdist_group("process-group")
+
 
 def average(rank: int, group: ProcessGroup, answers: torch.Tensor) -> None:
     """Twice, so that the second must not meet what the first left behind."""
