@@ -3,11 +3,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT := out
+NEWEST ?= python3.13
+WORKS := demo,frames,compress,compare,plan,lint,calibrate,profile,evaluate,score,study,routes
 JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 # tests run side by side: threads of one would spin while the other's work
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup
 
-.PHONY: coverage demo docs nightly test test-slow check check-mypy check-rest fix clean
+.PHONY: coverage demo docs newest nightly test test-slow check check-mypy check-rest fix clean
 
 demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
 	$(BIN)/me2e-compress demo -o $(OUT)
@@ -18,8 +20,16 @@ test: check  ## lint, types, layers, tests
 test-slow: $(VENV)/.test  ## what takes minutes: TensorRT-RTX builds of whole stacks, training killed and resumed, 2 GB
 	$(PYTEST) -m slow
 
-nightly: $(VENV)/.test  ## an hour: exact passes on 20,000 drawn graphs; resumes from out/nightly; FIRST=seed GRAPHS=count
+nightly: $(VENV)/.test  ## hours: all that make test leaves out; FIRST=seed GRAPHS=count of the drawn graphs, which resume from out/nightly
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.exact --graphs $(or $(GRAPHS),20000) --jobs $(JOBS) --first $(or $(FIRST),0) --out $(OUT)/nightly
+	$(PYTEST) -m "slow or not slow" --hypothesis-profile=night --cov --cov-report=term:skip-covered
+	$(MAKE) --no-print-directory docs
+	$(MAKE) --no-print-directory newest
+
+newest:  ## every command, with the newest Python that is tested
+	rm -rf $(OUT)/newest && $(NEWEST) -m venv $(OUT)/newest && git clone -q . $(OUT)/newest/source
+	$(OUT)/newest/bin/pip install -q -c constraints.txt "$(OUT)/newest/source[highway,fast]"
+	$(OUT)/newest/bin/python .ci/try_commands.py --works $(WORKS) --without sensitivity,search
 
 coverage: $(VENV)/.test  ## the same tests, with branch coverage and its floor
 	$(PYTEST) --cov --cov-report=term:skip-covered

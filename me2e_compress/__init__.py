@@ -185,19 +185,21 @@ _ROOMS = {
 _HOMES = {name: room for room, names in _ROOMS.items() for name in names}
 
 
-def __getattr__(name: str) -> object:
-    """Load a public name when it is asked for: a worker pays only for what it uses."""
-    if name in _MODULES:
-        return importlib.import_module(f"me2e_compress.{name}")
-    if name in _HOMES:
-        try:
-            home = importlib.import_module(f"me2e_compress.{_HOMES[name]}")
-        except ImportError as error:
-            if (told := explained(error)) is error:
-                raise
-            raise told from error
-        return getattr(home, name)
-    raise AttributeError(f"me2e_compress has no {name}")
+if not TYPE_CHECKING:  # else every name would be one for a type checker
+
+    def __getattr__(name: str) -> object:
+        """Load a public name when it is asked for: a worker pays for what it uses."""
+        if name in _MODULES:
+            return importlib.import_module(f"me2e_compress.{name}")
+        if name in _HOMES:
+            try:
+                home = importlib.import_module(f"me2e_compress.{_HOMES[name]}")
+            except ImportError as error:
+                if (told := explained(error)) is error:
+                    raise
+                raise told from error
+            return getattr(home, name)
+        raise AttributeError(f"me2e_compress has no {name}")
 
 
 def __dir__() -> list[str]:

@@ -2,8 +2,9 @@
 
 import abc
 import html
+import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 AT_LEAST = "≥ or -: plugins and open shapes are not counted; inspect names them"
@@ -124,8 +125,60 @@ def table(
 
 
 def number(value: float | None, form: str = ",.0f") -> str:
-    """Write a number, or a dash for what was not measured."""
-    return "-" if value is None else format(value, form)
+    """Write a number, or a dash for what was not measured; never a negative zero."""
+    if value is None:
+        return "-"
+    sign = "+" if form.startswith("+") else ""
+    return format(value, f"{sign}z{form.removeprefix('+')}")
+
+
+def significant(value: float | None, digits: int = 4) -> str:
+    """Write a number in so many digits, but no powers of ten: 4,778,000 and 0.00012.
+
+    Digits before the point are all written, and no zeros at the end of the others.
+    """
+    if value is None or not math.isfinite(value):
+        return number(value)
+    before = math.floor(math.log10(abs(value))) + 1 if value else 1
+    text = number(value, f",.{max(0, digits - before)}f")
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def counted(count: float, noun: str) -> str:
+    """Write how many there are: ``1 thread``, ``2,000 routes``, ``1.67 decisions``."""
+    text = f"{count:,}" if isinstance(count, int) else significant(count)
+    return f"{text} {noun}{'' if text == '1' else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """Write a time as people say it: ``40 s``, ``3 min``, ``2 h 5 min``."""
+    if seconds < 90:
+        return f"{max(seconds, seconds > 0):.0f} s"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+def prefixed(name: str, text: str) -> str:
+    """Write who says something before it, once."""
+    return text if text.startswith(f"{name}:") else f"{name}: {text}"
+
+
+def reason(error: BaseException) -> str:
+    """Write on one line why something failed; its kind where it says no more."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def not_measured(reasons: Mapping[str, str]) -> str:
+    """Write why things have no number, for the note of their table; empty if all have.
+
+    Args:
+        reasons: by the name of the row.
+    """
+    rows = {why: list[str]() for why in reasons.values()}
+    for name, why in reasons.items():
+        rows[why].append(name.strip())
+    said = (f"{', '.join(names)} ({why})" for why, names in rows.items())
+    return f"Not measured: {'; '.join(said)}." if reasons else ""
 
 
 def megabytes(count: float) -> str:

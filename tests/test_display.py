@@ -9,7 +9,15 @@ import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.display import Displayed
+from me2e_compress.display import (
+    Displayed,
+    counted,
+    not_measured,
+    number,
+    prefixed,
+    reason,
+    significant,
+)
 from me2e_compress.manager import PassManager
 from me2e_compress.modules import ModuleMap, assign
 from me2e_compress.passes import PASSES, Context
@@ -87,3 +95,70 @@ def test_a_plan_that_shows_itself_is_still_data(tmp_path: Path) -> None:
     save_plan(plan(), tmp_path / "plan.json")
 
     assert load_plan(tmp_path / "plan.json") == plan()
+
+
+@pytest.mark.parametrize(
+    ("value", "form", "text"),
+    [
+        (-0.001, ".2f", "0.00"),
+        (-0.001, "+.2f", "+0.00"),
+        (-0.01, "+.2f", "-0.01"),
+        (-4.6, ",.0f", "-5"),
+        (-0.0, "g", "0"),
+        (0, ".1f", "0.0"),
+        (None, ".2f", "-"),
+    ],
+)
+def test_no_number_is_a_negative_zero(
+    value: float | None, form: str, text: str
+) -> None:
+    assert number(value, form) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (4_778_000.0, "4,778,000"),
+        (1_234_567.0, "1,234,567"),
+        (5.412e-05, "0.00005412"),
+        (1e-12, "0.000000000001"),
+        (50.0, "50"),
+        (-1.67, "-1.67"),
+        (0.0, "0"),
+        (float("inf"), "inf"),
+        (None, "-"),
+    ],
+)
+def test_no_number_is_in_powers_of_ten(value: float | None, text: str) -> None:
+    assert significant(value) == text
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        *((1, "1 thread"), (0, "0 threads"), (2000, "2,000 threads")),
+        *((1.0, "1 thread"), (1.67, "1.67 threads")),
+    ],
+)
+def test_one_is_singular(count: float, text: str) -> None:
+    assert counted(count, "thread") == text
+
+
+def test_who_says_something_is_named_once() -> None:
+    assert prefixed("battery", "none here") == "battery: none here"
+    assert prefixed("battery", "battery: none here") == "battery: none here"
+
+
+def test_an_error_that_says_nothing_is_told_by_its_kind() -> None:
+    assert reason(EOFError()) == "EOFError"
+    assert reason(ValueError("two\n lines")) == "two lines"
+
+
+def test_what_is_not_measured_is_told_once_a_reason() -> None:
+    why = {"  Merging": "no route", "p99": "too few", "Give_Way": "no route"}
+
+    assert not_measured({}) == ""
+    assert (
+        not_measured(why)
+        == "Not measured: Merging, Give_Way (no route); p99 (too few)."
+    )

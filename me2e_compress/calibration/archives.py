@@ -9,6 +9,7 @@ from typing import IO
 
 import numpy as np
 
+from me2e_compress.display import reason
 from me2e_compress.documents import check_regular
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import UNREADABLE, Array
@@ -46,8 +47,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
         with path.open("rb") as source, zipfile.ZipFile(source) as archive:
             found = [_member(archive, each) for each in archive.infolist()]
     except UNREADABLE as error:
-        line = " ".join(str(error).split())[:200]
-        raise FramesError(f"{path}: not {what} ({line})") from error
+        raise FramesError(f"{path}: not {what} ({reason(error)})") from error
     if len(dict(found)) < len(found):
         raise FramesError(f"{path}: not {what} (an array is there twice)")
     total = sum(_bytes(each) for _, each in found)
@@ -74,8 +74,7 @@ def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as content:
             return {name: np.asarray(content[name]) for name in content}
     except UNREADABLE as error:
-        line = " ".join(str(error).split())[:200]
-        raise FramesError(f"{path}: not {what} ({line})") from error
+        raise FramesError(f"{path}: not {what} ({reason(error)})") from error
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Declared]:

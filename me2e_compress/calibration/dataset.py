@@ -20,7 +20,7 @@ from me2e_compress import documents
 from me2e_compress.calibration.archives import Declared, declared, load_arrays
 from me2e_compress.calibration.pixels import PixelInput, PixelInputs
 from me2e_compress.calibration.static_inputs import check_static, static_inputs
-from me2e_compress.display import Displayed, Table, table
+from me2e_compress.display import Displayed, Table, reason, table
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.runtime.frames import Array, Frame
@@ -129,7 +129,8 @@ class CalibrationSet(Displayed):
                         for each in archive.infolist()
                     )
             except (OSError, zipfile.BadZipFile) as error:
-                raise FramesError(f"{path}: not a readable .npz ({error})") from error
+                line = reason(error)
+                raise FramesError(f"{path}: not a readable .npz ({line})") from error
             seal.update(repr(entries).encode())
         return seal.hexdigest()
 

@@ -10,7 +10,7 @@ import pydantic
 from me2e_compress import documents
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import Statistics
-from me2e_compress.display import Displayed, Table, table
+from me2e_compress.display import Displayed, Table, counted, table
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.atomic import write_json
 
@@ -71,7 +71,10 @@ class Ranges(Displayed):
     @property
     def headline(self) -> str:
         """Tensors, method, frames."""
-        return f"{len(self.tensors)} tensors, {self.method}, {self.frames} frames"
+        return (
+            f"{counted(len(self.tensors), 'tensor')}, {self.method},"
+            f" {counted(self.frames, 'frame')}"
+        )
 
     def tables(self) -> tuple[Table, ...]:
         """Return a row a tensor: its bounds."""

@@ -1,26 +1,13 @@
 """The ``me2e-compress`` command, one short file each; the only room that prints."""
 
-import contextlib
 import os
-import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from threading import Timer
-from types import FrameType
-from typing import NoReturn
 
+from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, signals_in_order
 from me2e_compress.display import printable
 from me2e_compress.errors import Me2eError
 
-INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
-"""Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
-_LOST: dict[type[BaseException], signal.Signals] = {
-    KeyboardInterrupt: signal.SIGINT,
-    SystemExit: signal.SIGTERM,
-}
-"""What signals raise, by what they are."""
-_MOMENT_S = 0.02
 _AGAIN = "run again to go on"
 RESUMES = {
     **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study", "train"), _AGAIN),
@@ -36,7 +23,7 @@ def main() -> int:
     import this module again, and need none of them.
     """
     try:
-        with _terminated_in_order():
+        with signals_in_order():
             code = _run()
     except SystemExit as done:
         code = done.code if isinstance(done.code, int) else int(bool(done.code))
@@ -85,30 +72,3 @@ def _told(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     return str(error)
-
-
-@contextlib.contextmanager
-def _terminated_in_order() -> Iterator[None]:
-    """Make SIGTERM an exit like Ctrl-C: processes and drafts are cleared away.
-
-    What is raised while Python clears something away, or in a callback of native code,
-    is lost. Python tells of it; the signal is then sent once more, a moment later.
-    """
-
-    def leave(number: int, frame: FrameType | None) -> NoReturn:
-        raise SystemExit(TERMINATED)
-
-    def again(lost: "sys.UnraisableHookArgs") -> None:
-        number = _LOST.get(lost.exc_type)
-        if number is None:
-            hook(lost)
-        else:
-            Timer(_MOMENT_S, os.kill, (os.getpid(), number)).start()
-
-    hook, sys.unraisablehook = sys.unraisablehook, again
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-        sys.unraisablehook = hook

@@ -70,7 +70,7 @@ _ENTRIES = (
     CommandEntry(
         GRAPHS,
         "export",
-        "Write a reference stack as ONNX: drawn, of a checkpoint, or our driver.",
+        "Write a reference stack: random weights, a checkpoint's, or our driver.",
     ),
     CommandEntry(
         GRAPHS,
@@ -101,7 +101,7 @@ _ENTRIES = (
     CommandEntry(
         COMPRESS,
         "lint",
-        "Check a graph for the program that will run it; 1 if it would be refused.",
+        "Check a graph for the runtime that will run it; exit code 1 if it refuses.",
     ),
     CommandEntry(
         COMPRESS,

@@ -18,7 +18,7 @@ Scheme = Annotated[
     str | None, typer.Option(help="int8 modules: feature-ext, prediction or full")
 ]
 Rules = Annotated[
-    str | None, typer.Option(help="of the int8 plan: safe, paper, or see list")
+    str | None, typer.Option(help="rules of the int8 plan: safe, paper, or see list")
 ]
 Target = Annotated[
     str | None, typer.Option(help="runtime of the graph: tensorrt or onnxruntime")
@@ -33,12 +33,12 @@ Overrides = Annotated[
 SavedRanges = Annotated[
     Path | None, typer.Option("--ranges", help="saved RANGES.json instead of frames")
 ]
-METHOD = "of calibration: max-min, percentile:99.9, ..."
+METHOD = "calibration method: max-min, percentile:99.9, ..."
 Method = Annotated[str | None, typer.Option(help=METHOD)]
 RECIPE = "a TOML file, or a shipped recipe's name"
 Recipe = Annotated[str | None, typer.Option("-r", "--recipe", help=RECIPE)]
-Count = Annotated[int, typer.Option("-n", "--count", help="frames: so many")]
-Seed = Annotated[int, typer.Option(min=0, help="of everything random")]
+Count = Annotated[int, typer.Option("-n", "--count", help="number of frames")]
+Seed = Annotated[int, typer.Option(min=0, help="seed of everything random")]
 Provider = Annotated[
     str,
     typer.Option(help="runs the graph: cpu, cuda, tensorrt, tensorrt-rtx, or see list"),
@@ -48,9 +48,9 @@ Plugins = Annotated[
     typer.Option(help="a library of operators or plugins; once for each"),
 ]
 Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; 0 takes all")]
-Workers = Annotated[int, typer.Option(min=1, help="processes: as many at a time")]
+Workers = Annotated[int, typer.Option(min=1, help="processes at a time")]
 Engine = Annotated[str, typer.Option(help="local or ray")]
-Address = Annotated[str | None, typer.Option(help="of a Ray cluster")]
+Address = Annotated[str | None, typer.Option(help="address of a Ray cluster")]
 Adapter = Annotated[
     Path | None, typer.Option(help="adapts the model: A.toml, or see list")
 ]
@@ -61,16 +61,18 @@ SetDim = Annotated[
 Force = Annotated[
     bool, typer.Option("--force", help="replace what is there, whoever wrote it")
 ]
-Json = Annotated[bool, typer.Option("--json", help="for programs")]
+Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
 RecipeOutput = Annotated[Path, typer.Option("-o", "--output", help="the RECIPE.toml")]
 TrialScheme = Annotated[
-    str, typer.Option("--scheme", help="int8 modules: those that may be, as a scheme")
+    str,
+    typer.Option("--scheme", help="int8 modules: those to choose from, as a scheme"),
 ]
 TrialRules = Annotated[
-    str, typer.Option("--rules", help="of the int8 plan: safe, paper, or see list")
+    str,
+    typer.Option("--rules", help="rules of the int8 plan: safe, paper, or see list"),
 ]
 JudgedFrames = Annotated[
-    int, typer.Option("-n", "--count", help="frames: so many to judge on")
+    int, typer.Option("-n", "--count", help="number of frames (to judge on)")
 ]
 ROUTES = "routes: all, a number, ID,ID"
 Routes = Annotated[str, typer.Option(help=f"{ROUTES}; or a file of routes")]

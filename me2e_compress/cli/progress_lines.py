@@ -3,6 +3,8 @@
 import time
 from collections.abc import Callable
 
+from me2e_compress.display import duration
+
 EVERY_S = 10.0
 """Seconds between two lines."""
 
@@ -41,7 +43,8 @@ class ProgressLines:
             return
         self._said = now
         left = _left(now - self._begun, done, total)
-        self._write(", ".join(filter(None, [f"{stage}: {done}/{total} {what}", left])))
+        said = f"{stage}: {done}/{total} {what}".rstrip()
+        self._write(", ".join(filter(None, [said, left])))
 
 
 def _left(seconds: float, done: int, total: int) -> str:
@@ -49,12 +52,3 @@ def _left(seconds: float, done: int, total: int) -> str:
     if not 0 < done < total:
         return ""
     return f"{duration(seconds / done * (total - done))} left"
-
-
-def duration(seconds: float) -> str:
-    """Write a time as people say it: ``40 s``, ``3 min``, ``2 h 5 min``."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    hours, rest = divmod(minutes, 60)
-    return f"{minutes} min" if not hours else f"{hours} h {rest} min"

@@ -148,6 +148,11 @@ class TraceLatency(LatencySource):
         return self.trace
 
     @property
+    def measured(self) -> int | None:
+        """Samples of the trace, however often one is drawn."""
+        return None if self.lacks_trace else len(self.samples_us)
+
+    @property
     def lacks_trace(self) -> bool:
         """Whether it stands for each model's own latencies."""
         return self.trace is None

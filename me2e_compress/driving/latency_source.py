@@ -63,6 +63,11 @@ class LatencySource(abc.ABC):
         """Return what decides the latencies, for the fingerprint of the results."""
 
     @property
+    def measured(self) -> int | None:
+        """How many measurements its latencies are drawn from; None: it draws none."""
+        return None
+
+    @property
     def lacks_trace(self) -> bool:
         """Whether it stands for latencies that `with_trace` has yet to give."""
         return False

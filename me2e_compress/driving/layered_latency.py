@@ -48,6 +48,11 @@ class LayeredLatency(LatencySource):
         return self.source.measures
 
     @property
+    def measured(self) -> int | None:
+        """How many measurements the source below draws from."""
+        return self.source.measured
+
+    @property
     def lacks_trace(self) -> bool:
         """Whether the source below stands for each model's own latencies."""
         return self.source.lacks_trace

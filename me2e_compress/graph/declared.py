@@ -56,7 +56,9 @@ def check_port(port: onnx.ValueInfoProto, *, typed: bool) -> None:
     if kind == "tensor_type":
         _check_tensor_type(port, typed=typed)
     elif kind in ("map_type", "sparse_tensor_type") or (kind is None and typed):
-        raise GraphError(f"{port.name!r} is no tensor: its type is {kind or 'missing'}")
+        raise GraphError(
+            f"{port.name!r} is not a tensor: its type is {kind or 'missing'}"
+        )
 
 
 def _check_tensor_type(port: onnx.ValueInfoProto, *, typed: bool) -> None:

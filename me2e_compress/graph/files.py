@@ -12,6 +12,7 @@ import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
 from me2e_compress import drafts
+from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
 from me2e_compress.graph.external import data_file, external_tensors, settle
@@ -52,7 +53,9 @@ def load(path: str | Path) -> ir.Model:
     try:
         proto = onnx.load(path, format="protobuf", load_external_data=False)
     except DecodeError as error:
-        raise GraphError(f"{path}: not an ONNX file, or cut short ({error})") from error
+        raise GraphError(
+            f"{path}: not an ONNX file, or cut short ({reason(error)})"
+        ) from error
     try:
         model = _built(proto)
     except GraphError as error:
@@ -79,8 +82,7 @@ def _built(proto: onnx.ModelProto) -> ir.Model:
         cause: BaseException = error
         while cause.__cause__ is not None:
             cause = cause.__cause__
-        line = " ".join(str(cause).split())[:200]
-        raise GraphError(f"not a valid ONNX graph ({line})") from error
+        raise GraphError(f"not a valid ONNX graph ({reason(cause)})") from error
     return model
 
 

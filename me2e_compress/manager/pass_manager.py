@@ -52,7 +52,7 @@ class PassManager:
     verify_frames: int = 2
     reproducers: Path | None = None
     samples: CalibrationSet | None = None
-    try_first: Callable[[ir.Model, str], None] = lambda model, name: None
+    try_first: Callable[[ir.Model, str], None] | None = None
 
     def run(
         self, model: ir.Model, context: Context, progress: Progress | None = None
@@ -167,7 +167,8 @@ class _Books:
             self.verifications.append(equivalence.skipped(names, NOT_ASKED))
         if not stretch:
             return
-        self.manager.try_first(model, f"the graph after {stretch[-1][0].name}")
+        if self.manager.try_first is not None:
+            self.manager.try_first(model, f"the graph after {stretch[-1][0].name}")
         found, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(found)
         if equivalence.passed(found) or inputs is None:

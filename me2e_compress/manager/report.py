@@ -13,6 +13,7 @@ from me2e_compress.display import (
     AT_LEAST,
     Displayed,
     Table,
+    counted,
     giga,
     megabytes,
     table,
@@ -205,7 +206,7 @@ def versions() -> dict[str, str]:
 def steps_table(steps: Sequence[Step]) -> Table:
     """Show pass by pass what changed and what it cost, and what the passes say."""
     said = [f"{step.name}: {note}" for step in steps for note in step.notes]
-    notes = [f"{len(said)} notes of the passes: -v"] if said else []
+    notes = [f"{counted(len(said), 'note')} from the passes: -v"] if said else []
     if any(step.after.unknown_macs_nodes for step in steps):
         notes.append(AT_LEAST)
     return table(

@@ -7,6 +7,7 @@ from typing import Any
 
 from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.percentiles import percentile, too_few
 from me2e_compress.metrics.surrogate_safety import TTC_CRITICAL_S
 
 BUDGET_MS = FRAME_US / 1000
@@ -23,7 +24,7 @@ class Deadlines:
         budget_ms: What a decision may take.
         count: Decisions.
         percentiles_ms: By percent: the latency that so many do not exceed; None where
-            there are too few decisions for one to lie beyond it.
+            too few were measured for one to lie beyond it.
         mean_ms: Of all decisions.
         worst_ms: The longest.
         over_percent: Share of the decisions that took longer than the budget.
@@ -56,12 +57,18 @@ class Deadlines:
         }
 
 
-def deadlines(latencies_us: Sequence[int], budget_ms: float = BUDGET_MS) -> Deadlines:
+def deadlines(
+    latencies_us: Sequence[int],
+    budget_ms: float = BUDGET_MS,
+    measured: int | None = None,
+) -> Deadlines:
     """Hold latencies against a budget.
 
     Args:
         latencies_us: Microseconds, one a decision.
         budget_ms: What a decision may take; exactly so much is in time.
+        measured: Samples of the trace that they were drawn from; None where each was
+            found for itself.
     """
     if not latencies_us:
         none = Measure(None, "ms", "no decision was taken")
@@ -69,25 +76,30 @@ def deadlines(latencies_us: Sequence[int], budget_ms: float = BUDGET_MS) -> Dead
         return Deadlines(
             budget_ms, 0, dict.fromkeys(PERCENTILES, none), none, none, share
         )
+    count = len(latencies_us)
+    samples = count if measured is None else min(count, measured)
     late = sum(each > 1e3 * budget_ms for each in latencies_us)
     return Deadlines(
         budget_ms,
-        len(latencies_us),
-        {percent: _percentile(latencies_us, percent) for percent in PERCENTILES},
+        count,
+        {p: _percentile(latencies_us, p, samples) for p in PERCENTILES},
         Measure(fmean(latencies_us) / 1e3, "ms"),
         Measure(max(latencies_us) / 1e3, "ms"),
-        Measure(100.0 * late / len(latencies_us), "%"),
+        Measure(100.0 * late / count, "%"),
     )
 
 
 def charged(
-    episodes: Iterable[Episode], budget_ms: float = BUDGET_MS
+    episodes: Iterable[Episode],
+    budget_ms: float = BUDGET_MS,
+    measured: int | None = None,
 ) -> Deadlines | None:
     """Hold what the decisions of episodes were charged against a budget.
 
     Args:
         episodes: Of one evaluation.
         budget_ms: What a decision may take.
+        measured: See :func:`deadlines`.
 
     Returns:
         None where decisions cost nothing.
@@ -98,7 +110,7 @@ def charged(
         return None
     critical, other = _by_danger(driven)
     return replace(
-        deadlines(taken, budget_ms),
+        deadlines(taken, budget_ms, measured),
         critical_ms=_mean(critical, "no decision on a frame with TTC below 1.5 s"),
         other_ms=_mean(other, "no decision on another frame"),
     )
@@ -124,10 +136,7 @@ def _mean(latencies_us: Sequence[int], why: str) -> Measure:
     return Measure(fmean(latencies_us) / 1e3, "ms")
 
 
-def _percentile(latencies_us: Sequence[int], percent: float) -> Measure:
-    needed = round(100.0 / (100.0 - percent))
-    if len(latencies_us) < needed:
-        return Measure(None, "ms", f"{len(latencies_us)} decisions, {needed} needed")
-    # in whole numbers: 0.999 * 1000 is 999.0000000000001 in floating point
-    rank = -(-len(latencies_us) * round(10 * percent) // 1000)
-    return Measure(sorted(latencies_us)[rank - 1] / 1e3, "ms")
+def _percentile(latencies_us: Sequence[int], percent: float, samples: int) -> Measure:
+    if why := too_few(percent, samples):
+        return Measure(None, "ms", why)
+    return Measure(percentile(latencies_us, percent) / 1e3, "ms")

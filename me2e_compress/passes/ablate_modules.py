@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
+from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.modules import ModuleMap, Substitute
@@ -119,7 +120,8 @@ class AblateModules(Pass):
         model.graph.sort()
         check_sight(model, context.modules, sighted, self.drop)
         removed = before - graph.node_count(model)
-        notes.append(f"{abs(removed)} nodes {'removed' if removed >= 0 else 'added'}")
+        said = counted(abs(removed), "node")
+        notes.append(f"{said} {'removed' if removed >= 0 else 'added'}")
         return PassResult(model, max(1, removed), tuple(notes), tuple(gone))
 
     def _check_options(self) -> None:

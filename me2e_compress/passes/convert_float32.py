@@ -6,6 +6,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import rewrite
+from me2e_compress.display import counted
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.convert_float16.element_types import (
     FLOAT,
@@ -40,7 +41,7 @@ class ConvertFloat32(Pass):
         if changes:
             rewrite.sweep(model)
         computing = sum(node.op_type != "Cast" for node in nodes)
-        return PassResult(model, changes, (f"{computing} nodes in float32",))
+        return PassResult(model, changes, (f"{counted(computing, 'node')} in float32",))
 
 
 def _bypass_idle_casts(model: ir.Model) -> int:

@@ -7,6 +7,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.display import counted
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.targets import onnxruntime
@@ -61,8 +62,8 @@ class LowerInt8(Pass):
             lowered,
             len(layers) or int(graph.digest(lowered) != graph.digest(model)),
             (
-                f"{len(layers)} layers in int8 for onnxruntime",
-                f"{len(missing)} tensors calibrated besides those of the graph",
+                f"{counted(len(layers), 'layer')} in int8 for onnxruntime",
+                f"{counted(len(missing), 'tensor')} calibrated besides the graph's",
             ),
         )
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.plan import (
@@ -212,7 +213,8 @@ def _kept_float(plan: QuantPlan, target: str) -> tuple[str, ...]:
 
 
 def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
-    notes = [f"{len(ranges.tensors)} tensors calibrated on {ranges.frames} frames"]
+    on = counted(ranges.frames, "frame")
+    notes = [f"{counted(len(ranges.tensors), 'tensor')} calibrated on {on}"]
     costs = sorted(sharing_costs(plan, ranges), key=lambda cost: -cost.loss_db)
     shared = [
         f"{cost.group.name}: {len(cost.group.tensors)} tensors, {cost.tensor} loses"

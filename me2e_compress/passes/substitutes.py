@@ -8,6 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph, rewrite
 from me2e_compress.calibration.means import load_means, token_means
+from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context
@@ -259,6 +260,6 @@ def means_of(
             "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"
             " a mean is never made up"
         )
-    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+    count = counted(len(frames), "frame")
     means = token_means(model, frames, names, provider=context.provider)
     return means, f"its mean over {count}"

@@ -31,22 +31,27 @@ class QuantScheme:
     def named(cls, name: str, modules: ModuleMap) -> Self:
         """Return the modules of a map whose roles a scheme names.
 
+        A scheme of one role is of a part of the graph: a map whose modules are all of
+        one role knows no part.
+
         Raises:
             RecipeError: no such scheme, int4 and fp8 among them.
-            ModuleMapError: the map has no module of that role.
+            ModuleMapError: the map does not tell that part from the rest.
         """
         if name not in SCHEMES:
             raise RecipeError(
                 f"no scheme {name}; there are {', '.join(SCHEMES)}, all of them int8"
             )
         wanted = SCHEMES[name]
-        chosen = tuple(each.name for each in modules.modules if each.role in wanted)
-        if not chosen:
+        lacking = [role for role in SCHEMES["full"] if not modules.names(role)]
+        if lacking and name != "full":
             raise ModuleMapError(
-                f"map {modules.name} has no module of role {' or '.join(wanted)};"
-                f" it has {', '.join(modules.names())}"
+                f"scheme {name} is of a part of the graph, and map {modules.name}"
+                f" ({', '.join(modules.names())}) has no module of role {lacking[0]}:"
+                " name a map that has (--map), or take scheme full"
             )
-        return cls(name, chosen)
+        chosen = (each.name for each in modules.modules if each.role in wanted)
+        return cls(name, tuple(chosen))
 
     @classmethod
     def of(cls, chosen: tuple[str, ...], modules: ModuleMap) -> Self:

@@ -92,13 +92,13 @@ def _type(annotation: object) -> str:
 
 
 def _docs(cls: type) -> Mapping[str, str]:
-    """Return what the section Attributes (or Args) says, by field."""
-    section = _SECTION.search((inspect.getdoc(cls) or "") + "\n")
-    if section is None:
-        return {}
-    return {
-        name: " ".join(text.split()) for name, text in _OPTION.findall(section.group(1))
-    }
+    """Return what the section Attributes (or Args) says, by field; a base's, too."""
+    found = dict[str, str]()
+    for each in reversed(cls.__mro__):
+        section = _SECTION.search(inspect.cleandoc(each.__doc__ or "") + "\n")
+        options = [] if section is None else _OPTION.findall(section.group(1))
+        found |= {name: " ".join(text.split()) for name, text in options}
+    return found
 
 
 def _entry(registry: Registry[T], name: str) -> Entry:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import pydantic
 
+from me2e_compress.display import prefixed
 from me2e_compress.errors import Me2eError
 from me2e_compress.registry.text import (
     ParsedItem,
@@ -109,7 +110,7 @@ class Registry(Generic[T]):
             if first["type"] == "missing":
                 raise self.error(f"{name} needs the option {where}") from error
             if own := first.get("ctx", {}).get("error"):  # the item's own words
-                raise self.error(f"{name}: {own}") from error
+                raise self.error(prefixed(name, str(own))) from error
             raise self.error(f"{name}: {where}: {first['msg']}") from error
         return made
 

@@ -156,8 +156,12 @@ class Fusion:
     name: str
     pattern: Pattern
     rewrite: Callable[[Match, Kit], str | None]
-    check: Callable[[Match, Facts], str | None] = _no_objection
-    where: Callable[[Match, Facts], bool] = _always
+    check: Callable[[Match, Facts], str | None] = dataclasses.field(
+        default_factory=lambda: _no_objection
+    )
+    where: Callable[[Match, Facts], bool] = dataclasses.field(
+        default_factory=lambda: _always
+    )
 
 
 def needs_opset(what: str, version: int) -> Callable[[Match, Facts], str | None]:
@@ -190,7 +194,7 @@ class Fused:
 
     def notes(self) -> tuple[str, ...]:
         """Return sentences for the report."""
-        what = ", ".join(f"{count} {name}" for name, count in self.done.items())
+        what = ", ".join(f"{name} ({count})" for name, count in self.done.items())
         left = (f"left {count}: {reason}" for reason, count in self.refused.items())
         return (
             *((f"fused: {what}",) if what else ()),

@@ -10,8 +10,14 @@ from time import perf_counter, process_time
 from me2e_compress.runtime.any_session import AnySession
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.profile import WARM_UP, TimedSession, check_work, processor
-from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
+from me2e_compress.runtime.others_load import OthersLoad
+from me2e_compress.runtime.profile import (
+    WARM_UP,
+    TimedSession,
+    check_work,
+    machine_words,
+)
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import replay
 from me2e_compress.runtime.stack.split_stack import digest_of_files
 
@@ -117,23 +123,26 @@ def record_traces(
     kept = {name: list[int]() for name in models}
     for run in runs.values():
         _advance(run, warm_up)
-    for done in range(0, samples, BLOCK):
-        block = min(BLOCK, samples - done)
-        for place, (name, session) in enumerate(sessions.items()):
-            _advance(runs[name], RE_WARM + block)
-            kept[name] += session.taken_us[-block:]
-            on_sample(done * len(models) + place * block, samples * len(models), name)
+    total = samples * len(models)
+    with OthersLoad() as others:
+        for done in range(0, samples, BLOCK):
+            block = min(BLOCK, samples - done)
+            for place, (name, session) in enumerate(sessions.items()):
+                _advance(runs[name], RE_WARM + block)
+                kept[name] += session.taken_us[-block:]
+                on_sample(done * len(models) + place * block, total, name)
     machine = describe_machine(threads, provider)
     return {
-        name: LatencyTrace(digest_of_files(path), machine, tuple(kept[name]))
+        name: LatencyTrace(
+            digest_of_files(path), machine, tuple(kept[name]), others=others.load
+        )
         for name, path in models.items()
     }
 
 
 def describe_machine(threads: int, provider: Provider = CPU) -> str:
     """Return the machine of `record_traces`, in words: processor, threads, provider."""
-    runs = "" if provider == CPU else f", {PROVIDERS.text(provider)}"
-    return f"{processor()}, onnxruntime on {threads or 'all'} threads{runs}, in turn"
+    return f"{machine_words(threads, provider)}, in turn"
 
 
 def _advance(runs: Iterator[object], count: int) -> None:

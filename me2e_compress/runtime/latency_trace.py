@@ -5,13 +5,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from me2e_compress import documents
-from me2e_compress.display import Displayed, Table, table
+from me2e_compress.display import Displayed, Table, counted, not_measured, table
 from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.percentiles import percentile, too_few
 from me2e_compress.runtime.atomic import write_json
+from me2e_compress.runtime.others_load import Load
 
 PERCENTILES = (50, 90, 99)
 
@@ -26,7 +27,8 @@ class TimeShare:
     Attributes:
         name: of a module or an operator.
         share: of the whole, 0 to 1.
-        p50_us: microseconds; so with the others.
+        p50_us: microseconds; None where there are too few for one beyond it; so with
+            the others.
         p90_us: see there.
         p99_us: see there.
         max_us: of the slowest inference.
@@ -34,9 +36,9 @@ class TimeShare:
 
     name: str
     share: float
-    p50_us: int
-    p90_us: int
-    p99_us: int
+    p50_us: int | None
+    p90_us: int | None
+    p99_us: int | None
     max_us: int
 
 
@@ -47,9 +49,9 @@ def shares(parts: Microseconds) -> tuple[TimeShare, ...]:
         TimeShare(
             name,
             sum(samples) / whole,
-            percentile(samples, 50),
-            percentile(samples, 90),
-            percentile(samples, 99),
+            _told(samples, 50),
+            _told(samples, 90),
+            _told(samples, 99),
             max(samples),
         )
         for name, samples in parts.items()
@@ -62,20 +64,28 @@ def shares_table(title: str, what: str, parts: Microseconds) -> Table:
         (
             each.name,
             f"{each.share:.1%}",
-            *(
-                f"{taken_us / 1e3:.2f}"
-                for taken_us in (each.p50_us, each.p90_us, each.p99_us, each.max_us)
-            ),
+            *map(_ms, (each.p50_us, each.p90_us, each.p99_us, each.max_us)),
         )
         for each in shares(parts)
     ]
     columns = (what, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
-    return table(title, columns, rows)
+    count = min(map(len, parts.values()), default=0)
+    return table(title, columns, rows, _untold(count))
 
 
-def percentile(samples: Sequence[int], percent: float) -> int:
-    """Return the smallest sample that so many percent do not exceed."""
-    return int(np.percentile(samples, percent, method="inverted_cdf"))
+def _told(samples: Sequence[int], percent: float) -> int | None:
+    """Return a percentile; None where there are too few samples for it."""
+    return None if too_few(percent, len(samples)) else percentile(samples, percent)
+
+
+def _untold(count: int) -> str:
+    """Say which percentiles so many samples do not tell."""
+    why = {f"p{percent}": too_few(percent, count) for percent in PERCENTILES}
+    return not_measured({name: each for name, each in why.items() if each})
+
+
+def _ms(taken_us: int | None) -> str:
+    return "-" if taken_us is None else f"{taken_us / 1e3:.2f}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,6 +99,7 @@ class LatencyTrace(Displayed):
         frames: Fingerprint of the recording that the model saw; None: not known.
         modules_us: What each module took in as many inferences of their own, under a
             profiler; empty: not measured.
+        others: What other processes took meanwhile; None: not measured.
     """
 
     model_sha256: str
@@ -96,20 +107,22 @@ class LatencyTrace(Displayed):
     samples_us: tuple[int, ...]
     frames: str | None = None
     modules_us: Microseconds = field(default_factory=dict)
+    others: Load | None = None
 
     @property
     def headline(self) -> str:
         """Number of inferences, machine."""
-        return f"{len(self.samples_us)} inferences on {self.machine}"
+        return f"{counted(len(self.samples_us), 'inference')} on {self.machine}"
 
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds, and what modules took."""
         rows = [
-            *((f"p{p}", self.percentile_us(p)) for p in PERCENTILES),
+            *((f"p{p}", _told(self.samples_us, p)) for p in PERCENTILES),
             ("max", self.max_us),
         ]
-        shown = [(name, f"{taken_us / 1e3:.2f}") for name, taken_us in rows]
-        whole = table(self.headline, ("latency", "ms"), shown)
+        shown = [(name, _ms(taken_us)) for name, taken_us in rows]
+        note = _untold(len(self.samples_us))
+        whole = table(self.headline, ("latency", "ms"), shown, note)
         if not self.modules_us:
             return (whole,)
         count = len(next(iter(self.modules_us.values())))
@@ -126,15 +139,18 @@ class LatencyTrace(Displayed):
         return max(self.samples_us)
 
     def to_json(self) -> dict[str, Any]:
-        """Return p50, p90, p99 and max beside the samples."""
+        """Return p50, p90, p99 and max beside the samples; None of too few."""
         frames = {} if self.frames is None else {"frames": self.frames}
         taken = {name: list(each) for name, each in self.modules_us.items()}
         modules = {"modules_us": taken} if taken else {}
+        others = self.others
+        busy = {} if others is None else others.to_json()
         return {
             "model_sha256": self.model_sha256,
             "machine": self.machine,
             **frames,
-            **{f"p{p}_us": self.percentile_us(p) for p in PERCENTILES},
+            **busy,
+            **{f"p{p}_us": _told(self.samples_us, p) for p in PERCENTILES},
             "max_us": self.max_us,
             "samples_us": list(self.samples_us),
             **modules,
@@ -168,6 +184,7 @@ class LatencyTrace(Displayed):
             tuple(record.samples_us),
             record.frames,
             {name: tuple(taken) for name, taken in record.modules_us.items()},
+            record.others,
         )
 
 
@@ -182,3 +199,11 @@ class _Record(BaseModel):
     frames: str | None = None
     samples_us: _Samples
     modules_us: dict[str, _Samples] = Field(default_factory=dict)
+    others_cores: Annotated[float, Field(ge=0)] | None = None
+    cores: Annotated[int, Field(ge=1)] | None = None
+
+    @property
+    def others(self) -> Load | None:
+        if self.others_cores is None or self.cores is None:
+            return None
+        return Load(self.others_cores, self.cores)

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Self
 
 import psutil
@@ -15,6 +16,38 @@ SHORTEST_S = 0.5
 """What a block must take to be judged: systems count CPU time in ticks of 10 ms."""
 
 
+@dataclass(frozen=True)
+class Load:
+    """What other processes took of a machine while something was measured.
+
+    Attributes:
+        others: Cores, mean over that time.
+        cores: Of the machine.
+    """
+
+    others: float
+    cores: int
+
+    @property
+    def busy(self) -> bool:
+        """Whether they took more than `BUSY` of the cores."""
+        return self.others > BUSY * self.cores
+
+    def to_json(self) -> dict[str, float]:
+        """Return ``others_cores`` and ``cores``."""
+        return {"others_cores": self.others, "cores": self.cores}
+
+    def __str__(self) -> str:
+        """Say it, and what follows where the machine was busy."""
+        said = f"other processes took {self.others:.1f} of {self.cores} cores"
+        if not self.busy:
+            return said
+        return (
+            f"the machine was busy: {said}, and more than {BUSY:.0%} moves latencies;"
+            " measure again when it is idle"
+        )
+
+
 class OthersLoad:
     """Counts the cores that other processes keep busy while a block runs.
 
@@ -24,8 +57,7 @@ class OthersLoad:
         clock: seconds that pass.
 
     Attributes:
-        cores: mean over the block; None before it ends, or if it was too short.
-        of: cores of the machine.
+        load: over the block; None before it ends, or if it was too short.
     """
 
     def __init__(
@@ -36,8 +68,7 @@ class OthersLoad:
     ) -> None:
         self._machine, self._ours = machine or _machine_s, ours or _ours_s
         self._clock = clock
-        self.cores: float | None = None
-        self.of = os.cpu_count() or 1
+        self.load: Load | None = None
 
     def __enter__(self) -> Self:
         """Begin to count."""
@@ -52,12 +83,9 @@ class OthersLoad:
                 (self._clock(), self._machine(), self._ours()), self._begun, strict=True
             )
         )
-        self.cores = max(0.0, machine - ours) / wall if wall >= SHORTEST_S else None
-
-
-def is_busy(cores: float | None, of: int) -> bool:
-    """Return whether other processes take more than `BUSY` of a machine's cores."""
-    return cores is not None and cores > BUSY * of
+        if wall >= SHORTEST_S:
+            others = max(0.0, machine - ours) / wall
+            self.load = Load(others, os.cpu_count() or 1)
 
 
 def _machine_s() -> float:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, islice, repeat
 from pathlib import Path
 
+from me2e_compress.display import counted
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -25,6 +26,7 @@ def profile(
     warm_up: int = WARM_UP,
     threads: int = 1,
     provider: Provider = CPU,
+    said: Mapping[str, str] | None = None,
     on_sample: Callable[[int, int], None] = lambda done, total: None,
 ) -> LatencyTrace:
     """Measure the latency of a model on every frame, one at a time.
@@ -39,6 +41,7 @@ def profile(
         warm_up: Inferences before the first that counts.
         threads: Of onnxruntime; the closed loop uses one.
         provider: What runs it.
+        said: What is known of it beside its own metadata.
         on_sample: Called with samples done and to do.
 
     Raises:
@@ -49,15 +52,20 @@ def profile(
     """
     wanted = len(frames) if samples is None else samples
     check_work(wanted, warm_up, frames)
-    session = TimedSession(model, threads=threads, provider=provider)
+    session = TimedSession(model, threads=threads, provider=provider, said=said)
     endless = chain.from_iterable(repeat(frames))
     for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
         on_sample(max(0, done - warm_up), wanted)
-    machine = f"{processor()}, onnxruntime on {threads or 'all'} threads"
-    if provider != CPU:
-        machine += f", {PROVIDERS.text(provider)}"
+    machine = machine_words(threads, provider)
     taken = tuple(session.taken_us[warm_up:])
     return LatencyTrace(digest_of_files(model), machine, taken)
+
+
+def machine_words(threads: int, provider: Provider = CPU) -> str:
+    """Return what measures, in words: processor, threads, provider."""
+    runs = "" if provider == CPU else f", {PROVIDERS.text(provider)}"
+    on = counted(threads, "thread") if threads else "all threads"
+    return f"{processor()}, onnxruntime on {on}{runs}"
 
 
 def check_work(samples: int, warm_up: int, frames: Frames) -> None:
@@ -80,8 +88,15 @@ class TimedSession:
         taken_us: Microseconds, one a run; of a stack, all of its files together.
     """
 
-    def __init__(self, model: Path, *, threads: int, provider: Provider = CPU) -> None:
-        self._timed = open_session(model, threads=threads, provider=provider)
+    def __init__(
+        self,
+        model: Path,
+        *,
+        threads: int,
+        provider: Provider = CPU,
+        said: Mapping[str, str] | None = None,
+    ) -> None:
+        self._timed = open_session(model, threads=threads, provider=provider, said=said)
         self.inputs, self.outputs = self._timed.inputs, self._timed.outputs
         self.metadata, self.recurrent = self._timed.metadata, self._timed.recurrent
         self.provider = provider

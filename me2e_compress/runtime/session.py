@@ -83,11 +83,12 @@ class Session:
         provider: what runs the nodes, and the libraries of operators it knows.
         profiled: a folder for what onnxruntime's profiler writes, all in all, when
             :meth:`end_profile` is called.
+        said: what is known of the model beside its own metadata; it wins.
 
     Attributes:
         inputs: by name, what must be fed, in order.
         outputs: by name, what comes out, in order.
-        metadata: the model's own metadata.
+        metadata: the model's own metadata, and what is said beside it.
         recurrent: ``{input: output}`` of the state that is fed forward.
         provider: what runs it.
 
@@ -108,6 +109,7 @@ class Session:
         rewritten: Path | None = None,
         provider: Provider = CPU,
         profiled: Path | None = None,
+        said: Mapping[str, str] | None = None,
     ) -> None:
         options = ort.SessionOptions()
         provider.attach(options)
@@ -145,7 +147,7 @@ class Session:
             metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError as error:
             raise GraphError(f"a name in the graph is not UTF-8: {error}") from error
-        self.metadata = metadata
+        self.metadata = {**metadata, **(said or {})}
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
     def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:

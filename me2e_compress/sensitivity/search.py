@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import onnx_ir as ir
 
+from me2e_compress.display import significant
 from me2e_compress.errors import EvaluationError
 from me2e_compress.sensitivity.analysis import names_of
 from me2e_compress.sensitivity.trials import Int8Choice, Score, Trials
@@ -125,7 +126,9 @@ def nothing_fits(
 
     def said(costs: Iterable[float]) -> str:
         pairs = zip(costs, limits, strict=True)
-        return " and ".join(f"{cost:g} {unit}" for cost, (_, unit) in pairs)
+        return " and ".join(
+            f"{significant(cost, 6)} {unit}" for cost, (_, unit) in pairs
+        )
 
     least = said(map(min, zip(*found, strict=True)))
     apart = "; each alone" if len(limits) > 1 else ""

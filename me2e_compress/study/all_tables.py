@@ -17,6 +17,8 @@ from me2e_compress.workflows.result import Cell, Table
 if TYPE_CHECKING:
     from me2e_compress.study.outcome import StudyResult
 
+MOST_ROUTES = 40
+"""Routes that are shown one by one; the results hold any number."""
 COLUMNS = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
 
 
@@ -27,11 +29,33 @@ def all_tables(outcome: "StudyResult") -> tuple[Table, ...]:
         *scoreboards(outcome),
         *compared,
         *change_tables(outcome),
+        *filter(None, [route_table(outcome)]),
         near_misses(outcome),
         *abilities(outcome),
     )
     preview = outcome.study.preview
     return tuple(replace(each, title=f"{each.title}{preview}") for each in found)
+
+
+def route_table(outcome: "StudyResult") -> Table | None:
+    """Show how each route ended for each driver; None where they are too many."""
+    driven = [each for each in outcome.drives if each.routes]
+    if not driven or len(driven[0].routes) > MOST_ROUTES:
+        return None
+    several = len(outcome.study.conditions) > 1
+    names = [f"{e.variant}, {e.condition}" if several else e.variant for e in driven]
+    return Table(
+        "How each route ended",
+        ("route", *names),
+        tuple(
+            (
+                Cell(routes[0].route),
+                *(Cell(f"{each.driving_score:.1f}", each.fate) for each in routes),
+            )
+            for routes in zip(*(each.routes for each in driven), strict=True)
+        ),
+        "Driving score, and why it is not 100.",
+    )
 
 
 def near_misses(outcome: "StudyResult") -> Table:

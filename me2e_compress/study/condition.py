@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from me2e_compress.display import counted
 from me2e_compress.driving.latency import LatencySource, parse_latency
 from me2e_compress.driving.layered_latency import LimitedLatency
 from me2e_compress.errors import EvaluationError, StudyError
@@ -162,18 +163,22 @@ class Condition:
         if self.latency == TRACE:
             return f"each model's own latency, {device}"
         if name_in(self.latency) == "fps" and ":" in self.latency:
-            return f"{self.latency.removeprefix('fps:')} decisions a second"
+            return _per_second(float(self.latency.removeprefix("fps:")))
         return f"{self.latency}, {device}" if self.traced else self.latency
 
     def _changes(self) -> list[str]:
         said = {
             "in the trace's order": self.in_order,
-            f"limited to {self.limit_fps or 0:g} decisions a second": self.limit_fps,
+            f"limited to {_per_second(self.limit_fps or 0)}": self.limit_fps,
             "every control late (fifo)": self.latency_model != "drop",
             f"a step of {self.dt_ms:g} ms": self.dt_ms != 50.0,
             f"weather {self.weather}": self.weather,
         }
         return [words for words, true in said.items() if true]
+
+
+def _per_second(fps: float) -> str:
+    return f"{counted(fps, 'decision')} a second"
 
 
 def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -> None:
@@ -198,7 +203,7 @@ def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -
             )
         if each.against and (each.against not in names or each.against == each.name):
             raise StudyError(
-                f"condition {each.name}: against {each.against!r} is no other"
+                f"condition {each.name}: against {each.against!r} is not another"
                 f" condition; there are {', '.join(names)}"
             )
         before.append(each.name)

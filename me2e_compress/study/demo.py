@@ -6,19 +6,23 @@ from pathlib import Path
 
 from me2e_compress import recipe
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.study.outcome import StudyResult
+from me2e_compress.study.report import Section
 from me2e_compress.study.run import run_study
 from me2e_compress.study.tables import differences, scoreboards
-from me2e_compress.study.verdict import verdict
+from me2e_compress.study.verdict import before_and_after, road_verdict
+from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.workflows.checks import check_folder
+from me2e_compress.workflows.claims import check_ours
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.compress_result import CompressResult
+from me2e_compress.workflows.compress_result import CompressResult, beside
 from me2e_compress.workflows.export import ExportOptions, export_stack
 from me2e_compress.workflows.frames import FramesOptions, record_frames
 from me2e_compress.workflows.listener import Listener
@@ -38,23 +42,34 @@ class DriveResult(Result):
     Attributes:
         study: everything that was found.
         written: its files.
-        ending: the verdict, and what the user has now.
+        variant: the one that was compressed.
+        ending: what the user has now.
     """
 
     study: StudyResult
     written: StudyFiles
+    variant: str
     ending: tuple[str, ...]
 
     @property
     def headline(self) -> str:
-        """Size, time and plan, in one line."""
-        return self.ending[0]
+        """How many routes, of how many."""
+        driven, whole = self.study.coverage
+        return f"{driven} of {whole} routes, before and after"
 
     def lines(self) -> tuple[str, ...]:
-        """Return the verdict, what the user has, and another target's command."""
-        return self.ending
+        """Return the verdict of the road, what the user has, another target."""
+        return (road_verdict(self.study, self.variant), *self.ending)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what puts the figures in doubt."""
+        return self.study.alerts()
 
     def tables(self) -> tuple[Table, ...]:
+        """Return size, time, plan and road, before and after."""
+        return (before_and_after(self.study, self.variant),)
+
+    def details(self) -> tuple[Table, ...]:
         """Return scoreboard and differences."""
         return (*scoreboards(self.study), differences(self.study))
 
@@ -74,7 +89,7 @@ class DriverDemo:
     Attributes:
         name: of the driver.
         out: the folder.
-        scheme: a shipped recipe.
+        recipe_name: a shipped recipe.
         routes: that both drive: a number or ``ID,ID``.
         workers: routes at a time.
         provider: what runs the graphs.
@@ -83,22 +98,31 @@ class DriverDemo:
     Raises:
         RecipeError: no such recipe.
         EvaluationError: no such route.
-        GraphError: the folder is a file.
+        GraphError: the folder is a file, or holds a file of the user's that would be
+            written.
     """
 
     name: str
     out: Path
-    scheme: str = "feature-ext"
+    recipe_name: str = "full-fused"
     routes: str = "5"
     workers: int = 2
     provider: Provider = CPU
     force: bool = False
+    _told: list[Section] = dataclasses.field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        """Check recipe, routes and folder."""
-        recipe.load(self.scheme)
+        """Check recipe, routes and outputs: the work takes minutes."""
+        recipe.load(self.recipe_name)
         pick_routes(load_routes(), self.routes)
         check_folder(self.out, ())
+        records = (beside(self._small, what) for what in ("report", "plan"))
+        pages = (self.out / name for name in (JSON, MARKDOWN, HTML))
+        check_ours(
+            [self._source, self._small, *records, *pages],
+            trees=[self._frames, self._held_out],
+            force=self.force,
+        )
 
     @property
     def steps(self) -> dict[str, Callable[[Listener], Result]]:
@@ -123,7 +147,7 @@ class DriverDemo:
         ):
             asked = FramesOptions(count, seed, provider=self.provider, force=self.force)
             record_frames(self._source, folder, asked, listener)
-        passes = recipe.load(self.scheme)
+        passes = recipe.load(self.recipe_name)
         quantizes = any(each.quantizes for each in passes)
         target = self.provider.target if quantizes else None
         # Fidelity is measured on frames of other routes, see `compare`.
@@ -134,32 +158,41 @@ class DriverDemo:
             provider=self.provider,
             force=self.force,
         )
-        return compress(
+        found = compress(
             self._source, self._small, passes, self._frames, options, listener
         )
+        self._told.append(Section("The passes", found.tables()))
+        plan = plan_of(found.report.model)
+        if plan is not None:
+            self._told.append(Section("What became int8", plan.tables()))
+        return found
 
     def weigh(self, listener: Listener) -> ModuleChanges:
         """Weigh the modules before and after."""
-        return compare_modules(self._source, self._small)
+        found = compare_modules(self._source, self._small)
+        self._told.append(Section("The modules", found.tables()))
+        return found
 
     def compare(self, listener: Listener) -> Result:
         """Compare the small graph with the driver on other frames."""
-        return compare(
+        found = compare(
             self._source,
             self._small,
             self._held_out,
             listener,
             provider=self.provider,
         )
+        self._told.append(Section("The outputs", found.tables()))
+        return found
 
     def drive(self, listener: Listener) -> DriveResult:
         """Drive the routes with both, and write the report."""
         everything = load_routes()
         study = Study(
-            f"{self.name} before and after {self.scheme}",
+            f"{self.name} before and after {self.recipe_name}",
             (
                 Variant(FLOAT, str(self._source)),
-                Variant(self.scheme, str(self._small)),
+                Variant(self.recipe_name, str(self._small)),
             ),
             (Condition("ideal", "none"),),
             FLOAT,
@@ -171,18 +204,33 @@ class DriverDemo:
         )
         engine = LocalEngine(self.workers)
         found = run_study(study, self.out, engine, listener, force=self.force)
-        written = write_study(found, self.out, self._words(), force=self.force)
+        told = (*self._told, self._files())
+        written = write_study(found, self.out, self._words(), told, force=self.force)
         ending = (
-            *verdict(found, self.scheme),
-            f"{self._small} and {written.report} are yours.",
+            f"{self._small} is yours; {written.report} tells all of it.",
             *self._elsewhere(),
         )
-        return DriveResult(found, written, ending)
+        return DriveResult(found, written, self.recipe_name, ending)
+
+    def _files(self) -> Section:
+        """List what lies beside the page."""
+        report, plan = (beside(self._small, what) for what in ("report", "plan"))
+        files = (
+            ("the driver", self._source),
+            ("the small one", self._small),
+            ("pass by pass", report),
+            ("node by node", plan),
+            ("calibration", self._frames),
+            ("held out", self._held_out),
+            ("drives", self.out / "results"),
+        )
+        there = ((words, path.name) for words, path in files if path.exists())
+        return Section("Files", files=(*there, ("for programs", JSON)))
 
     def _words(self) -> tuple[str, ...]:
         """Return the command that does all this."""
         words = ("me2e-compress", "demo", "-o", str(self.out))
-        chosen = ["--routes", self.routes, "--scheme", self.scheme]
+        chosen = ["--routes", self.routes, "--recipe", self.recipe_name]
         if self.provider != CPU:
             chosen += ["--provider", PROVIDERS.text(self.provider)]
         return (*words, *chosen)
@@ -193,9 +241,9 @@ class DriverDemo:
         if target == "tensorrt":
             return ()
         return (
-            f"Its int8 is for {target}, which drives here. For TensorRT: me2e-compress"
-            f" compress {self.name} -r {self.scheme} --frames {self._frames} -o"
-            f" {self.name}.trt.onnx",
+            f"Its int8 is for {target}, which drives here. For TensorRT:",
+            f"  me2e-compress compress {self.name} -r {self.recipe_name} --frames"
+            f" {self._frames} -o {self.name}.trt.onnx",
         )
 
     @property
@@ -204,7 +252,7 @@ class DriverDemo:
 
     @property
     def _small(self) -> Path:
-        return self.out / f"{self.name}.{self.scheme}.onnx"
+        return self.out / f"{self.name}.{self.recipe_name}.onnx"
 
     @property
     def _frames(self) -> Path:

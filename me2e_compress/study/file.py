@@ -66,6 +66,9 @@ def load_study(
     path = study_path(path)
     try:
         content = documents.from_toml(documents.content(path))
+    except FileNotFoundError as error:
+        ours = ", ".join(sorted(each.stem for each in STUDIES.glob("*.toml")))
+        raise StudyError(f"no study {path}: no such file; we ship {ours}") from error
     except OSError as error:
         raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
     except documents.MalformedError as error:

@@ -1,11 +1,13 @@
 """What a study found."""
 
+import os
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from me2e_compress.metrics.measure import Measure
+from me2e_compress.runtime.others_load import Load
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.study.all_tables import all_tables
@@ -17,7 +19,7 @@ from me2e_compress.study.plan_fidelity import PlanFidelity, measure_json
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.timing import Clock
-from me2e_compress.workflows.result import Result, Table
+from me2e_compress.workflows.result import Result, Table, counted
 
 LATENCY_PERCENTILES = (50, 99)
 
@@ -51,12 +53,13 @@ class VariantOutcome:
         size = prepared.size_bytes
         name = prepared.variant.name
         why = prepared.failure or "no model"
-        late = why if prepared.model is None else clock.reason
         return cls(
             prepared,
             Measure(None, "MB", why) if size is None else _mb(size),
             {
-                percent: _ms(clock.milliseconds(name, percent), late)
+                percent: Measure(None, "ms", why)
+                if prepared.model is None
+                else clock.latency(name, percent)
                 for percent in LATENCY_PERCENTILES
             },
             fidelity,
@@ -92,6 +95,8 @@ class StudyResult(Result):
         device_scale: How many times slower the device is than the machine timed on.
         machine: What it was made on, in words.
         versions: Of the packages that decide the result.
+        load: What other processes took while latencies were measured; None where none
+            was measured here.
     """
 
     study: Study
@@ -101,6 +106,7 @@ class StudyResult(Result):
     device_scale: float
     machine: str
     versions: Mapping[str, str]
+    load: Load | None = None
 
     @property
     def timed(self) -> bool:
@@ -120,8 +126,9 @@ class StudyResult(Result):
         """Title, variants, conditions, routes."""
         study, (driven, whole) = self.study, self.coverage
         return (
-            f"{study.title}: {len(study.variants)} variants under"
-            f" {len(study.conditions)} conditions on {driven} of {whole} routes"
+            f"{study.title}: {counted(len(study.variants), 'variant')} under"
+            f" {counted(len(study.conditions), 'condition')} on {driven} of"
+            f" {counted(whole, 'route')}"
         )
 
     def lines(self) -> tuple[str, ...]:
@@ -129,12 +136,14 @@ class StudyResult(Result):
         return ()
 
     def alerts(self) -> tuple[str, ...]:
-        """Return the variants that failed, and why."""
+        """Return the variants that failed, and why; whether the machine was busy."""
         failed = [each.prepared for each in self.variants if each.prepared.failure]
-        return tuple(
+        busy = [str(self.load)] if self.load is not None and self.load.busy else []
+        left_out = (
             f"variant {each.variant.name} was left out: {each.failure}"
             for each in failed
         )
+        return (*left_out, *busy)
 
     def tables(self) -> tuple[Table, ...]:
         """Return every table, in the order of reading."""
@@ -202,6 +211,7 @@ class StudyResult(Result):
                 "device_scale": self.device_scale,
                 "samples": study.timing.samples,
                 "threads": study.timing.threads,
+                **({} if self.load is None else self.load.to_json()),
             },
             "schemes": [each.to_json() for each in self.variants],
             "drives": [each.to_json() for each in self.drives],
@@ -212,14 +222,12 @@ class StudyResult(Result):
         }
 
 
-def this_machine() -> str:
-    """Name processor and system, in words."""
-    return f"{processor()}, {platform.system()} {platform.machine()}"
+def this_machine(load: Load | None = None) -> str:
+    """Name processor, cores and system, and a load that puts latencies in doubt."""
+    cores = f"{os.cpu_count() or 1} cores"
+    named = f"{processor()}, {cores}, {platform.system()} {platform.machine()}"
+    return f"{named}; {load}" if load is not None and load.busy else named
 
 
 def _mb(size_bytes: int) -> Measure:
     return Measure(size_bytes / 1e6, "MB")
-
-
-def _ms(value: float | None, why: str) -> Measure:
-    return Measure(value, "ms", "" if value is not None else why or "not measured")

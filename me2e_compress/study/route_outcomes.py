@@ -10,6 +10,22 @@ from me2e_compress.metrics.driving_score import route_score
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.infraction import InfractionKind
 
+WORDS = {
+    InfractionKind.COLLISION_PEDESTRIAN: "collision with a pedestrian",
+    InfractionKind.COLLISION_VEHICLE: "collision with a vehicle",
+    InfractionKind.COLLISION_LAYOUT: "collision with an obstacle",
+    InfractionKind.RED_LIGHT: "red light",
+    InfractionKind.STOP: "stop sign",
+    InfractionKind.GIVE_WAY: "give-way sign",
+    InfractionKind.OUTSIDE_ROUTE_LANES: "outside its lanes",
+    InfractionKind.MIN_SPEED: "too slow",
+    InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: "no way for an emergency vehicle",
+    InfractionKind.SCENARIO_TIMEOUT: "scenario timed out",
+    InfractionKind.ROUTE_DEVIATION: "left the route",
+    InfractionKind.VEHICLE_BLOCKED: "blocked",
+    InfractionKind.ROUTE_TIMEOUT: "timed out",
+}
+
 
 @dataclass(frozen=True)
 class RouteOutcome:
@@ -38,6 +54,12 @@ class RouteOutcome:
     duration_us: int
     apart_m: float | None = None
     apart_us: int | None = None
+
+    @property
+    def fate(self) -> str:
+        """How it ended, in words: the infractions, or that it was completed."""
+        kinds = [WORDS[InfractionKind(kind)] for kind, _ in self.infractions]
+        return ", ".join(dict.fromkeys(kinds)) or self.ending
 
     def to_json(self) -> dict[str, Any]:
         """Return a flat object; infractions as a list of kind and time."""

@@ -85,6 +85,7 @@ def _run(
         clock.scale,
         this_machine(),
         versions(),
+        clock.load,
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.simulator.cameras import paint_texture
-from me2e_compress.simulator.pictures import Moment, RoutePicture, write_png
+from me2e_compress.simulator.pictures import Moment, RoutePicture, overlay, write_png
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.world import World
 from me2e_compress.study.condition import Condition
@@ -21,7 +21,7 @@ SCORED, MOVED_M = 1.0, 0.5
 
 @dataclass(frozen=True)
 class Contrast:
-    """Two pictures of one moment.
+    """A picture of one moment of two drives.
 
     Attributes:
         route: What the baseline made of the route.
@@ -29,8 +29,7 @@ class Contrast:
         variant: Its name.
         condition: Under what both drove.
         time_us: The moment; a drive that was over by then shows its end.
-        before: PNG of the baseline.
-        after: PNG of the variant.
+        picture: PNG: the baseline in grey under the variant.
     """
 
     route: RouteOutcome
@@ -38,8 +37,7 @@ class Contrast:
     variant: str
     condition: str
     time_us: int
-    before: Path
-    after: Path
+    picture: Path
 
 
 @dataclass(frozen=True)
@@ -110,15 +108,12 @@ def take_pictures(
         setup.listener.on_progress("pictures", done, len(pairs), pair.route.route)
         condition = conditions[pair.drive.condition]
         where = routes[pair.route.route]
-        names = (setup.study.baseline, pair.drive.variant)
-        before, after = (
-            _picture(setup, by_name[name], condition, where, pair.moment_us)
-            for name in names
-        )
+        both = by_name[pair.drive.variant], by_name[setup.study.baseline]
+        picture = _picture(setup, *both, condition, where, pair.moment_us)
         found.append(
             Contrast(
                 *(pair.route, pair.other, pair.drive.variant, condition.name),
-                *(pair.moment_us, before, after),
+                *(pair.moment_us, picture),
             )
         )
     return tuple(found)
@@ -170,22 +165,26 @@ class _Enough(Exception):  # noqa: N818 - it ends a drive, nothing went wrong
 
 def _picture(
     setup: DriveSetup,
-    prepared: PreparedVariant,
+    variant: PreparedVariant,
+    baseline: PreparedVariant,
     condition: Condition,
     route: Route,
     time_us: int,
 ) -> Path:
-    name = prepared.variant.name
-    path = setup.workspace.picture(prepared.variant, condition, route.id, time_us)
-    job = setup.job(prepared, condition)
-    if path.is_file() or job is None:
+    """Drive both again up to a moment and lay them over each other, unless that is."""
+    path = setup.workspace.picture(variant.variant, condition, route.id, time_us)
+    jobs = [setup.job(each, condition) for each in (variant, baseline)]
+    if path.is_file() or None in jobs:
         return path
-    moments = _watched(job, route, time_us)
     world = World(route)
-    texture = paint_texture(world.roadmap, world.path.points)
-    title = f"{route.scenario}   {name}"
-    picture = RoutePicture(title, texture, world.path.points, moments)
-    write_png(path, picture.frame(len(moments) - 1))
+    points = world.path.points
+    texture = paint_texture(world.roadmap, points)
+    drives = [
+        RoutePicture(each.variant.name, texture, points, _watched(job, route, time_us))
+        for each, job in zip((variant, baseline), jobs, strict=True)
+        if job is not None
+    ]
+    write_png(path, overlay(*drives))
     return path
 
 

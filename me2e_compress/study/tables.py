@@ -10,7 +10,8 @@ from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drives import Drive
 from me2e_compress.study.plan_fidelity import EXACT
-from me2e_compress.workflows.result import Cell, Table
+from me2e_compress.workflows.result import Cell, Table, counted
+from me2e_compress.workflows.result import number as plain_number
 
 if TYPE_CHECKING:
     from me2e_compress.study.changes import Change
@@ -88,17 +89,19 @@ def _differences_note(found: Sequence[PairedDifference]) -> str:
     ]
     if len(found) > 1:
         notes[1] = (
-            f", corrected for {len(found)} comparisons (Holm). The intervals are each "
-            f"of 95 %: of {len(found)}, one in twenty would miss zero by chance."
+            f", corrected for {len(found)} comparisons (Holm). Each interval is a 95 % "
+            "interval by itself: one in twenty misses zero by chance where nothing "
+            "differs."
         )
     if found:
         n, least = found[0].driving_score.n, found[0].smallest_shown
-        notes.append(f" {n} routes show no difference below {least:.1f} points.")
+        on = counted(n, "route")
+        notes.append(f" {on} cannot show a difference below {least:.1f} points.")
     alike = [each for each in found if not each.differ]
     if alike:
         routes, share = alike[0].driving_score.n, alike[0].unseen_percent
         notes.append(
-            f" Where 0 of {routes} routes differ, with 95 % at most {share:.1f} % do."
+            f" Where 0 of {routes} routes differ, at most {share:.1f} % do (95 %)."
         )
     return "".join(notes)
 
@@ -224,7 +227,8 @@ def _condition(outcome: "StudyResult", condition: Condition) -> str:
 
 def _routes_note(outcome: "StudyResult") -> str:
     driven, whole = outcome.coverage
-    share = f"{driven} routes" if driven == whole else f"{driven} of {whole} routes"
+    of = "" if driven == whole else f"{driven} of "
+    share = f"{of}{counted(whole, 'route')}"
     return (
         f"{share}. DS driving score, SR success rate, DE efficiency, DC comfort, each "
         f"with its 95 % interval over these scenario types. {MISSING} means not "
@@ -278,7 +282,4 @@ def measure_cell(measure: Measure, form: str) -> Cell:
 
 def number(value: float, form: str) -> str:
     """Write a number with a minus as wide as a plus, and no negative zero."""
-    text = format(value, form)
-    if not any(digit in text for digit in "123456789"):
-        text = text.replace("-", "+" if form.startswith("+") else "")
-    return text.replace("-", MINUS)
+    return plain_number(value, form).replace("-", MINUS)

@@ -6,8 +6,11 @@ from dataclasses import dataclass, replace
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import LatencySource
 from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.percentiles import too_few
 from me2e_compress.runtime.interleaved import describe_machine, record_traces
 from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.others_load import Load
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.prepared import PreparedVariant
@@ -24,17 +27,23 @@ class Clock:
         scale: How many times slower the device is than the machine of the traces;
             one number for all variants.
         reason: Why a variant has no trace, in words; empty if all have one.
+        load: What other processes took while traces were measured here, the worst of
+            them; None where none was measured.
     """
 
     traces: Mapping[str, LatencyTrace]
     scale: float
     reason: str = ""
+    load: Load | None = None
 
-    def milliseconds(self, variant: str, percent: float) -> float | None:
-        """Return a percentile on the device; None without a trace."""
+    def latency(self, variant: str, percent: float) -> Measure:
+        """Return a percentile on the device, ms; None without enough samples."""
         if variant not in self.traces:
-            return None
-        return self.scale * self.traces[variant].percentile_us(percent) / 1e3
+            return Measure(None, "ms", self.reason or "not measured")
+        trace = self.traces[variant]
+        if why := too_few(percent, len(trace.samples_us)):
+            return Measure(None, "ms", why)
+        return Measure(self.scale * trace.percentile_us(percent) / 1e3, "ms")
 
     def source(
         self, variant: Variant, condition: Condition, seed: int
@@ -75,7 +84,8 @@ def time_all(
         if kept is not None:
             traces[each.variant.name] = kept
     if frames is None:
-        return Clock(traces, _scale(study, traces), "no held-out frames were given")
+        why = "no held-out frames were given"
+        return Clock(traces, _scale(study, traces), why, _load(prepared, traces))
     baseline = next(each for each in prepared if each.variant is study.reference)
     kept_baseline = None if baseline.variant.trace else traces.get(study.baseline)
     missing = _missing(prepared, traces, kept_baseline, workspace, listener)
@@ -85,7 +95,18 @@ def time_all(
         trace = replace(measured[each.variant.name], frames=seen)
         trace.save(workspace.trace(each.variant))
         traces[each.variant.name] = trace
-    return Clock(traces, _scale(study, traces), "not a model")
+    load = _load(prepared, traces)
+    return Clock(traces, _scale(study, traces), "not a model", load)
+
+
+def _load(
+    prepared: Sequence[PreparedVariant], traces: Mapping[str, LatencyTrace]
+) -> Load | None:
+    """Return the worst load under which a trace was measured here."""
+    names = [each.variant.name for each in prepared if not each.variant.trace]
+    found = [traces[name].others for name in names if name in traces]
+    known = [each for each in found if each is not None]
+    return max(known, key=lambda load: load.others, default=None)
 
 
 def _missing(
@@ -178,7 +199,8 @@ def _other(
         return "another model"
     if len(trace.samples_us) < wanted:
         return f"{len(trace.samples_us)} samples, not {wanted}"
-    if trace.machine != machine:
+    # as it was written before 1 was singular
+    if trace.machine.replace("on 1 threads", "on 1 thread") != machine:
         return f"another machine ({trace.machine}; this is {machine})"
     if None not in (trace.frames, frames) and trace.frames != frames:
         return "other frames"
@@ -192,7 +214,7 @@ def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:
         return 1.0
     if study.baseline not in traces:
         raise EvaluationError(
-            f"latency: the device scale wants a median of {wanted_s} s of "
+            f"latency: the device scale needs a median of {wanted_s} s of "
             f"{study.baseline}, and there is no trace of it"
         )
     median_us = traces[study.baseline].percentile_us(50)

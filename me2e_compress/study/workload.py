@@ -15,7 +15,14 @@ from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import Cell, Result, Table, number
+from me2e_compress.workflows.result import (
+    Cell,
+    Result,
+    Table,
+    counted,
+    duration,
+    number,
+)
 
 FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one
@@ -69,17 +76,17 @@ class Workload(Result):
 
     @property
     def headline(self) -> str:
-        """Drives, routes, hours."""
-        drives = _count(len(self.drives), "drive")
+        """Drives, routes, time."""
+        drives = counted(len(self.drives), "drive")
         if not self.set_size:
             return f"{self.title}: {drives}, of routes that the evaluator knows"
         routes = sum(each.routes for each in self.drives)
         done = sum(each.done for each in self.drives)
         how = "by this folder's logs" if self.measured else "an estimate"
         return (
-            f"{self.title}: {drives}, {_count(routes, 'route')},"
-            f" {number(done)} of them driven; about {self.hours:.1f} hours"
-            f" on {_count(self.workers, 'worker')} ({how})"
+            f"{self.title}: {drives}, {counted(routes, 'route')},"
+            f" {number(done)} of them driven; about {duration(3600 * self.hours)}"
+            f" on {counted(self.workers, 'worker')} ({how})"
         )
 
     def tables(self) -> tuple[Table, ...]:
@@ -89,11 +96,11 @@ class Workload(Result):
                 Cell(each.variant),
                 Cell(each.condition),
                 Cell(f"{each.done} of {each.routes}"),
-                Cell(f"{each.hours:.2f}"),
+                Cell(duration(3600 * each.hours)),
             )
             for each in self.drives
         ]
-        columns = ("variant", "condition", "routes driven", "hours left")
+        columns = ("variant", "condition", "routes driven", "time left")
         return (Table("Drives", columns, tuple(rows), words=2),)
 
     def records(self) -> list[dict[str, object]]:
@@ -188,7 +195,3 @@ def _logged(folder: Path) -> tuple[float, float] | None:
     costs = np.array([(row["frames"], row["decisions"]) for row in rows], np.float64)
     found, _ = nnls(costs, np.array([row["seconds"] for row in rows], np.float64))
     return float(found[0]), float(found[1])
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{number(n)} {noun}{'' if n == 1 else 's'}"

@@ -45,8 +45,9 @@ class Workspace:
     def picture(
         self, variant: Variant, condition: Condition, route: str, time_us: int
     ) -> Path:
-        """Return where the picture of one moment goes."""
-        name = f"{route}.{time_us // 1000}ms.{variant.name}.{condition.name}.png"
+        """Return where the picture goes of one moment of it and of the baseline."""
+        drive = self.drive(variant, condition)
+        name = f"{route}.{time_us // 1000}ms.{drive}.overlay.png"
         return self._made("pictures") / name
 
     def _made(self, name: str) -> Path:

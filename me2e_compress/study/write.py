@@ -10,7 +10,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.runtime.atomic import write_bytes, write_json
 from me2e_compress.study.all_tables import all_tables
 from me2e_compress.study.outcome import StudyResult
-from me2e_compress.study.report import html
+from me2e_compress.study.report import Section, html
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.workflows.claims import writing
 
@@ -34,6 +34,7 @@ def write_study(
     outcome: StudyResult,
     folder: str | Path,
     command: Sequence[str] = (),
+    sections: Sequence[Section] = (),
     *,
     force: bool = False,
 ) -> StudyFiles:
@@ -43,6 +44,7 @@ def write_study(
         outcome: What was found.
         folder: It is made when needed.
         command: What makes it again, word by word.
+        sections: What the page tells besides.
         force: Replace files that are not as we left them, too.
 
     Raises:
@@ -62,7 +64,7 @@ def write_study(
         ):
             write_json(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
-            write_bytes(written.report, html(outcome, command).encode())
+            write_bytes(written.report, html(outcome, command, sections).encode())
     except OSError as error:
         raise StudyError(f"{folder}: cannot be written: {error.strerror}") from error
     return written

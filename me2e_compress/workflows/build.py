@@ -13,7 +13,7 @@ from me2e_compress.targets.tensorrt.tensorrt_engine import (
 from me2e_compress.workflows.checks import model_path, output_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, megabytes
+from me2e_compress.workflows.result import Result, Table, counted, megabytes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +49,8 @@ class EngineResult(Result):
         found = self.engine
         return (
             f"{self.output}: {megabytes(len(found.content))} MB, TensorRT"
-            f" {found.version}, {found.layers} layers parsed, {found.seconds:.0f} s;"
-            " it fits this GPU and this version"
+            f" {found.version}, {counted(found.layers, 'layer')} parsed,"
+            f" {found.seconds:.0f} s; it fits this GPU and this version"
         )
 
     def tables(self) -> tuple[Table, ...]:

@@ -57,6 +57,8 @@ class CalibrateOptions:
         onnxruntime_table: write onnxruntime's table too, into this folder.
         threads: of onnxruntime; 0 takes all.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        adapter: TOML file that says which outputs are fed back; ``compress`` is then
+            given it too.
         provider: what runs the graph.
         force: replace outputs that are not as we left them, too.
 
@@ -77,6 +79,7 @@ class CalibrateOptions:
     onnxruntime_table: str | Path | None = None
     threads: int = 0
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    adapter: str | Path | None = None
     provider: Provider = CPU
     force: bool = False
 
@@ -139,7 +142,7 @@ def _calibrate(
     listener: Listener,
 ) -> CalibrateResult:
     passes = with_sizes(recipe.load(options.recipe), options.dims)
-    loaded = read_graph(source, listener)
+    loaded = read_graph(source, listener, options.adapter)
     part = None if frames is None else _part(loaded, Path(frames), options)
     try_first(
         loaded,
@@ -203,7 +206,7 @@ def _outputs(output: Path, options: CalibrateOptions) -> list[Path]:
 def _inputs(
     source: Path, frames: str | Path | None, options: CalibrateOptions
 ) -> tuple[Given, ...]:
-    named = (options.recipe, options.module_map, options.imported)
+    named = (options.recipe, options.module_map, options.imported, options.adapter)
     return (source, frames, *named, *options.merge)
 
 

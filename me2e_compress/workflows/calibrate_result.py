@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.workflows.result import Result, Table
+from me2e_compress.workflows.result import Result, Table, counted
 
 _SHOWN = 5
 """How many of a kind are listed."""
@@ -30,11 +30,11 @@ class CalibrateResult(Result):
     def headline(self) -> str:
         """File, tensors, method, frames."""
         if self.ranges is None:
-            return f"{self.output}: shard {self.shard}, {self.frames} frames"
+            return f"{self.output}: shard {self.shard}, {counted(self.frames, 'frame')}"
         found = self.ranges
         return (
-            f"{self.output}: {len(found.tensors)} tensors, {found.method},"
-            f" {found.frames} frames"
+            f"{self.output}: {counted(len(found.tensors), 'tensor')}, {found.method},"
+            f" {counted(found.frames, 'frame')}"
         )
 
     def lines(self) -> tuple[str, ...]:

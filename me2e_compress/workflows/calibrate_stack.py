@@ -23,7 +23,14 @@ from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from me2e_compress.workflows.result import Result, Table
 from me2e_compress.workflows.stack_maps import map_of_stack
 
-_OF_ONE_FILE = ("shard", "merge", "imported", "tensorrt_cache", "onnxruntime_table")
+_OF_ONE_FILE = (
+    "shard",
+    "merge",
+    "imported",
+    "tensorrt_cache",
+    "onnxruntime_table",
+    "adapter",
+)
 """Options that are not for a stack."""
 
 

@@ -13,6 +13,7 @@ from me2e_compress.errors import GraphError, RecipeError
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.modules import ModuleMap, map_of
+from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.listener import Listener
 from me2e_compress.zoo.shipped import SHIPPED, shipped
 
@@ -47,13 +48,22 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
     raise GraphError(f"{text}: no such file; models that ship: {', '.join(SHIPPED)}")
 
 
-def read_graph(path: Path, listener: Listener) -> ir.Model:
+def read_graph(
+    path: Path, listener: Listener, adapter: str | Path | None = None
+) -> ir.Model:
     """Read a graph, and warn of what was changed in it, and of what it lacks.
+
+    Args:
+        path: of the file.
+        listener: is called with the warnings.
+        adapter: what it says becomes metadata of the graph; see :func:`adapted`.
 
     Raises:
         GraphError: not a graph.
+        EvaluationError: the adapter is not of this graph.
     """
     model = graph.load(path)
+    adapted(model, adapter)
     if said := lowered(model):
         listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
     if lack := lacking_shapes(model):

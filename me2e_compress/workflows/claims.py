@@ -67,15 +67,17 @@ def writing(
         yield
 
 
-def check_ours(files: Iterable[Path], *, force: bool = False) -> None:
-    """Refuse, long before they are written, files that are not to be replaced.
+def check_ours(
+    files: Iterable[Path], *, trees: Iterable[Path] = (), force: bool = False
+) -> None:
+    """Refuse, long before they are written, files and whole folders of the user's.
 
     Raises:
         GraphError: one is the user's, no regular file, or another process writes it.
     """
     there = [file for file in files if file.parent.is_dir()]
     check_output(there, ())
-    for file in there:
+    for file in (*there, *(tree for tree in trees if tree.parent.is_dir())):
         with _opened(file.absolute().parent / RECORD) as record:
             _Claim(record, file, force=force)
 

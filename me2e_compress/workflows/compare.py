@@ -12,11 +12,12 @@ from me2e_compress.fidelity.open_loop import OpenLoopTally
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.stack_session import open_session
+from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.first_try import load_interface, try_model
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.plan_quality import OpenLoop
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.workflows.result import Result, Table, counted, table
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -46,7 +47,7 @@ class CompareResult(Result):
             return f"plan displacement: not measured ({found.plan_reason})"
         said = (
             f"plan displacement: mean {found.plan.mean_m:.4f} m, largest"
-            f" {found.plan.max_m:.4f} m over {found.frames} frames"
+            f" {found.plan.max_m:.4f} m over {counted(found.frames, 'frame')}"
         )
         if found.same_choice is None:
             return said
@@ -59,7 +60,7 @@ class CompareResult(Result):
             *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in found.outputs),
             *((name, "removed", "") for name in found.missing),
         ]
-        title = f"Fidelity over {found.frames} frames"
+        title = f"Fidelity over {counted(found.frames, 'frame')}"
         outputs = table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows)
         agents = () if found.agents is None else (_agents(found.agents),)
         driven = () if self.open_loop is None else (self.open_loop.table(),)
@@ -81,16 +82,17 @@ class CompareResult(Result):
 
 def _agents(found: SetFidelity) -> Table:
     rows = [(name, f"{decibels:.1f}") for name, decibels in found.sqnr_db.items()]
+    agents = counted(found.agents, "agent")
     away = (
         "" if found.centre_m is None else f", {found.centre_m:.2f} m apart on average"
     )
     return table(
-        "Sure agents, each against the nearest, not slot by slot",
+        "Agents with a score of 0.5 or more, each against the nearest",
         ("output", "SQNR dB"),
         rows,
-        f"Of {found.agents} that the first is sure of (score 0.5), {found.found} have "
-        f"one of the second within 2 m{away}; it is sure of {found.kept} of them, and "
-        f"of {found.added} where the first has none.",
+        f"The first graph scores {agents} at 0.5 or more. The second has an agent "
+        f"within 2 m of {found.found} of them{away}, scores {found.kept} of those at "
+        f"0.5 or more, and {found.added} where the first has none.",
     )
 
 
@@ -102,6 +104,7 @@ def compare(
     *,
     as_it_stands: bool = False,
     provider: Provider = CPU,
+    adapter: str | Path | None = None,
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
@@ -116,6 +119,8 @@ def compare(
         as_it_stands: run the first graph without onnxruntime's optimizations, and the
             second with all of them: a graph held against itself shows what they change.
         provider: what runs both.
+        adapter: TOML file that says which output is the plan and which are fed back,
+            in both graphs; None leaves it to their metadata.
 
     Raises:
         GraphError: no such model, onnxruntime cannot run it, or its plan has several
@@ -126,8 +131,10 @@ def compare(
     """
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
+    said = dict[Path, dict[str, str]]()
     for path in dict.fromkeys(paths):
         model = load_interface(path)
+        said[path] = adapted(model, adapter)
         recording.check(model)
         try_model(model, path, recording, listener, provider)
     total = len(recording)
@@ -136,17 +143,19 @@ def compare(
         listener.on_progress("frames", frame.index, total, "")
         return frame
 
-    left, right = (
-        open_session(
-            paths[0], optimize=not as_it_stands, release=True, provider=provider
-        ),
-        open_session(paths[1], stock=as_it_stands, release=True, provider=provider),
-    )
+    left = open_session(
+        paths[0], optimize=not as_it_stands, release=True, provider=provider,
+        said=said[paths[0]],
+    )  # fmt: skip
+    right = open_session(
+        paths[1], stock=as_it_stands, release=True, provider=provider,
+        said=said[paths[1]],
+    )  # fmt: skip
     try:
-        adapter, reason = common_adapter(left, right)
+        read, reason = common_adapter(left, right)
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
-    tally = None if adapter is None else OpenLoopTally(adapter)
+    tally = None if read is None else OpenLoopTally(read)
     watch = None if tally is None else tally.add
     fidelity = measure(left, right, map(reported, recording), watch)
     driven = reason if tally is None else OpenLoop.of(tally)

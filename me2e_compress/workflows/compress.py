@@ -72,6 +72,7 @@ class CompressOptions:
         floor: least SQNR of an output, in dB, without a warning.
         allow_empty: write the graph although nothing in it became int8.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        adapter: TOML file whose plan and state become metadata of the graph.
         provider: what runs graphs, to calibrate, check and measure.
         force: replace outputs that are not as we left them, too.
 
@@ -94,6 +95,7 @@ class CompressOptions:
     floor: float = SQNR_FLOOR_DB
     allow_empty: bool = False
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    adapter: str | Path | None = None
     provider: Provider = CPU
     force: bool = False
 
@@ -192,12 +194,12 @@ def compress(
     passes = options.passes(recipe)
     read = [file for each in passes for file in each.files()]
     named = recipe if isinstance(recipe, str | Path) else None
-    inputs = (source, named, frames, options.module_map, *read)
+    inputs = (source, named, frames, options.module_map, options.adapter, *read)
     with (
         writing(written_files(output), inputs, force=options.force),
         collector_paused(),
     ):
-        loaded = read_graph(source, listener)
+        loaded = read_graph(source, listener, options.adapter)
         modules = load_map(options.module_map, loaded)
         split = _split(source, loaded, frames, passes, options)
         files = source, output, output.parent

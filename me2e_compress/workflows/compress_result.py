@@ -60,13 +60,15 @@ class CompressResult(Result):
         return named_weights(self.report.model.metadata_props)
 
     @property
+    def size(self) -> str:
+        """MB, and the share of what was compressed."""
+        share = self.output_bytes / self.source_bytes
+        return f"{megabytes(self.output_bytes)} MB, {share:.1%} of {self.source.name}"
+
+    @property
     def headline(self) -> str:
         """File, size, report."""
-        share = self.output_bytes / self.source_bytes
-        return (
-            f"{self.output}: {megabytes(self.output_bytes)} MB, {share:.1%} of"
-            f" {self.source.name}; report: {self.report_path}"
-        )
+        return f"{self.output}: {self.size}; report: {self.report_path}"
 
     def tables(self) -> tuple[Table, ...]:
         """Return pass by pass what changed, how it was checked, and how true it is."""

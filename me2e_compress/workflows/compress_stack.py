@@ -85,6 +85,8 @@ def compress_stack(
     options, output = options or CompressOptions(), Path(output)
     if output.suffix in (".onnx", ".toml"):
         raise GraphError(f"{output}: a stack is written as a folder: name one")
+    if options.adapter is not None:
+        raise RecipeError(f"--adapter is for one file: {stack} says state and plan")
     whole = SplitStack.load(model_path(stack))
     pipelines = _pipelines(whole, recipe, options)
     check_folder(output, (*whole.paths(), frames))

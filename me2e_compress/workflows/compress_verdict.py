@@ -7,7 +7,7 @@ from me2e_compress.fidelity.floor import Shortfall, shown
 from me2e_compress.manager import Report
 from me2e_compress.workflows.compress_fidelity import NOT_ASKED, MeasuredLoss
 from me2e_compress.workflows.int8_outcome import Int8Outcome
-from me2e_compress.workflows.result import Table, megabytes, table
+from me2e_compress.workflows.result import Table, counted, megabytes, table
 
 LEAST_SHOWN = 10_000
 """Bytes of a rule that are worth a word."""
@@ -58,13 +58,13 @@ def _cure(loss: MeasuredLoss) -> Iterator[str]:
     """Name the nodes, and what the outputs are with them in float."""
     assert loss.remedy is not None
     remedy, worst = loss.remedy, loss.shortfalls[0].output
-    runs = f"{remedy.trials} variants run on {_frames(remedy.fidelity)}"
+    runs = f"{counted(remedy.trials, 'variant')} run on {_frames(remedy.fidelity)}"
     found = [
         *map(str, remedy.nodes),
         *(f"many nodes of module {name}" for name in remedy.modules),
     ]
     if not found:
-        yield f"no node or module is to blame alone ({runs})"
+        yield f"no single node or module is to blame ({runs})"
         return
     yield f"lost at {'; '.join(found)}"
     after = ", ".join(map(str, remedy.shortfalls)) or _figure(remedy.fidelity, worst)
@@ -74,7 +74,7 @@ def _cure(loss: MeasuredLoss) -> Iterator[str]:
 
 
 def _int8_line(int8: Int8Outcome) -> str:
-    said = f"int8: {int8.nodes} nodes"
+    said = f"int8: {counted(int8.nodes, 'node')}"
     if int8.float_bytes:
         rules = ", ".join(
             f"{rule} {megabytes(count)}"
@@ -98,7 +98,8 @@ def _proof(report: Report) -> Iterator[str]:
     ]
     if judged and not report.lossy:
         worst, inputs = max(judged)
-        yield f"every output is the same within {worst:.1e} of its largest ({inputs})"
+        near = f" to within {worst:.1e} of its largest value" if worst else ""
+        yield f"every output is the same{near} ({inputs})"
     if not any(step.changes for step in report.steps):
         yield "every output is the same: no pass changed anything"
     for check in report.verifications:

@@ -5,13 +5,19 @@ from collections.abc import Iterator
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.deadlines import Deadlines
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.workflows.result import Table, number, table
+from me2e_compress.workflows.result import Table, counted, not_measured, number, table
 
 
 def deadlines_table(title: str, found: Deadlines) -> Table:
     """Show percentiles and how many decisions took longer than the budget."""
     rows = [(name, *_cells(measure)) for name, measure in _each(found)]
-    return table(f"{title}: {found.count} decisions", ("latency", "", "unit"), rows)
+    why = {name: each.reason for name, each in _each(found) if each.value is None}
+    return table(
+        f"{title}: {counted(found.count, 'decision')}",
+        ("latency", "", "unit"),
+        rows,
+        not_measured(why),
+    )
 
 
 def check_budget(budget_ms: float) -> None:
@@ -35,6 +41,4 @@ def _each(found: Deadlines) -> Iterator[tuple[str, Measure]]:
 
 
 def _cells(measure: Measure) -> tuple[str, str]:
-    if measure.value is None:
-        return "-", f"not measured: {measure.reason}"
     return number(measure.value, ".2f"), measure.unit

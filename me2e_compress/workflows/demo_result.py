@@ -3,7 +3,13 @@
 import dataclasses
 from collections.abc import Mapping
 
+from me2e_compress.workflows.compress_result import CompressResult
 from me2e_compress.workflows.result import Result, Table
+
+
+def figure(found: Result) -> str:
+    """Return what a step found, short enough for a line of a terminal."""
+    return found.size if isinstance(found, CompressResult) else found.headline
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -35,8 +41,13 @@ class DemoResult(Result):
         return tuple(line for each in self.steps.values() for line in each.alerts())
 
     def tables(self) -> tuple[Table, ...]:
-        """Return the tables of every step."""
-        return tuple(each for step in self.steps.values() for each in step.tables())
+        """Return what the last step compares: before and after."""
+        return self._last.tables()
+
+    def details(self) -> tuple[Table, ...]:
+        """Return the tables of the steps before, and what more the last one tells."""
+        *others, last = self.steps.values()
+        return (*(each for step in others for each in step.tables()), *last.details())
 
     def records(self) -> list[dict[str, object]]:
         """Return the rows of the last step."""

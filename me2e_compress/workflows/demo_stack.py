@@ -116,7 +116,7 @@ class StackDemo:
     Attributes:
         stack: ``vad-tiny``.
         out: the folder.
-        scheme: a shipped recipe.
+        recipe_name: a shipped recipe.
         rounds: of the latency.
         threads: of onnxruntime.
         provider: what runs the graphs.
@@ -129,7 +129,7 @@ class StackDemo:
 
     stack: str
     out: Path
-    scheme: str = "feature-ext"
+    recipe_name: str = "full-fused"
     rounds: int = 4
     threads: int = 2
     provider: Provider = CPU
@@ -138,7 +138,7 @@ class StackDemo:
 
     def __post_init__(self) -> None:
         """Check recipe, threads and folder."""
-        recipe.load(self.scheme)
+        recipe.load(self.recipe_name)
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_folder(self.out, ())
 
@@ -166,7 +166,12 @@ class StackDemo:
             measure_frames=0, provider=self.provider, force=self.force
         )
         return compress(
-            self._source, self._small, self.scheme, self._frames, unmeasured, listener
+            self._source,
+            self._small,
+            self.recipe_name,
+            self._frames,
+            unmeasured,
+            listener,
         )
 
     def weigh(self, listener: Listener) -> ModuleChanges:
@@ -218,7 +223,7 @@ class StackDemo:
 
     @property
     def _small(self) -> Path:
-        return self.out / f"{self.stack}.{self.scheme}.onnx"
+        return self.out / f"{self.stack}.{self.recipe_name}.onnx"
 
     @property
     def _frames(self) -> Path:

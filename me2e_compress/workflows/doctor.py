@@ -91,7 +91,7 @@ def doctor() -> DoctorResult:
 
 def _machine() -> list[Checkup]:
     memory = psutil.virtual_memory().total / 2**30
-    enough = "" if memory >= 6 else "VAD-tiny wants 6 GiB to calibrate"
+    enough = "" if memory >= 6 else "VAD-tiny needs 6 GiB to calibrate"
     return [
         Checkup("cores", str(os.cpu_count())),
         Checkup("memory", f"{memory:.1f} GiB", enough),

@@ -203,7 +203,9 @@ def _evaluated(
     episodes = tuple(evaluator.episodes())
     scores = score_episodes(episodes, evaluator.set_size)
     pictures = _pictures(evaluator.job, shown, output)
-    return EvaluateResult(policy, output, scores, pictures, charged(episodes))
+    measured = evaluator.job.conditions.latency.measured
+    late = charged(episodes, measured=measured)
+    return EvaluateResult(policy, output, scores, pictures, late)
 
 
 def with_stage(driver: Driver, host_stage: str) -> Driver:

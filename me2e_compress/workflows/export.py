@@ -138,7 +138,7 @@ class ExportResult(Result):
 def export_stack(
     stack: str, output: str | Path, options: ExportOptions | None = None
 ) -> ExportResult:
-    """Write a reference stack as ONNX: drawn, of a checkpoint, or our driver.
+    """Write a reference stack: random weights, a checkpoint's, or our driver.
 
     Args:
         stack: ``vad-tiny``, ``uniad-tiny``, ``uniad-trt``, ``tcp`` or ``highway``.

@@ -5,9 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from me2e_compress.calibration.logs import LOGS, DriveLog
+from me2e_compress.calibration.logs.log_frames import LoggedInputs
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError
 from me2e_compress.extras import need_extra
@@ -15,12 +17,13 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import digest_of_files
 from me2e_compress.version import __version__
+from me2e_compress.workflows.adapted_log import AdaptedInputs
 from me2e_compress.workflows.checks import check_count, check_folder, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.first_try import try_file
 from me2e_compress.workflows.listener import SILENT, Listener
 from me2e_compress.workflows.logged_inputs import inputs_of_model, inputs_of_stack
-from me2e_compress.workflows.result import Result, Table
+from me2e_compress.workflows.result import Result, Table, counted
 from me2e_compress.zoo.stacks import STACKS, find
 from me2e_compress.zoo.synthetic_frames import frames as synthetic
 
@@ -47,7 +50,6 @@ class FramesOptions:
 
     Raises:
         RecipeError: a seed below 0.
-        EvaluationError: an adapter for frames of a log.
     """
 
     count: int = 256
@@ -59,13 +61,8 @@ class FramesOptions:
     adapter: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the seed, and that the adapter adapts something."""
+        """Check the seed."""
         check_count("--seed", self.seed)
-        if self.adapter is not None and self.log is not None:
-            raise EvaluationError(
-                f"adapter {self.adapter}: --from lays frames out by the model's inputs;"
-                " leave one out"
-            )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -91,7 +88,7 @@ class FramesResult(Result):
     def headline(self) -> str:
         """Folder, frames, stack, and seed or log."""
         log, seed = self.options.log, self.options.seed
-        said = f"{self.output}: {self.count} frames of {self.stack}"
+        said = f"{self.output}: {counted(self.count, 'frame')} of {self.stack}"
         return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
 
     def tables(self) -> tuple[Table, ...]:
@@ -163,19 +160,14 @@ def _recorded(
     if options.log is not None:
         make, of, pixels = _logged(source, options.log, options)
         about = {"stack": str(source), "log": LOGS.text(options.log)}
-    elif Path(source).is_file() or find(str(source)).trained:
+    elif _drives(source, options):
         model = model_path(source)
         try_file(model, listener, options.provider)
         make, of = _driven(model, options), digest_of_files(model)
-        if options.adapter is not None:
-            of += f" {Adapter.digest(adapter_file(options.adapter))}"
-    elif options.adapter is not None:
-        raise EvaluationError(
-            f"adapter {options.adapter}: {source} is drawn from a synthetic world; name"
-            " the ONNX file that it adapts"
-        )
     else:
         make, of = _synthetic(str(source), options), str(source)
+    if options.adapter is not None:
+        of += f" {Adapter.digest(adapter_file(options.adapter))}"
 
     def reported(begin: Begin) -> Iterator[Frame]:
         for frame in make(begin):
@@ -193,7 +185,12 @@ def _logged(
     need_extra("logs", "reading pictures of a log")
     from me2e_compress.calibration.logs.log_frames import log_frames
 
-    if Path(source).is_file():
+    model: LoggedInputs | AdaptedInputs
+    if options.adapter is not None and _drives(source, options):
+        path = model_path(source)
+        model, of = AdaptedInputs(_policy(path, options)), digest_of_files(path)
+        log = model.log_for(log)
+    elif Path(source).is_file():
         model, of = (
             inputs_of_model(Path(source), log.size),
             digest_of_files(Path(source)),
@@ -207,19 +204,38 @@ def _logged(
             log, model, count, length, done=begin.frame, first=begin.place
         )
 
-    return make, of, {} if model.image is None else {"img": model.image}
+    image = model.image if isinstance(model, LoggedInputs) else None
+    return make, of, {} if image is None else {"img": image}
+
+
+def _drives(source: str | Path, options: FramesOptions) -> bool:
+    """Return whether a file keeps the contract; a stack that is drawn does not.
+
+    Raises:
+        EvaluationError: An adapter for one that is drawn.
+    """
+    if Path(source).is_file() or find(str(source)).trained:
+        return True
+    if options.adapter is not None:
+        raise EvaluationError(
+            f"adapter {options.adapter}: {source} is a stack of the zoo; name the ONNX"
+            " file that it adapts"
+        )
+    return False
+
+
+def _policy(model: Path, options: FramesOptions) -> OnnxPolicy:
+    adapter = None
+    if options.adapter is not None:
+        adapter = Adapter.load(adapter_file(options.adapter))
+    return OnnxPolicy.open(model, adapter, options.provider)
 
 
 def _driven(model: Path, options: FramesOptions) -> Source:
     need_extra("highway", "recording frames of a driver")
-    from me2e_compress.driving.onnx_policy import OnnxPolicy
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 
-    adapter = None
-    if options.adapter is not None:
-        adapter = Adapter.load(adapter_file(options.adapter))
-    policy = OnnxPolicy.open(model, adapter, options.provider)
-    length = options.scene_length
+    policy, length = _policy(model, options), options.scene_length
     return lambda begin: driven_frames(
         policy,
         options.count,

@@ -81,6 +81,7 @@ def refuse_both(frames: Path | None, options: ProfileOptions) -> None:
         "--by-module": options.by_module,
         "--figure": options.figure,
         "--energy": options.energy,
+        "--adapter": options.adapter,
     }
     for name, value in asked.items():
         if value not in (None, False):

@@ -24,6 +24,7 @@ from me2e_compress.runtime.energy.modelled import (
 )
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.recurrence import recurrent_inputs
+from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.listener import SILENT, Listener
@@ -45,6 +46,7 @@ def inspect(
     trace: str | Path | None = None,
     frames: str | Path | None = None,
     listener: Listener = SILENT,
+    adapter: str | Path | None = None,
 ) -> InspectResult:
     """Read a graph and weigh its modules.
 
@@ -57,6 +59,7 @@ def inspect(
         trace: latencies of this model by module, as ``profile`` writes them.
         frames: folder of recorded frames: measure the latencies on them instead.
         listener: is called with progress and warnings.
+        adapter: TOML file that says which outputs are fed back.
 
     Raises:
         EnergyError: no such process.
@@ -74,8 +77,9 @@ def inspect(
     path = model_path(model)
     taken = None if trace is None else trace_of(trace, path)
     if frames is not None:
-        taken = _timed(path, module_map, frames, listener)
+        taken = _timed(path, module_map, frames, listener, adapter)
     loaded = graph.load(path)
+    adapted(loaded, adapter)
     return inspected(path, loaded, load_map(module_map, loaded), dims, process, taken)
 
 
@@ -141,6 +145,7 @@ def _timed(
     module_map: str | Path | None,
     frames: str | Path,
     listener: Listener,
+    adapter: str | Path | None,
 ) -> LatencyTrace:
     """Measure module by module, one inference a frame."""
     from me2e_compress.workflows.profile import (  # opens sessions
@@ -148,7 +153,7 @@ def _timed(
         profile,
     )
 
-    options = ProfileOptions(by_module=True, module_map=module_map)
+    options = ProfileOptions(by_module=True, module_map=module_map, adapter=adapter)
     return profile(path, frames, options=options, listener=listener).trace
 
 

@@ -14,7 +14,7 @@ from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.inspect import inspected
 from me2e_compress.workflows.inspect_result import InspectResult
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, megabytes, table
+from me2e_compress.workflows.result import Result, Table, counted, megabytes, table
 from me2e_compress.workflows.stack_maps import map_of_stack
 
 
@@ -60,7 +60,7 @@ class StackInspectResult(Result):
     def headline(self) -> str:
         """TOML, files, size."""
         size = sum(each.file_bytes for each in self.files.values())
-        return f"{self.file}: {len(self.files)} files, {megabytes(size)} MB"
+        return f"{self.file}: {counted(len(self.files), 'file')}, {megabytes(size)} MB"
 
     def lines(self) -> tuple[str, ...]:
         """Return what each file says, and the headline."""
@@ -101,6 +101,7 @@ def inspect_stack(
     trace: str | Path | None = None,
     frames: str | Path | None = None,
     listener: Listener = SILENT,
+    adapter: str | Path | None = None,
 ) -> StackInspectResult:
     """Read a stack, and weigh the modules of each of its files.
 
@@ -112,12 +113,15 @@ def inspect_stack(
         trace: not for a stack: nodes are timed in one graph at a time.
         frames: likewise.
         listener: is not called.
+        adapter: not for a stack, whose TOML says state and plan.
 
     Raises:
         GraphError: a file is missing, or they do not fit each other.
-        RecipeError: a trace or frames.
+        RecipeError: a trace, frames or an adapter.
         ModuleMapError: no such map, or a pattern matches nothing in any file.
     """
+    if adapter is not None:
+        raise RecipeError(f"--adapter is for one file: {stack} says state and plan")
     if trace is not None or frames is not None:
         raise RecipeError(
             "--trace and --frames time the nodes of one graph: inspect one of the files"

@@ -17,6 +17,7 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.sensitivity import Drive, Int8Choice, Trials, write_recipe
 from me2e_compress.targets import TARGETS
+from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     Given,
@@ -43,6 +44,8 @@ class TrialOptions:
         count: frames to judge on.
         threads: of onnxruntime; 0 takes all.
         dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
+        adapter: TOML file that says which output is the plan, which are fed back, and
+            how the model drives.
         provider: what runs the graphs.
         force: replace outputs that are not as we left them, too.
 
@@ -58,6 +61,7 @@ class TrialOptions:
     count: int = 4
     threads: int = 0
     dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    adapter: str | Path | None = None
     provider: Provider = CPU
     force: bool = False
 
@@ -93,7 +97,8 @@ class TrialFiles:
             GraphError: one of them is not to be written; names it.
         """
         output = output_path(self.output)
-        read = (self.model, self.frames, options.ranges, options.module_map, *inputs)
+        named = (options.ranges, options.module_map, options.adapter)
+        read = (self.model, self.frames, *named, *inputs)
         overrides = output.with_name(output.stem + ".overrides.toml")
         return writing([output, overrides], read, force=options.force)
 
@@ -114,6 +119,7 @@ class TrialFiles:
         rules, place = RULE_SETS.parse(options.rules), TARGETS.parse(target)
         recording = CalibrationSet(self.frames)
         loaded = graph.load(self.model)
+        adapted(loaded, options.adapter)
         recording.check(loaded)
         scheme = QuantScheme.named(options.scheme, load_map(options.module_map, loaded))
         name = self.model.name

@@ -13,13 +13,15 @@ from matplotlib.style import context
 from matplotlib.ticker import PercentFormatter
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.percentiles import percentile, too_few
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.runtime.latency_trace import Microseconds, percentile
+from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
 
 Totals: TypeAlias = npt.NDArray[np.int64]
 """Microseconds of whole inferences."""
 
-_MARKED = (50, 99)
+_MARKED = {50: ":", 99: "--"}
+"""Percentiles in the tail, and how their lines are drawn."""
 _STYLE = {
     "font.size": 9,
     "axes.spines.top": False,
@@ -34,31 +36,24 @@ _MOST_COLOURS = 10
 """Of the map ``tab10``: modules beyond these are drawn as one."""
 
 
-def draw_modules(parts: Microseconds, name: str, machine: str, path: Path) -> None:
+def draw_modules(trace: LatencyTrace, name: str, path: Path) -> None:
     """Draw what modules took: stacked inference by inference, and how they spread.
 
     Left, a bar an inference, a colour a module, the largest at the bottom. Right, which
     share of the inferences takes longer than so many milliseconds, on a logarithmic
-    axis: a long tail reaches far to the right.
+    axis: a long tail reaches far to the right. Both are of the inferences under the
+    profiler, which is said above them beside the median without it.
 
     Args:
-        parts: microseconds by module, one number an inference.
+        trace: by module.
         name: of the model.
-        machine: that ran it, in words.
         path: PNG, SVG or PDF.
 
     Raises:
         EvaluationError: the file cannot be written.
     """
     with context(_STYLE, after_reset=True):
-        figure = Figure(figsize=(9.6, 3.6), layout="constrained")
-        left, right = figure.subplots(1, 2, width_ratios=(2.3, 1))
-        figure.suptitle(f"{name}: {machine}", x=0.01, ha="left", fontsize=10)
-        shown = _gathered(parts)
-        total = np.sum([np.array(each) for each in shown.values()], axis=0)
-        _stack(left, shown, total)
-        _tail(right, total)
-        drawn = io.BytesIO()
+        figure, drawn = modules_figure(trace, name), io.BytesIO()
         kind = path.suffix.removeprefix(".")
         undated = {"Date": None} if kind == "svg" else None
         figure.savefig(drawn, format=kind, dpi=160, metadata=undated)
@@ -66,6 +61,29 @@ def draw_modules(parts: Microseconds, name: str, machine: str, path: Path) -> No
         write_bytes(path, drawn.getvalue())
     except OSError as error:
         raise EvaluationError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def modules_figure(trace: LatencyTrace, name: str) -> Figure:
+    """Return what :func:`draw_modules` writes."""
+    figure = Figure(figsize=(9.6, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(2.3, 1))
+    shown = _gathered(trace.modules_us)
+    total = np.sum([np.array(each) for each in shown.values()], axis=0)
+    said = f"{name}: {trace.machine}\n{_slower(trace, total)}"
+    figure.suptitle(said, x=0.01, ha="left", fontsize=10)
+    _stack(left, shown, total)
+    _tail(right, total)
+    return figure
+
+
+def _slower(trace: LatencyTrace, total: Totals) -> str:
+    """Say who timed the modules, and what that costs an inference."""
+    taken_us = total, trace.samples_us
+    under, without = (f"{np.mean(each) / 1e3:.3g}" for each in taken_us)
+    return (
+        f"timed by onnxruntime's profiler, which takes time itself: {under} ms on"
+        f" average, {without} ms without it"
+    )
 
 
 def _gathered(parts: Microseconds) -> Microseconds:
@@ -104,11 +122,19 @@ def _tail(axes: Axes, total: Totals) -> None:
     axes.step(np.sort(total) / 1e3, slower, where="pre", color=_INK, linewidth=1.4)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    for percent in _MARKED:
-        place = percentile(total.tolist(), percent) / 1e3
-        axes.axvline(place, color=_MUTED, linewidth=0.8, linestyle=":")
-        above = axes.get_xaxis_transform()
-        words = f"p{percent} {place:.0f}"
-        axes.text(place, 1.01, words, transform=above, color=_MUTED, ha="center")
+    samples = total.tolist()
+    for percent, drawn in _MARKED.items():
+        if not too_few(percent, len(samples)):
+            place = percentile(samples, percent) / 1e3
+            words = f"p{percent} {place:.3g} ms"
+            axes.axvline(
+                place, color=_MUTED, linewidth=0.8, linestyle=drawn, label=words
+            )
+    if axes.get_legend_handles_labels()[0]:  # above the axes, where no curve is
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(_MARKED),
+            frameon=False, labelcolor=_MUTED, borderaxespad=0.0, handlelength=1.6,
+            columnspacing=1.0,
+        )  # fmt: skip
     axes.set_xlabel("milliseconds", color=_MUTED)
-    axes.set_title("how many take longer", color=_MUTED, pad=16)
+    axes.set_title("how many take longer", color=_MUTED, pad=22)

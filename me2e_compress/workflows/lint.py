@@ -17,7 +17,7 @@ from me2e_compress.targets.tensorrt.rtx import BuildResult, check
 from me2e_compress.workflows.checks import load_map, model_path
 from me2e_compress.workflows.first_try import try_first
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Status, Table, table
+from me2e_compress.workflows.result import Result, Status, Table, counted, table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,8 @@ class LintResult(Result):
         if errors:
             first = errors[0]
             return (
-                f"{self.model}: {self.options.target} refuses it, {len(errors)} errors;"
+                f"{self.model}: {self.options.target} refuses it,"
+                f" {counted(len(errors), 'error')};"
                 f" {first.rule} {first.node!r}: {first.message}"
             )
         if self.build is not None and not self.build.passed:
@@ -104,8 +105,10 @@ class LintResult(Result):
         """Count errors and warnings."""
         counts = Counter(each.severity for each in self.findings)
         return (
-            f"{self.model.name} for {self.options.target}: {counts['error']} errors,"
-            f" {counts['warning']} warnings (our own rules and operator tables)"
+            f"{self.model.name} for {self.options.target}:"
+            f" {counted(counts['error'], 'error')},"
+            f" {counted(counts['warning'], 'warning')} (our own rules and operator"
+            " tables)"
         )
 
     def lines(self) -> tuple[str, ...]:

@@ -1,7 +1,10 @@
 """How a workflow reports progress: to nobody, unless a listener is given."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+Progress = Callable[[str, int, int, str], None]
+Warn = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -13,8 +16,16 @@ class Listener:
         on_warning: Called with one line a surprise.
     """
 
-    on_progress: Callable[[str, int, int, str], None] = lambda stage, a, b, words: None
-    on_warning: Callable[[str], None] = lambda line: None
+    on_progress: Progress = field(default_factory=lambda: _no_progress, repr=False)
+    on_warning: Warn = field(default_factory=lambda: _no_warning, repr=False)
+
+
+def _no_progress(stage: str, done: int, total: int, words: str) -> None:
+    """Say nothing."""
+
+
+def _no_warning(line: str) -> None:
+    """Say nothing."""
 
 
 SILENT = Listener()

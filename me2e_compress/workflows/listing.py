@@ -168,7 +168,11 @@ def list_entries(kind: str | None = None) -> ListResult:
 
 def _added_to(kind: str) -> str:
     found = REGISTRIES.get(kind)
-    return "" if found is None else f"others add theirs by entry point: {found.group}"
+    return (
+        ""
+        if found is None
+        else f"other packages add theirs by entry point: {found.group}"
+    )
 
 
 def _rows(entry: Entry, closely: bool) -> Iterator[tuple[str, str]]:

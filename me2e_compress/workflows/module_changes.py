@@ -32,11 +32,13 @@ class ModuleChanges(Result):
 
     @property
     def headline(self) -> str:
-        """Nodes in all."""
+        """Weights in all, and the modules that are left."""
         before, after = (
-            sum(item.nodes for item in side) for side in (self.before, self.after)
+            megabytes(sum(item.weight_bytes for item in side))
+            for side in (self.before, self.after)
         )
-        return f"{before} nodes, now {after}"
+        left = f"{len(self.after)} of {len(self.before)} modules"
+        return f"{before} MB of weights, now {after} in {left}"
 
     def lines(self) -> tuple[str, ...]:
         """Return none: the table says it."""

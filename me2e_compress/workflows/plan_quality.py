@@ -15,7 +15,7 @@ import numpy.typing as npt
 from me2e_compress.fidelity.open_loop import OpenLoopTally
 from me2e_compress.metrics.intervals import mean_estimate
 from me2e_compress.runtime.recorded_future import STEP_S
-from me2e_compress.workflows.result import Table, number, table
+from me2e_compress.workflows.result import Table, counted, number, table
 
 Kind: TypeAlias = Literal["l2", "collision"]
 Convention: TypeAlias = Literal["at", "up-to"]
@@ -100,20 +100,20 @@ class OpenLoop:
                 each.title,
                 f"{each.reference:.2f}",
                 f"{each.candidate:.2f}",
-                f"{each.difference:+.2f}",
+                number(each.difference, "+.2f"),
                 _between(each.low, each.high),
                 _between(each.anew_low, each.anew_high),
             )
             for each in self.qualities
         ]
-        plural = "" if self.scenes == 1 else "s"
         return table(
             "Plans against what was really driven",
             ("mean", "first", "second", "differ", "95 %", "scenes anew"),
             rows,
-            f"Over {self.frames} frames of {self.scenes} scene{plural} whose next three"
-            f" seconds are known ({self.left_out} others are left out). At a horizon is"
-            " UniAD's convention, the mean up to it that of ST-P3 and VAD.",
+            f"Over {counted(self.frames, 'frame')} of {counted(self.scenes, 'scene')}"
+            f" whose next three seconds are known ({self.left_out} others are left"
+            " out). At a horizon is UniAD's convention, the mean up to it that of ST-P3"
+            " and VAD.",
         )
 
 

@@ -1,6 +1,7 @@
 """Latency of a model alone and warm, as a trace; and its energy, if asked."""
 
 import dataclasses
+from collections.abc import Mapping
 from importlib import util
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.stack.split_stack import is_stack
+from me2e_compress.workflows.adapted import adapted
 from me2e_compress.workflows.checks import (
     MOST_THREADS,
     check_count,
@@ -60,6 +62,7 @@ class ProfileOptions:
         energy_output: file of these; None is beside the trace, ``.energy.json``.
         schedule: how long energy is measured, and how often; None takes the defaults.
         budget_ms: what a decision may take: latencies are held against it.
+        adapter: TOML file that says which outputs are fed back.
 
     Raises:
         RecipeError: a number below 0, or beyond all measure; or a file of joules
@@ -79,6 +82,7 @@ class ProfileOptions:
     energy_output: str | Path | None = None
     schedule: EnergySchedule | None = None
     budget_ms: float = BUDGET_MS
+    adapter: str | Path | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -126,16 +130,17 @@ def profile(
         )
     if options.energy is not None:
         check_counter(options.energy)
-    inputs = (source, frames, options.module_map)
+    inputs = (source, frames, options.module_map, options.adapter)
     with writing([written, figure, joules], inputs, force=options.force):
         loaded, recording = load_interface(source), CalibrationSet(Path(frames))
-        trace, load = _measured(source, loaded, recording, options, listener)
+        said = adapted(loaded, options.adapter)
+        trace = _measured(source, loaded, said, recording, options, listener)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
             found = _broken_down(loaded, recording, options, listener)
             trace = dataclasses.replace(trace, modules_us=found.modules_us)
             operators = found.operators_us
-        energy = _energy(source, recording, options, listener)
+        energy = _energy(source, said, recording, options, listener)
         with drafts.all_or_none():
             if figure is not None:
                 draw(trace, source.stem, figure)
@@ -144,7 +149,7 @@ def profile(
             if energy is not None and joules is not None:
                 energy.save(joules)
     return ProfileResult(
-        *(source, trace, written, load.cores, load.of, operators, figure),
+        *(source, trace, written, operators, figure),
         energy=energy,
         energy_output=joules,
         budget_ms=options.budget_ms,
@@ -162,6 +167,7 @@ def _energy_path(options: ProfileOptions, trace: Path | None) -> Path | None:
 
 def _energy(
     source: Path,
+    said: Mapping[str, str],
     recording: CalibrationSet,
     options: ProfileOptions,
     listener: Listener,
@@ -175,6 +181,7 @@ def _energy(
         options.schedule,
         threads=options.threads,
         provider=options.provider,
+        said=said,
         on_window=lambda done, total, name: listener.on_progress(
             "energy", done, total, "windows"
         ),
@@ -201,7 +208,7 @@ def draw(trace: LatencyTrace, name: str, path: Path) -> None:
     """Draw what modules took, inference by inference; see :mod:`latency_figure`."""
     from me2e_compress.workflows.latency_figure import draw_modules  # matplotlib
 
-    draw_modules(trace.modules_us, name, trace.machine, path)
+    draw_modules(trace, name, path)
 
 
 def _broken_down(
@@ -229,12 +236,13 @@ def _broken_down(
 def _measured(
     source: Path,
     loaded: ir.Model,
+    said: Mapping[str, str],
     recording: CalibrationSet,
     options: ProfileOptions,
     listener: Listener,
-) -> tuple[LatencyTrace, OthersLoad]:
+) -> LatencyTrace:
     try_model(loaded, source, recording, listener, options.provider)
-    with OthersLoad() as load:
+    with OthersLoad() as others:
         trace = measure(
             source,
             recording,
@@ -242,8 +250,9 @@ def _measured(
             warm_up=options.warm_up,
             threads=options.threads,
             provider=options.provider,
+            said=said,
             on_sample=lambda done, total: listener.on_progress(
                 "profile", done, total, "inferences"
             ),
         )
-    return trace, load
+    return dataclasses.replace(trace, others=others.load)

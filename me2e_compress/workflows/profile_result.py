@@ -11,15 +11,14 @@ from me2e_compress.runtime.latency_trace import (
     shares,
     shares_table,
 )
-from me2e_compress.runtime.others_load import BUSY, is_busy
 from me2e_compress.workflows.deadlines_table import deadlines_table
 from me2e_compress.workflows.result import Result, Table
 
 _SHOWN = 12
 """Operators in a table."""
 BEYOND_P99 = 5
-"""Samples that must lie beyond the 99th percentile: with fewer, one disturbance more or
-less moves it."""
+"""Samples beyond the 99th percentile from which on it is steady: with fewer, one
+disturbance more or less moves it."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -32,8 +31,6 @@ class ProfileResult(Result):
         output: the trace that was written; None if none was.
         operators_us: what each operator took, in inferences under a profiler.
         figure: the picture that was drawn; None if none was.
-        others_cores: how many cores other processes kept busy; None: not measured.
-        cores: of the machine.
         energy: joules, or why there are none; None: not asked for.
         energy_output: the file they were written to; None if they were not.
         budget_ms: what a decision may take.
@@ -43,8 +40,6 @@ class ProfileResult(Result):
     model: Path
     trace: LatencyTrace
     output: Path | None
-    others_cores: float | None = None
-    cores: int = 1
     operators_us: Microseconds = dataclasses.field(default_factory=dict)
     figure: Path | None = None
     energy: EnergyResult | None = None
@@ -71,25 +66,19 @@ class ProfileResult(Result):
             return energy
         return (
             *energy,
-            f"p99 rests on too few samples: {count}, and {needed} are needed for"
-            f" {BEYOND_P99} beyond it{self._remedy(needed)}",
+            f"p99 is steady from {needed} samples on, with {BEYOND_P99} beyond it; here"
+            f" are {count}{self._remedy(needed)}",
         )
 
     def _remedy(self, needed: int) -> str:
         """Say how there would be more samples, where they were measured here."""
-        return "" if self.others_cores is None else f" (--samples {needed})"
+        return "" if self.trace.others is None else f" (--samples {needed})"
 
     def alerts(self) -> tuple[str, ...]:
         """Return whether the machine was busy, and what puts joules in doubt."""
         energy = () if self.energy is None else self.energy.alerts()
-        if self.others_cores is None or not is_busy(self.others_cores, self.cores):
-            return energy
-        return (
-            *energy,
-            f"the machine was busy: other processes took {self.others_cores:.1f} of"
-            f" {self.cores} cores, and more than {BUSY:.0%} moves latencies; measure"
-            " again when it is idle",
-        )
+        load = self.trace.others
+        return (*energy, str(load)) if load is not None and load.busy else energy
 
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds, by module and operator too."""
@@ -102,7 +91,8 @@ class ProfileResult(Result):
             return found
         rest = len(self.operators_us) - _SHOWN
         shown = shares_table("By operator, as it runs", "operator", self.operators_us)
-        note = f"{rest} more operators: --json" if rest > 0 else ""
+        more = f"{rest} more operators: --json" if rest > 0 else ""
+        note = "; ".join(filter(None, (shown.note, more)))
         return *found, dataclasses.replace(shown, rows=shown.rows[:_SHOWN], note=note)
 
     def records(self) -> list[dict[str, object]]:
@@ -111,12 +101,16 @@ class ProfileResult(Result):
 
     def to_json(self) -> object:
         """Return what the trace holds, shares, joules, how busy the machine was."""
+        load = self.trace.others
         return {
             **self.trace.to_json(),
             "deadlines": self.deadlines.to_json(),
             "modules": shares(self.trace.modules_us),
             "operators": shares(self.operators_us),
             "energy": None if self.energy is None else self.energy.to_json(),
-            "others_cores": self.others_cores,
-            "cores": self.cores,
+            **(
+                {"others_cores": None, "cores": None}
+                if load is None
+                else load.to_json()
+            ),
         }

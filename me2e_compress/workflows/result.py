@@ -11,9 +11,13 @@ from me2e_compress.display import (
     Cell,
     Displayed,
     Table,
+    counted,
+    duration,
     giga,
     megabytes,
+    not_measured,
     number,
+    significant,
     table,
 )
 from me2e_compress.errors import MissingPackageError
@@ -26,9 +30,13 @@ __all__ = [
     "Result",
     "Status",
     "Table",
+    "counted",
+    "duration",
     "giga",
     "megabytes",
+    "not_measured",
     "number",
+    "significant",
     "table",
 ]
 

@@ -13,7 +13,7 @@ from me2e_compress.simulator.scenarios.catalogue import SCENARIO_ABILITIES, VARI
 from me2e_compress.workflows.checks import check_count
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Status, Table, table
+from me2e_compress.workflows.result import Result, Status, Table, counted, table
 
 if TYPE_CHECKING:  # they take highway-env, an extra and a second to import
     from me2e_compress.evaluators.highway.admission import Admission
@@ -85,7 +85,7 @@ class RoutesResult(Result):
         """Routes, tries, file."""
         share = self.admitted / self.tried
         return (
-            f"{self.admitted} routes of {self.tried} tried ({share:.0%}) ->"
+            f"{self.admitted} of {counted(self.tried, 'route')} tried ({share:.0%}) ->"
             f" {self.output}"
         )
 
@@ -178,7 +178,7 @@ class ExaminationResult(Result):
     def headline(self) -> str:
         """Count those admitted."""
         admitted = len(self.verdicts) - len(self.refused)
-        return f"{admitted} of {len(self.verdicts)} routes admitted"
+        return f"{admitted} of {counted(len(self.verdicts), 'route')} admitted"
 
     def tables(self) -> tuple[Table, ...]:
         """Return the routes that are refused, and why."""

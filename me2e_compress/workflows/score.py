@@ -15,7 +15,13 @@ from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, number, table
+from me2e_compress.workflows.result import (
+    Result,
+    Table,
+    not_measured,
+    number,
+    table,
+)
 from me2e_compress.workflows.score_bench2drive import (
     STANDING,
     Bench2DriveOptions,
@@ -129,12 +135,16 @@ def score(
     """
     check_budget(budget_ms)
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
-    driven = dict[str, Sequence[Episode]]()
+    driven, measured = dict[str, Sequence[Episode]](), dict[str, int | None]()
     for path in map(Path, results):
         if (path / MANIFEST).exists():
-            driven[str(path)], size = _episodes(path, listener)
-            scores[str(path)] = metrics.score(driven[str(path)], size)
+            folder = ResultsFolder.open(path)
+            driven[str(path)] = _episodes(folder, listener)
+            scores[str(path)] = metrics.score(driven[str(path)], folder.set_size)
+            measured[str(path)] = folder.measured
             continue
+        if not path.exists():
+            raise EvaluationError(f"{path}: no such folder")
         if real is None and not holds_records(path):
             raise EvaluationError(
                 f"{path}: not a results folder: it holds neither {MANIFEST} nor "
@@ -151,20 +161,19 @@ def score(
     late = {
         name: found
         for name, episodes in driven.items()
-        if (found := charged(episodes, budget_ms)) is not None
+        if (found := charged(episodes, budget_ms, measured.get(name))) is not None
     }
     return ScoreResult(scores, runs, score_eer(driven, eer or EerOptions()), late)
 
 
-def _episodes(path: Path, listener: Listener) -> tuple[tuple[Episode, ...], int]:
-    """Return what a folder holds, and how many routes the whole set has."""
-    folder = ResultsFolder.open(path)
+def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:
+    """Return what a folder holds; say what of it is damaged."""
     episodes = tuple(folder.episodes().values())
     for file, reason in folder.corrupt.items():
         listener.on_warning(f"{file}: {reason}: left out")
     if stood := stood_most(episodes):
-        listener.on_warning(f"{path}: {STANDING}: {some_of(stood)}")
-    return episodes, folder.set_size
+        listener.on_warning(f"{folder.path}: {STANDING}: {some_of(stood)}")
+    return episodes
 
 
 def driving_score(scores: Scores) -> str:
@@ -183,7 +192,8 @@ def scores_table(name: str, scores: Scores) -> Table:
     partial = ", PARTIAL: no comparison with a whole set" if scores.partial else ""
     rows = [(label, *_cells(estimate)) for label, estimate in _each(scores)]
     columns = ("score", "mean", "95 %", "95 %, other types", "n", "unit")
-    return table(f"{name}: {routes}{partial}", columns, rows)
+    why = {label: e.measure.reason for label, e in _each(scores) if e.value is None}
+    return table(f"{name}: {routes}{partial}", columns, rows, not_measured(why))
 
 
 def score_records(scores: Scores) -> list[dict[str, object]]:
@@ -215,7 +225,7 @@ def _cells(estimate: Estimate) -> Sequence[str]:
     measure = estimate.measure
     form = ".2f" if measure.unit == "%" else ".3f"
     if measure.value is None:
-        return "-", "-", "-", str(estimate.n), f"not measured: {measure.reason}"
+        return "-", "-", "-", str(estimate.n), measure.unit
     here = _between(estimate.low, estimate.high, form)
     anew = _between(estimate.anew_low, estimate.anew_high, form)
     return number(measure.value, form), here, anew, str(estimate.n), measure.unit

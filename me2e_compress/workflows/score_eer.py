@@ -14,7 +14,14 @@ from me2e_compress.metrics.route_measures import RouteMeasures, route_measures
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.workflows.eer_weights import Kind, SavedWeights
 from me2e_compress.workflows.paired_drives import UNPAIRED, paired_drives
-from me2e_compress.workflows.result import Table, number, table
+from me2e_compress.workflows.result import (
+    Table,
+    counted,
+    not_measured,
+    number,
+    significant,
+    table,
+)
 
 HEADS: Mapping[Kind, str] = {
     "measured": "EER_AV",
@@ -92,7 +99,14 @@ class EerScores:
             columns += [HEADS[kind], "95 %", "95 %, other types", "n"]
             for row, name in zip(rows, names, strict=True):
                 row += _cells(result.scores[name])
-        return table("Driving and energy, points", columns, rows)
+        why = {
+            f"{HEADS[kind]} of {name}": each.measure.reason
+            for kind, result in self.found.items()
+            for name, each in result.scores.items()
+            if each.value is None
+        }
+        note = not_measured(why)
+        return table("Driving and energy, points", columns, rows, note)
 
     def _weights(self, kind: Kind) -> Table:
         found = self.found[kind]
@@ -100,7 +114,7 @@ class EerScores:
         if scale is None:
             return table("Weights", (), ())
         rows = [
-            (measure, f"{weight:.3f}", f"{low:.4g}", f"{low + span:.4g}", unit)
+            (measure, f"{weight:.3f}", significant(low), significant(low + span), unit)
             for measure, weight, low, span, unit in zip(
                 MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
             )
@@ -187,7 +201,7 @@ def joules_named(words: Sequence[str]) -> dict[str, str | float]:
     for word in words:
         name, equals, value = word.rpartition("=")
         if not (name and equals and value):
-            raise EvaluationError(f"energy {word!r}: NAME=JOULES or NAME=FILE is asked")
+            raise EvaluationError(f"energy {word!r}: write NAME=JOULES or NAME=FILE")
         if name in found:
             raise EvaluationError(f"energy of {name} is given twice")
         try:
@@ -215,8 +229,8 @@ def _folder(name: str, folders: Mapping[str, Sequence[Episode]]) -> str:
     fitting = [each for each in folders if name in (each, Path(each).name)]
     if len(fitting) != 1:
         raise EvaluationError(
-            f"energy of {name}: {len(fitting)} folders of that name; there are "
-            f"{', '.join(folders)}"
+            f"energy of {name}: {counted(len(fitting), 'folder')} of that name; there"
+            f" are {', '.join(folders)}"
         )
     return fitting[0]
 
@@ -227,7 +241,7 @@ def _joules(name: str, kind: Kind, given: str | Path | float) -> float | None:
             return _modelled(Path(given))
         return EnergyResult.load(Path(given)).j_per_frame
     if not 0.0 <= given < float("inf"):
-        raise EvaluationError(f"energy of {name}: {given} is no number of joules")
+        raise EvaluationError(f"energy of {name}: {given} is not a number of joules")
     return given
 
 
@@ -243,7 +257,7 @@ def _modelled(path: Path) -> float | None:
             f"{path}: not what inspect --modelled-energy --json prints: {error}"
         ) from error
     if joules is not None and not (isinstance(joules, float) and joules >= 0.0):
-        raise EvaluationError(f"{path}: modelled_j_per_frame: {joules} is no number")
+        raise EvaluationError(f"{path}: modelled_j_per_frame: {joules} is not a number")
     return joules
 
 
@@ -267,7 +281,7 @@ def _scale_json(found: EerResult, kind: Kind) -> dict[str, Any] | None:
 def _cells(estimate: Estimate) -> list[str]:
     measure = estimate.measure
     if measure.value is None:
-        return [f"- ({measure.reason})", "-", "-", str(estimate.n)]
+        return ["-", "-", "-", str(estimate.n)]
     here = _between(estimate.low, estimate.high)
     anew = _between(estimate.anew_low, estimate.anew_high)
     return [f"{measure.value:.2f}", here, anew, str(estimate.n)]

@@ -22,7 +22,7 @@ from me2e_compress.workflows.budgets import (
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, number, table
+from me2e_compress.workflows.result import Result, Table, significant, table
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,14 +86,16 @@ class SearchResult(Result):
         rows = [
             (
                 ", ".join(each.modules) or "none",
-                number(None if each.score is None else each.score.loss, ".4g"),
-                f"{each.loss:.4g}",
-                *(number(cost, ".4g") for cost in each.measured_costs or ()),
+                significant(None if each.score is None else each.score.loss),
+                significant(each.loss),
+                *map(significant, each.measured_costs or ()),
             )
             for each in self.tried
         ]
         units = [unit for unit, _ in self.limits]
-        limits = " and ".join(f"{limit:g} {unit}" for unit, limit in self.limits)
+        limits = " and ".join(
+            f"{significant(limit, 6)} {unit}" for unit, limit in self.limits
+        )
         columns = ("int8", "loss", "predicted", *units)
         note = f"budget: {limits}"
         return (table("Tried, best first", columns, rows, note),)

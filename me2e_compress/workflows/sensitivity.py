@@ -26,7 +26,15 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
 from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, megabytes, number, table
+from me2e_compress.workflows.result import (
+    Result,
+    Table,
+    counted,
+    megabytes,
+    number,
+    significant,
+    table,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,7 +47,6 @@ class SensitivityOptions(TrialOptions):
         drive: drive each module's int8 over these routes: ``all``, a number,
             ``ID,ID`` or a file.
         drive_limit: most points of driving score that the recipe may lose.
-        adapter: TOML file that adapts the model to the policy contract.
         workers: routes at a time.
         node_trials: most trials on the nodes of a module; 0 leaves nodes out.
 
@@ -51,7 +58,6 @@ class SensitivityOptions(TrialOptions):
     limit: float = 0.1
     drive: str | None = None
     drive_limit: float | None = None
-    adapter: str | Path | None = None
     workers: int = 1
     node_trials: int = 24
 
@@ -61,10 +67,8 @@ class SensitivityOptions(TrialOptions):
         check_number("--limit", self.limit, zero=True)
         check_number("--drive-limit", self.drive_limit, zero=True)
         check_count("--node-trials", self.node_trials)
-        if self.drive is None and (self.drive_limit, self.adapter) != (None, None):
-            raise RecipeError(
-                "--drive-limit and --adapter say how to drive: add --drive"
-            )
+        if self.drive is None and self.drive_limit is not None:
+            raise RecipeError("--drive-limit says how to drive: add --drive")
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -101,11 +105,13 @@ class SensitivityResult(Result):
         for each in self.found.findings:
             for (first, *rest), alone in each.blamed:
                 more = f" and {len(rest)} more" if rest else ""
-                blamed.append(f"{each.module}: {first}{more}: {alone:.4g} {unit} alone")
+                blamed.append(
+                    f"{each.module}: {first}{more}: {significant(alone)} {unit} alone"
+                )
         cost = []
         if self.score is not None:
-            loss = f"{self.score.loss:.4g} {self.score.unit}"
-            cost.append(f"its loss: {loss}, limit {self.limit:g}")
+            loss = f"{significant(self.score.loss)} {self.score.unit}"
+            cost.append(f"its loss: {loss}, limit {significant(self.limit)}")
         if self.driving is not None:
             whole = number(self.found.float_driving, ".1f")
             cost.append(f"its DS: {self.driving:.1f}, float {whole}")
@@ -130,7 +136,7 @@ class SensitivityResult(Result):
                 "Int8 module by module",
                 columns[:width],
                 [row[:width] for row in rows],
-                f"{found.trials} variants run; together {size} MB of weights",
+                f"{counted(found.trials, 'variant')} run; all together {size} MB",
             ),
         )
 
@@ -181,7 +187,7 @@ def measure_sensitivity(
     """
     options = options or SensitivityOptions()
     files = TrialFiles(model_path(model), Path(frames), Path(output))
-    with files.claimed(options, options.adapter, options.drive):
+    with files.claimed(options, options.drive):
         return _measured(files, options, listener)
 
 
@@ -265,4 +271,4 @@ def _name_of(choice: Int8Choice, model: ir.Model) -> str:
 
 def _cells(score: Score, driving: float | None) -> tuple[str, str, str]:
     worst = min(item.sqnr_db for item in score.fidelity.outputs)
-    return f"{score.loss:.4g}", f"{worst:.1f}", number(driving, ".1f")
+    return significant(score.loss), f"{worst:.1f}", number(driving, ".1f")

@@ -288,5 +288,5 @@ def find(name: str) -> Stack:
         GraphError: There is none.
     """
     if name not in STACKS:
-        raise GraphError(f"no stack {name!r} in the zoo: there is {', '.join(STACKS)}")
+        raise GraphError(f"no stack {name!r} in the zoo: there are {', '.join(STACKS)}")
     return STACKS[name]

@@ -1,5 +1,6 @@
 """Sizes are looked at before anything is read."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -60,3 +61,16 @@ def test_an_archive_that_lies_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(FramesError, match=r"x\.npz: not a readable \.npz") as caught:
         load_arrays(tmp_path / "x.npz")
     assert "\n" not in str(caught.value)
+
+
+def test_an_archive_that_breaks_without_a_word_is_told_by_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*given: object) -> None:
+        raise EOFError
+
+    (tmp_path / "x.npz").write_bytes(b"")
+    monkeypatch.setattr(zipfile, "ZipFile", broken)
+
+    with pytest.raises(FramesError, match=r"not a readable \.npz \(EOFError\)$"):
+        load_arrays(tmp_path / "x.npz")

@@ -1,5 +1,6 @@
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -32,19 +33,13 @@ def test_the_demo_compresses_drives_and_reports(
 ) -> None:
     out = tmp_path / "out"
 
-    assert command("demo", "--out", out, "--routes", ROUTE, "--scheme", "full") == 0
+    assert command("demo", "--out", out, "--routes", ROUTE, "-r", "full") == 0
 
     shown = capsys.readouterr().out
-    for title in (
-        "Pass by pass",
-        "Module by module",
-        "Fidelity over 2 f",
-        "Scoreboard",
-    ):
-        assert title in shown
-    assert "held-out frames)" in shown
-    assert "on the road: +0.0 points of driving score; 0 of 1 routes differ" in shown
-    assert ": too few routes; " in shown
+    steps = [line.split()[0] for line in shown.splitlines()[:4]]
+    assert steps == ["compress", "weigh", "compare", "drive"]
+    assert len(shown.splitlines()) <= 25
+    assert "on the road: too few routes; 0 of 1 routes differ" in shown
     assert (
         "1 route cannot show a difference below 24 points, all 220 (--routes all) n"
         in shown
@@ -57,8 +52,43 @@ def test_the_demo_compresses_drives_and_reports(
     assert "quantize-int8" in record["schemes"][1]["pipeline"]
     assert 'target="onnxruntime"' in record["schemes"][1]["pipeline"]
     assert record["routes"] == {"driven": 1, "set": 220}
-    assert (out / "report.html").read_text().startswith("<!doctype html>")
-    assert "<svg" in (out / "demo.svg").read_text()
+    page = (out / "report.html").read_text()
+    for heading in ("The passes", "The modules", "The outputs", "Files"):
+        assert f"<h2>{heading}</h2>" in page
+    links = re.findall('<a href="([^"]*)"', page)
+    assert "highway.full.onnx" in links
+    assert [name for name in links if not (out / name).exists()] == []
+
+
+def test_all_tables_are_shown_to_who_asks(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--out", tmp_path / "out", "--routes", ROUTE, "-r", "full")
+    assert command("-v", "demo", *words) == 0
+
+    shown = capsys.readouterr().out
+    for title in ("Pass by pass", "Module by module", "Fidelity over 2 frames"):
+        assert shown.count(title) == 1
+    assert shown.count("Scoreboard") == 1
+
+
+@pytest.mark.parametrize("name", ["report.html", "highway.full-fused.onnx", "frames"])
+def test_what_is_there_is_refused_before_any_work(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    out = tmp_path / "out"
+    theirs = out / name
+    if name == "frames":
+        theirs.mkdir(parents=True)
+        (theirs / "notes.txt").write_text("mine")
+    else:
+        out.mkdir()
+        theirs.write_text("mine")
+
+    assert command("demo", "--out", out) == 1
+
+    assert str(theirs) in capsys.readouterr().err
+    assert [each.name for each in out.iterdir() if each.name[0] != "."] == [name]
 
 
 def test_all_its_steps_are_one_document(
@@ -83,7 +113,7 @@ def test_all_its_steps_are_one_document(
     ("words", "message"),
     [
         (("--routes", "0"), "0 routes were asked for"),
-        (("--scheme", "half"), "no recipe half"),
+        (("--recipe", "half"), "no recipe half"),
     ],
 )
 def test_what_is_wrong_is_one_line(

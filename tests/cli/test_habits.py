@@ -8,8 +8,9 @@ import pytest
 
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.cli.console import listening
-from me2e_compress.cli.progress_lines import EVERY_S, ProgressLines, duration
+from me2e_compress.cli.progress_lines import EVERY_S, ProgressLines
 from me2e_compress.cli.verbosity import Verbosity, set_verbosity
+from me2e_compress.display import duration
 from me2e_compress.version import __version__
 from tests.cli.conftest import Command
 
@@ -138,8 +139,23 @@ def test_every_stage_of_a_long_job_is_a_line() -> None:
     assert said == ["collect", "learn"]
 
 
+def test_progress_without_a_name_has_no_space_before_the_comma() -> None:
+    said, clock = list[str](), Clock()
+    lines = ProgressLines(said.append, clock=clock)
+    clock.now = EVERY_S
+    lines.on_progress("frames", 0, 8, "")
+    clock.now = 2 * EVERY_S
+    lines.on_progress("frames", 7, 8, "")
+
+    assert said == ["frames: 0/8", "frames: 7/8, 1 s left"]
+
+
 @pytest.mark.parametrize(
-    ("seconds", "text"), [(40, "40 s"), (200, "3 min"), (7500, "2 h 5 min")]
+    ("seconds", "text"),
+    [
+        *((0, "0 s"), (0.3, "1 s"), (40, "40 s"), (200, "3 min")),
+        *((3599, "1 h 0 min"), (7500, "2 h 5 min")),
+    ],
 )
 def test_durations(seconds: float, text: str) -> None:
     assert duration(seconds) == text

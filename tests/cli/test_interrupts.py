@@ -1,12 +1,14 @@
 """Ctrl-C and SIGTERM: one line, and the exit code that shells know."""
 
 import signal
+import subprocess
 import sys
 import time
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
+import onnx
 import pytest
 
 import me2e_compress
@@ -108,3 +110,47 @@ def test_processes_are_started_in_one_place_alone() -> None:
     ]
 
     assert found == [str(Path("runtime", "children.py"))]
+
+
+ENDLESS = """
+<ir_version: 9, opset_import: ["" : 17]>
+endless (int64[1] x) => (int64[1] y) <int64 most = {9223372036854775807}> {
+    go = Equal (x, x)
+    first = Squeeze (go)
+    y = Loop (most, first, x) <body = body (int64 i, bool c, int64[1] a) => (
+        bool again, int64[1] b
+    ) { same = Equal (a, a) again = Squeeze (same) b = Identity (a) }>
+}
+"""
+DEAF = """
+import sys, numpy as np, onnxruntime as ort
+from me2e_compress.cli import signals
+signals.DEAF_S = 0.2
+session = ort.InferenceSession(sys.argv[1])
+with signals.signals_in_order():
+    print("runs", flush=True)
+    session.run(None, {"x": np.zeros(1, np.int64)})
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_graph_that_never_ends_ends_with_the_signal(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    onnx.save(onnx.parser.parse_model(ENDLESS), tmp_path / "endless.onnx")
+    words = [sys.executable, "-c", DEAF, str(tmp_path / "endless.onnx")]
+    with subprocess.Popen(
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "runs\n"
+        time.sleep(0.2)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=30)
+
+    assert process.returncode == 128 + number
+    assert said == "me2e-compress: interrupted\n"

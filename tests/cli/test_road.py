@@ -88,7 +88,6 @@ def test_the_recipe_keeps_a_limit_of_driving(
     ("more", "message"),
     [
         (("--drive-limit", "1"), "add --drive"),
-        (("--adapter", "a.toml"), "add --drive"),
         (("--drive", "nowhere"), "no route 'nowhere'"),
     ],
 )

@@ -43,7 +43,7 @@ def test_a_set_is_put_through_the_gate_again(tmp_path: Path) -> None:
     code, out, _ = run("--examine", file)
 
     assert code == 0
-    assert "1 of 1 routes admitted" in out
+    assert "1 of 1 route admitted" in out
 
 
 def test_a_route_that_is_too_easy_is_named(tmp_path: Path) -> None:

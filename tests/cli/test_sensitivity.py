@@ -139,7 +139,7 @@ def test_search_keeps_size_time_and_energy_at_once(
         (("--max-mb", "1", "--max-joules", "0"), "--max-joules is 0"),
         (
             ("--max-mb", "1", "--max-ms", "1e-9"),
-            "nothing fits .* 1e-12 s: .* alone",
+            r"nothing fits .* 0\.000000000001 s: .* alone",
         ),
         (("--max-ms", "1", "--target", "tensorrt"), "use --target onnxruntime"),
         (("--max-mb", "0.0000001"), "nothing fits"),

@@ -71,8 +71,5 @@ def test_an_open_dimension_is_proven_at_drawn_sizes(
 ) -> None:
     assert compress(OPEN) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert (
-        "every output is the same within 0.0e+00 of its largest (synthetic, n=2"
-        in shown
-    )
+    assert "every output is the same (synthetic, n=2" in shown
     assert "not proven" not in shown

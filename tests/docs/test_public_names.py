@@ -4,9 +4,17 @@ After a change that is meant: ``python -m tests.docs.test_public_names``.
 """
 
 import importlib
+import inspect
+import re
+from enum import Enum
 from pathlib import Path
 
+import mypy.api
 import pytest
+
+import me2e_compress
+from me2e_compress.cli.app import COMMANDS
+from tests.docs.pages import ROOT
 
 LIST = Path(__file__).with_name("public_names.txt")
 ROOMS = (
@@ -59,6 +67,43 @@ def test_every_public_name_is_there(room: str) -> None:
     module = importlib.import_module(room)
     missing = [name for name in public_names(room) if not hasattr(module, name)]
     assert missing == []
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_signature_shows_no_address(room: str) -> None:
+    module = importlib.import_module(room)
+    shown = {
+        name: str(inspect.signature(each))
+        for name in public_names(room)
+        if inspect.isroutine(each := getattr(module, name))
+        or (inspect.isclass(each) and not issubclass(each, Enum | Exception))
+    }
+    assert [name for name, text in shown.items() if " at 0x" in text] == []
+
+
+def test_the_package_page_tells_the_function_of_every_command() -> None:
+    page = (ROOT / "docs" / "package.md").read_text(encoding="utf-8")
+    (told,) = (line for line in page.splitlines() if line.startswith("In Python "))
+    functions, others = told.split(" are commands alone")[0].rsplit(". ", 1)
+    names = set(re.findall(r"`(\w+)`", functions))
+    without = set(re.findall(r"`(\w+)`", others))
+
+    assert {*names, *without} >= COMMANDS.keys()
+    assert names - {"frames", "sensitivity", "study"} <= set(me2e_compress.__all__)
+    assert not without & set(me2e_compress.__all__)
+
+
+def test_a_name_that_is_none_is_an_error_for_a_type_checker(tmp_path: Path) -> None:
+    there, missing = (tmp_path / f"{name}.py" for name in ("there", "missing"))
+    there.write_text("import me2e_compress\nme2e_compress.compress\n")
+    missing.write_text("import me2e_compress\nme2e_compress.nothing\n")
+    options = ["--follow-imports=silent", "--no-error-summary", "--config-file="]
+
+    said = mypy.api.run([*options, str(there), str(missing)])[0].splitlines()
+
+    assert [line.partition(": error: ")[2] for line in said] == [
+        'Module has no attribute "nothing"  [attr-defined]'
+    ]
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """What the documents say of writing additions is done to an installed package."""
 
+import dataclasses
+import importlib
 import re
 import sys
 import tomllib
@@ -7,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress.registry import Registry
+from me2e_compress.testing import check_form
+from me2e_compress.workflows import listing
 from tests.docs.conftest import run
 from tests.docs.pages import EXAMPLE, WRITING, blocks
 
@@ -58,3 +63,31 @@ def test_every_addition_of_the_example_is_listed(folder: Path, site: Path) -> No
     for names in entry_points(EXAMPLE_PROJECT).values():
         for name in names:
             assert re.search(rf"\b{name}\b", listed), name
+
+
+@pytest.mark.parametrize(
+    ("group", "where"),
+    [
+        (group, where)
+        for group, names in entry_points(EXAMPLE_PROJECT).items()
+        for where in names.values()
+    ],
+)
+def test_every_addition_of_the_example_has_the_form_of_ours(
+    group: str, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    module, _, name = where.partition(":")
+    added = getattr(importlib.import_module(module), name)
+    needed = {
+        each.name: Path("rides")
+        for each in dataclasses.fields(added)
+        if each.default is dataclasses.MISSING
+        and each.default_factory is dataclasses.MISSING
+    }
+    (registry,) = (
+        each
+        for each in vars(listing).values()
+        if isinstance(each, Registry) and each.group == group
+    )
+    check_form(added(**needed), registry)

@@ -158,6 +158,13 @@ def test_another_file_is_no_trace(tmp_path: Path, text: str) -> None:
         LatencyTrace.load(path)
 
 
+def test_a_trace_says_how_many_samples_it_has(trace: Path) -> None:
+    layered = parse_latency(f"limited{{source=trace:{trace}, fps=10}}")
+
+    assert parse_latency(f"trace:{trace}").measured == layered.measured == len(SAMPLES)
+    assert parse_latency("trace").measured is parse_latency("fps:10").measured is None
+
+
 def test_the_fingerprint_of_a_trace_is_its_samples() -> None:
     same = [TraceLatency(SAMPLES).to_json(), TraceLatency(SAMPLES).to_json()]
     other = TraceLatency((*SAMPLES, 1)).to_json()

@@ -111,5 +111,5 @@ def test_no_such_adapter_names_those_that_ship() -> None:
 
 
 def test_a_synthetic_world_takes_no_adapter(tmp_path: Path) -> None:
-    with pytest.raises(EvaluationError, match="tcp is drawn from a synthetic world"):
+    with pytest.raises(EvaluationError, match="tcp is a stack of the zoo"):
         record_frames("tcp", tmp_path / "f", FramesOptions(1, adapter=Path("tcp")))

@@ -34,7 +34,7 @@ REFUSED = {
     "raw-short": "initializer 'w' has 3 bytes, its shape says 432",
     "two-kinds-of-data": "initializer 'w' holds its data twice",
     "type-99": "initializer 'w' is of element type 99, which is none",
-    "input-untyped": "'image' is no tensor: its type is missing",
+    "input-untyped": "'image' is not a tensor: its type is missing",
     "axis-float": "attribute axis is of type FLOAT, it must be INT",
     "perm-wrong": r"perm \[0, 7, -9\] is none",
     "attribute-refers": "refers to one of a function, and stands in none",

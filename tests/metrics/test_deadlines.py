@@ -6,6 +6,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.conflict_record import ConflictRecord
 from me2e_compress.metrics.deadlines import charged, deadlines
 from me2e_compress.metrics.episode import InferenceRecord
+from me2e_compress.metrics.percentiles import percentile, too_few
 from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
 from tests.metrics.drives import drive
 
@@ -35,11 +36,26 @@ def test_a_percentile_of_too_few_is_not_measured() -> None:
     found = deadlines([40_000] * 150)
 
     assert found.percentiles_ms[99.0].value == 40.0
-    assert found.percentiles_ms[99.9].reason == "150 decisions, 1000 needed"
-    rows = deadlines_table("trace", found).rows
-    assert [cell.text for cell in rows[2]] == [
-        *("p99.9", "-", "not measured: 150 decisions, 1000 needed")
-    ]
+    assert found.percentiles_ms[99.9].reason == "needs 1,000 samples, has 150"
+    shown = deadlines_table("trace", found)
+    assert [cell.text for cell in shown.rows[2]][:2] == ["p99.9", "-"]
+    assert "needs 1,000 samples, has 150" in shown.note
+
+
+def test_decisions_drawn_from_a_trace_tell_no_more_than_it() -> None:
+    found = deadlines([40_000] * 2478, measured=16)
+
+    assert found.count == 2478
+    assert found.percentiles_ms[50.0].value == 40.0
+    assert found.percentiles_ms[99.0].reason == "needs 100 samples, has 16"
+    assert found.percentiles_ms[99.9].reason == "needs 1,000 samples, has 16"
+
+
+@pytest.mark.parametrize(("percent", "least"), [(50, 2), (90, 10), (99, 100)])
+def test_one_sample_lies_beyond_a_percentile(percent: int, least: int) -> None:
+    assert too_few(percent, least - 1)
+    assert not too_few(percent, least)
+    assert percentile(range(least), percent) == least - 2
 
 
 def test_nothing_decided_is_not_zero() -> None:

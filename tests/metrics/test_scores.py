@@ -6,6 +6,7 @@ from me2e_compress.metrics.abilities import ABILITIES
 from me2e_compress.metrics.infraction import InfractionKind
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.metrics.scores import score
+from me2e_compress.workflows.score import scores_table
 from tests.metrics.drives import cruise, drive, infraction
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
@@ -85,3 +86,13 @@ def test_a_measure_is_a_finite_value_or_a_reason(
 ) -> None:
     with pytest.raises(ValueError, match="measure"):
         Measure(value, "%", reason)
+
+
+def test_the_column_of_units_holds_units_and_the_note_the_reasons() -> None:
+    table = scores_table("results", score(SET[:1]))
+    at = table.columns.index("unit")
+
+    assert {row[at].text for row in table.rows} == {"%", "ratio", "s", "m"}
+    assert "Emergency_Brake, Give_Way, Traffic_Signs (no such route was driven)" in (
+        table.note
+    )

@@ -219,7 +219,7 @@ def test_layer_normalization() -> None:
 
 def test_a_layer_normalization_is_counted_once() -> None:
     model = read(opset(17) + NORM, **NORM_WEIGHTS, gamma=normal(8), beta=normal(8))
-    assert apply(FuseBasic(), model).notes == ("fused: 1 layer normalizations",)
+    assert apply(FuseBasic(), model).notes == ("fused: layer normalizations (1)",)
 
 
 def test_layer_normalization_needs_opset_17() -> None:

@@ -44,7 +44,7 @@ def test_the_largest_weights_that_stay_float_come_first(model: ir.Model) -> None
     assert [each.name for each in found] == ["recurrent", "step", "table"]
     assert found[0].bytes == 4 * 256 * 64
     assert (found[0].op, found[0].module, found[0].rule) == ("LSTM", "head", "operator")
-    assert found[0].reason == "LSTM is no weighted layer"
+    assert found[0].reason == "LSTM is not a weighted layer"
 
 
 def test_a_layer_outside_the_scheme_is_named_with_its_rule(model: ir.Model) -> None:

@@ -98,7 +98,7 @@ def test_operators_that_declare_nothing_stay() -> None:
         {},
     )
 
-    assert decided(model).reason == "Rotate is no weighted layer"
+    assert decided(model).reason == "Rotate is not a weighted layer"
 
 
 def test_constant_features_stay() -> None:

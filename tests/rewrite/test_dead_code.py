@@ -93,7 +93,7 @@ def test_a_dead_reader_hides_no_pattern() -> None:
     found = fuse(model, [ONCE], by="test")
 
     assert ops(model) == ["Relu"]
-    assert found.notes() == ("fused: 1 Relu of Relu", "removed: 1 unread")
+    assert found.notes() == ("fused: Relu of Relu (1)", "removed: 1 unread")
     assert fuse(model, [ONCE], by="test").changes == 0
 
 

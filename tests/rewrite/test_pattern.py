@@ -217,7 +217,7 @@ def test_relu_of_relu_in_four_lines() -> None:
     found = fuse(model, [once], by="drop-relu-of-relu")
 
     assert ops(model) == ["Relu"]
-    assert found.notes() == ("fused: 1 Relu of Relu",)
+    assert found.notes() == ("fused: Relu of Relu (1)",)
 
 
 def test_what_a_check_refuses_is_counted_with_its_reason() -> None:

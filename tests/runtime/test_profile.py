@@ -7,7 +7,12 @@ import pytest
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.profile import TimedSession, processor, profile
+from me2e_compress.runtime.profile import (
+    TimedSession,
+    machine_words,
+    processor,
+    profile,
+)
 from me2e_compress.runtime.session import replay
 
 MODEL = """<ir_version: 8, opset_import: ["" : 17]>
@@ -58,3 +63,8 @@ def test_nothing_to_measure_is_an_error(
 ) -> None:
     with pytest.raises(EvaluationError, match="at least one sample and one frame"):
         profile(model, frames, samples=samples)
+
+
+def test_one_thread_is_singular() -> None:
+    assert machine_words(1) == f"{processor()}, onnxruntime on 1 thread"
+    assert machine_words(0).endswith("on all threads")

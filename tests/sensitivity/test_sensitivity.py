@@ -16,6 +16,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.sensitivity import (
     Budget,
+    Candidate,
     Drive,
     Int8Choice,
     Score,
@@ -26,7 +27,9 @@ from me2e_compress.sensitivity import (
     write_recipe,
 )
 from me2e_compress.sensitivity.analysis import names_of
+from me2e_compress.sensitivity.search import nothing_fits
 from me2e_compress.targets import TARGETS
+from me2e_compress.workflows.search import SearchResult
 from tests.frames import record
 from tests.nets import net
 
@@ -307,7 +310,9 @@ def test_every_one_of_several_budgets_is_kept(tmp_path: Path) -> None:
 
     assert found[-1].measured_costs is not None
     assert found[-1].modules == ("head",)
-    message = r"nothing fits \d+ bytes and 1 s: .*least found is .* and 2 s; each alone"
+    message = (
+        r"nothing fits [\d,]+ bytes and 1 s: .*least found is .* and 2 s; each alone"
+    )
     with pytest.raises(EvaluationError, match=message):
         search(judge, ("backbone", "head"), both)
 
@@ -322,3 +327,21 @@ def test_a_model_without_a_plan_is_judged_by_its_worst_output(tmp_path: Path) ->
     sqnr_db = score.fidelity.outputs[0].sqnr_db
     assert bare.loss == pytest.approx(10 ** (-sqnr_db / 20))
     assert bare.unit == "of the signal"
+
+
+def test_what_fits_nothing_is_told_without_powers_of_ten() -> None:
+    said = nothing_fits([(1e5, "bytes")], [6_142_060.0], [[4_778_000.0]])
+
+    assert said == (
+        "nothing fits 100,000 bytes: the float model costs 6,142,060 bytes, the least"
+        " found is about 4,778,000 bytes"
+    )
+
+
+def test_a_search_shows_bytes_as_they_are() -> None:
+    tried = Candidate(("neck",), 5.4e-05, (1.0,), None, (4_746_123.0,))
+    found = SearchResult(Path("s.toml"), (tried,), (("bytes", 4_778_000.0),), "")
+
+    (table,) = found.tables()
+    assert [cell.text for cell in table.rows[0][1:]] == ["-", "0.000054", "4,746,123"]
+    assert table.note == "budget: 4,778,000 bytes"

@@ -41,7 +41,10 @@ def test_options_that_do_not_go_together(options: dict[str, Any], words: str) ->
     [
         (Condition("even", mean_of="blind.later"), "mean_of 'blind.later' is no VARI"),
         (Condition("even", mean_of="nobody.ideal"), "mean_of 'nobody.ideal' is no"),
-        (Condition("fog", "none", against="fog"), "against 'fog' is no other condit"),
+        (
+            Condition("fog", "none", against="fog"),
+            "against 'fog' is not another condit",
+        ),
         (Condition("fog", "none", against="day"), "there are ideal, fog, later"),
     ],
 )
@@ -151,3 +154,13 @@ def test_conditions_of_a_file(tmp_path: Path) -> None:
     assert fog == Condition("fog", "fps:10", weather="fog_m=60", against="clear")
     assert even == Condition("even", mean_of="blind.fog", latency_model="fifo")
     assert fog.described("here") == "fog: 10 decisions a second, weather fog_m=60"
+
+
+@pytest.mark.parametrize(
+    ("fps", "words"),
+    [("1", "1 decision a second"), ("1.67", "1.67 decisions a second")],
+)
+def test_one_decision_is_singular(fps: str, words: str) -> None:
+    assert Condition("slow", f"fps:{fps}").described("here") == f"slow: {words}"
+    limited = Condition("slow", "none", limit_fps=float(fps)).described("here")
+    assert limited.endswith(f"limited to {words}")

@@ -15,7 +15,7 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import registry
 from me2e_compress.study import Condition, Study, StudyResult, Variant, load_study
 from me2e_compress.study.run import run_study
-from me2e_compress.study.workload import workload
+from me2e_compress.study.workload import PlannedDrive, Workload, workload
 from me2e_compress.study.write import write_study
 from tests.metrics.drives import drive
 
@@ -163,3 +163,13 @@ def test_an_evaluator_that_drives_nobody(tmp_path: Path) -> None:
 
     with pytest.raises(EvaluationError, match="bench2drive drives no policy"):
         run_study(study, tmp_path / "out")
+
+
+def test_a_short_study_takes_seconds_not_0_0_hours() -> None:
+    drive = PlannedDrive("float", "ideal", 0, 1, 20 / 3600)
+    ahead = Workload("Short", (drive,), 220, 1, False)
+
+    assert (
+        "1 drive, 1 route, 0 of them driven; about 20 s on 1 worker" in ahead.headline
+    )
+    assert ahead.tables()[0].rows[0][-1].text == "20 s"

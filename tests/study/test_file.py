@@ -199,8 +199,13 @@ def test_no_routes_at_all(models: Path) -> None:
 
 
 def test_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(StudyError, match=r"none\.toml: cannot be read: No such file"):
+    with pytest.raises(StudyError, match=r"^no study .*none\.toml: no such file"):
         load_study(tmp_path / "none.toml")
+
+
+def test_an_unknown_study_is_told_which_ones_ship() -> None:
+    with pytest.raises(StudyError, match=r"^no study smoke: .* we ship paper, shifts"):
+        load_study("smoke")
 
 
 def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:

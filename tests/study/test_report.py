@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.runtime.others_load import Load
 from me2e_compress.study import Condition, StudyResult
+from me2e_compress.study.all_tables import MOST_ROUTES, route_table
 from me2e_compress.study.report import html
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import Point, forest, front, pareto
@@ -17,7 +19,7 @@ from me2e_compress.study.report.findings import TIMES, findings, sure
 from me2e_compress.study.tables import MINUS
 from me2e_compress.study.write import write_study
 from me2e_compress.workflows.claims import RECORD
-from tests.study.conftest import IDEAL, SLOW
+from tests.study.conftest import IDEAL, ROUTES, SLOW
 
 pytestmark = pytest.mark.xdist_group("study")
 
@@ -60,7 +62,7 @@ def test_the_page_needs_nothing_beside_it(page: str) -> None:
         if not link.startswith(("data:image/png;base64,", "#"))
     ]
     assert outside == []
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 1
 
 
 def test_what_users_wrote_is_escaped(page: str) -> None:
@@ -93,6 +95,7 @@ def test_every_section_is_there(page: str) -> None:
         "Scoreboard",
         "Paired differences",
         "What a point of driving score costs",
+        "Route by route",
         "Near misses",
         "Abilities",
         "Where they part",
@@ -102,6 +105,42 @@ def test_every_section_is_there(page: str) -> None:
 
 def test_the_same_study_gives_the_same_page(found: StudyResult, page: str) -> None:
     assert html(found, ("me2e-compress", "study", "<s>.toml")) == page
+
+
+def test_the_headline_says_what_so_few_routes_cannot_show(page: str) -> None:
+    (lede,) = re.findall(r'<p class="lede">(.*?)</p>', page)
+
+    assert "2 routes cannot show a difference below " in lede
+
+
+def test_a_busy_machine_is_said_above_all(found: StudyResult) -> None:
+    idle = dataclasses.replace(found, load=Load(0.1, 2))
+    busy = dataclasses.replace(found, load=Load(1.3, 2))
+    words = "the machine was busy: other processes took 1.3 of 2 cores"
+
+    assert busy.alerts()[-1].startswith(words)
+    assert f'<p class="alert">{words}' in html(busy)
+    assert idle.alerts() == dataclasses.replace(found, load=None).alerts()
+    assert "timed, other processes took 0.1 of 2 cores" in html(idle)
+
+
+def test_each_route_has_its_end(found: StudyResult) -> None:
+    table = route_table(found)
+
+    assert table is not None
+    assert table.columns[:2] == ("route", "blind, ideal")
+    assert [row[0].text for row in table.rows] == [each.id for each in ROUTES]
+    ends = {cell.detail for row in table.rows for cell in row[1:]}
+    assert "collision with a vehicle" in ends
+
+
+def test_many_routes_are_not_shown_one_by_one(found: StudyResult) -> None:
+    many = [
+        dataclasses.replace(each, routes=each.routes * MOST_ROUTES)
+        for each in found.drives
+    ]
+
+    assert route_table(dataclasses.replace(found, drives=tuple(many))) is None
 
 
 def test_figures_name_every_variant(found: StudyResult) -> None:

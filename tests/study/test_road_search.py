@@ -186,7 +186,9 @@ def test_the_tables_tell_what_became_of_every_scheme(found: Found) -> None:
 def test_budgets_that_nothing_meets(killed: RoadSearchOptions, model: Path) -> None:
     tight = dataclasses.replace(killed, limits=Limits(max_mb=1e-9))
 
-    with pytest.raises(EvaluationError, match=r"^nothing fits 1e-09 MB: .*least found"):
+    with pytest.raises(
+        EvaluationError, match=r"^nothing fits 0\.000000001 MB: .*least found"
+    ):
         search(model, tight, Scripted(), [])
 
 

@@ -73,8 +73,11 @@ def test_the_note_says_how_many_were_compared_and_what_may_be_unseen(
 ) -> None:
     note = differences(found).note
 
-    assert "corrected for 6 comparisons (Holm)" in note
-    assert "Where 0 of 2 routes differ, with 95 % at most 77.6 % do." in note
+    assert (
+        "corrected for 6 comparisons (Holm). Each interval is a 95 % interval" in note
+    )
+    assert "one in twenty misses zero by chance where nothing differs." in note
+    assert "Where 0 of 2 routes differ, at most 77.6 % do (95 %)." in note
 
 
 def test_abilities_have_their_mean_last(found: StudyResult) -> None:

@@ -10,6 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import NoLatency, TraceLatency
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
+from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.interleaved import describe_machine
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.study import Condition, Listener, Study, Timing, Variant, timing
@@ -70,8 +71,8 @@ def test_one_scale_gives_the_baseline_the_median_asked_for(
 
     assert paced == [["slow", "fast"]]
     assert clock.scale == pytest.approx(2000.0)
-    assert clock.milliseconds("fast", 50) == pytest.approx(240.0)
-    assert clock.milliseconds("blind", 50) is None
+    assert clock.latency("fast", 50).value == pytest.approx(240.0)
+    assert clock.latency("blind", 50).value is None
 
 
 @pytest.mark.usefixtures("paced")
@@ -189,7 +190,7 @@ def test_without_a_trace_of_the_baseline_all_are_measured_again(
     clock = clock_of(ours, tmp_path, Listener(on_warning=warnings.append))
 
     assert paced[1:] == [["slow", "fast"]]
-    assert clock.milliseconds("fast", 50) == pytest.approx(240.0)
+    assert clock.latency("fast", 50).value == pytest.approx(240.0)
     stale = tmp_path / "traces" / "fast.json"
     assert warnings == [
         f"{stale}: no trace of the baseline is kept beside it: measured again"
@@ -227,7 +228,8 @@ def test_a_trace_that_is_given_is_taken(
     clock = clock_of(asked, tmp_path)
 
     assert paced == []
-    assert (clock.scale, clock.milliseconds("slow", 99)) == (1.0, 80.0)
+    assert (clock.scale, clock.latency("slow", 50).value) == (1.0, 70.0)
+    assert clock.latency("slow", 99) == Measure(None, "ms", "needs 100 samples, has 2")
 
 
 def test_a_baseline_without_latency_sets_no_scale(make: Make, tmp_path: Path) -> None:

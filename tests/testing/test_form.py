@@ -62,7 +62,9 @@ class Silent(Good):
 
 @dataclass(frozen=True)
 class Terse(Good):
-    """A thing of some size."""
+    """A thing of some size and weight."""
+
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class Rounding(Good):
         (Undecorated(), "Undecorated is not a frozen dataclass"),
         (Shouting(), "'BadThing' is not a name-like-this"),
         (Silent(), "Silent has no docstring"),
-        (Terse(), "Terse's docstring lacks size under Attributes:"),
+        (Terse(), "Terse's docstring lacks weight under Attributes:"),
         (Rounding(), "good-thing:1 is read back as something else"),
     ],
 )

@@ -275,7 +275,7 @@ def test_nothing_int8_is_an_error_and_writes_nothing(
 
     said = capsys.readouterr().err
     assert "made nothing int8" in said
-    assert "rule operator: LSTM is no weighted layer" in said
+    assert "rule operator: LSTM is not a weighted layer" in said
     assert "--allow-empty" in said
     assert sorted(lstm.iterdir()) == before
 

@@ -84,5 +84,5 @@ def test_a_refused_graph_is_a_result_and_an_error_once_it_is_checked(
     found = me2e.lint(tmp_path / "twist.onnx")
 
     assert [each.rule for each in found.findings] == ["plugin"]
-    with pytest.raises(PreconditionError, match="tensorrt refuses it, 1 errors"):
+    with pytest.raises(PreconditionError, match="tensorrt refuses it, 1 error;"):
         found.check()

@@ -219,4 +219,4 @@ def test_a_table_says_what_each_number_is() -> None:
     first = [str(cell.text) for cell in shown.rows[0]]
     assert first == ["L2 at 1 s, m", "0.00", "2.00", "+2.00", "-", "-"]
     assert len(shown.rows) == 12
-    assert "1 frames of 1 scene whose" in shown.note
+    assert "1 frame of 1 scene whose" in shown.note

@@ -6,21 +6,23 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.others_load import SHORTEST_S, OthersLoad
+from me2e_compress.runtime.others_load import SHORTEST_S, Load, OthersLoad
 from me2e_compress.workflows.profile_result import BEYOND_P99, ProfileResult
 
 ENOUGH = 100 * BEYOND_P99
 
 
 def found(samples: int = ENOUGH, others: float | None = 0.0) -> ProfileResult:
-    trace = LatencyTrace("0", "a CPU", (7,) * samples)
-    return ProfileResult(Path("m.onnx"), trace, None, others, 2)
+    load = None if others is None else Load(others, 2)
+    trace = LatencyTrace("0", "a CPU", (7,) * samples, others=load)
+    return ProfileResult(Path("m.onnx"), trace, None)
 
 
 def test_few_samples_make_no_p99() -> None:
     (line,) = found(samples=ENOUGH - 1).lines()
 
-    assert f"p99 rests on too few samples: {ENOUGH - 1}" in line
+    assert f"p99 is steady from {ENOUGH} samples on" in line
+    assert f"here are {ENOUGH - 1}" in line
     assert found().lines() == ()
 
 
@@ -46,19 +48,20 @@ def test_what_we_take_is_not_the_others(ours: float, others: float) -> None:
     with load:
         pass
 
-    assert load.cores == others
+    assert load.load is not None
+    assert load.load.others == others
 
 
 def test_this_machine_can_tell() -> None:
     with OthersLoad() as load:
         time.sleep(1.1 * SHORTEST_S)
 
-    assert load.cores is not None
-    assert 0.0 <= load.cores <= load.of + 1
+    assert load.load is not None
+    assert 0.0 <= load.load.others <= load.load.cores + 1
 
 
 def test_a_blink_tells_nothing() -> None:
     with OthersLoad() as load:
         pass
 
-    assert load.cores is None
+    assert load.load is None

@@ -64,7 +64,8 @@ def test_modelled_joules_make_a_column_of_their_own() -> None:
     assert scores.columns[1] == "EER_AV"
     assert scores.columns[5] == "EER_AV, modelled energy"
     (_, slow) = scores.rows
-    assert slow[1].text == "- (energy: not measured)"
+    assert slow[1].text == "-"
+    assert scores.note.endswith("EER_AV of runs/slow (energy: not measured).")
     assert slow[5].text != "-"
 
 
@@ -176,8 +177,8 @@ def test_no_joules_no_score() -> None:
     ("options", "said"),
     [
         (EerOptions({"other": 2.0}), "energy of other: 0 folders of that name"),
-        (EerOptions({"fast": -1.0}), "energy of fast: -1.0 is no number of joules"),
-        (EerOptions({"fast": float("nan")}), "nan is no number of joules"),
+        (EerOptions({"fast": -1.0}), "energy of fast: -1.0 is not a number of joules"),
+        (EerOptions({"fast": float("nan")}), "nan is not a number of joules"),
         (EerOptions(modelled={"fast": "a.json"}), "a.json: No such file"),
         (EerOptions(weights="no.json"), "no.json: No such file"),
     ],

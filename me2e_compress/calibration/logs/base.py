@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -155,6 +155,10 @@ class DriveLog(ABC):
                 some = ", ".join(there[:5]) + (", ..." if len(there) > 5 else "")
                 raise FramesError(f"{self.name}: no scene {name!r}; there are {some}")
         return self.scenes or there
+
+    def as_contract(self) -> Self:
+        """Return it with CAN bus and commands as the policy contract has them."""
+        return self
 
     @property
     def all_cameras(self) -> tuple[str, ...]:

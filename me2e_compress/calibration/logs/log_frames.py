@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -66,6 +66,7 @@ class LoggedInputs:
             if name not in MADE:
                 raise FramesError(
                     f"input {name} is not made from a log; there are {', '.join(MADE)}"
+                    ", and what an adapter makes (--adapter)"
                 )
         image = self.forms.get("img")
         if image is None or self.image is None:
@@ -86,14 +87,42 @@ class LoggedInputs:
                 f" {len(log.seen)}: name them (cameras=[CAM_FRONT, ...])"
             )
 
+    def ground(self, now: LogMoment) -> Floats:
+        """Return [4, 4] of lidar to the model's ground frame."""
+        return now.lidar_to_ego if self.forward_left else np.eye(4)
+
+    def arrays(
+        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+    ) -> dict[str, Array]:
+        """Return what the model is fed at a moment."""
+        return _arrays(log, self, scene, at, before)
+
     def columns(self, log: DriveLog, image: PixelInput) -> int:
         """Return how many columns of the image a picture takes."""
         return log.width or self.width or image.columns
 
 
+class LogFeeder(Protocol):
+    """Lays the moments of a log out as the inputs of a model."""
+
+    def check(self, log: DriveLog) -> None:
+        """Check that a log can feed the model."""
+        ...
+
+    def ground(self, now: LogMoment) -> Floats | None:
+        """Return [4, 4] of lidar to the frame of its plan; None tells no future."""
+        ...
+
+    def arrays(
+        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+    ) -> dict[str, Array]:
+        """Return what the model is fed at a moment; ``before`` None begins a scene."""
+        ...
+
+
 def log_frames(
     log: DriveLog,
-    model: LoggedInputs,
+    model: LogFeeder,
     count: int,
     scene_length: int | None = None,
     *,
@@ -129,27 +158,26 @@ def log_frames(
         ]
         before = None
         for at in chosen:
-            arrays = _arrays(log, model, scene, at, before)
-            future = recorded_future(log, scene, at, _ground(model, scene[at]))
+            arrays, ground = (
+                model.arrays(log, scene, at, before),
+                model.ground(scene[at]),
+            )
+            future = None if ground is None else recorded_future(log, scene, at, ground)
             yield Frame(done, before is None, arrays, place, future)
             before, done = at, done + 1
         if done == count:
             return
 
 
-def _ground(model: LoggedInputs, now: LogMoment) -> Floats:
-    return now.lidar_to_ego if model.forward_left else np.eye(4)
-
-
 def _arrays(
     log: DriveLog, model: LoggedInputs, scene: LogScene, at: int, before: int | None
 ) -> dict[str, Array]:
     now = scene[at]
-    back = np.linalg.inv(_ground(model, now))
+    back = np.linalg.inv(model.ground(now))
     to_world = now.lidar_to_world @ back
     turn = to_world[:3, :3]
     made: dict[str, Array] = {
-        "can_bus": _changes(now, None if before is None else scene[before]),
+        "can_bus": changes(now, None if before is None else scene[before]),
         "command": np.asarray(command_at(log, scene, at)),
         "timestamp": np.asarray((now.time_us - scene[0].time_us) / 1e6),
         "l2g_r_mat": turn.T if now.l2g_rows else turn,
@@ -174,7 +202,7 @@ def _arrays(
     return {name: _fed(made[name], form, name) for name, form in model.forms.items()}
 
 
-def _changes(now: LogMoment, before: LogMoment | None) -> Floats:
+def changes(now: LogMoment, before: LogMoment | None) -> Floats:
     """Turn position and heading into what they changed by since the frame before.
 
     As UniAD and VAD do between the frames that they are shown; zero at the first.

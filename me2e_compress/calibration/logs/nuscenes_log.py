@@ -3,9 +3,9 @@
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
@@ -69,6 +69,10 @@ class NuScenesLog(DriveLog):
     root: Path = field(kw_only=False)
     version: str = ""
     layout: Literal["nuscenes", "bench2drive"] = "nuscenes"
+
+    def as_contract(self) -> Self:
+        """Return it in the layout of Bench2Drive, which is the policy contract's."""
+        return replace(self, layout="bench2drive")
 
     @property
     def all_cameras(self) -> tuple[str, ...]:
@@ -166,5 +170,6 @@ def _version_folder(root: Path, version: str) -> Path:
         return root / version
     if version or len(there) != 1:
         wanted = f"no version {version}" if version else "name the version"
-        raise FramesError(f"{root}: {wanted}; there is {', '.join(there) or 'none'}")
+        known = f"there are {', '.join(there)}" if there else "no v1.0-* is in it"
+        raise FramesError(f"{root}: {wanted}; {known}")
     return root / there[0]

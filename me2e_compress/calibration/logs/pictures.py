@@ -8,6 +8,7 @@ is padded below and to the right when it is fed (mmdetection, UniAD, VAD: 1600 x
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,8 @@ from me2e_compress.calibration.logs.base import Floats
 from me2e_compress.calibration.pixels import PixelInput
 from me2e_compress.documents import MalformedError, check_regular
 from me2e_compress.errors import FramesError
+
+Bytes: TypeAlias = npt.NDArray[np.uint8]
 
 _JPEG, _PNG = b"\xff\xd8", b"\x89PNG"
 
@@ -30,7 +33,7 @@ class Picture:
             depth.
     """
 
-    planes: npt.NDArray[np.uint8]
+    planes: Bytes
     place: Floats
 
 
@@ -47,6 +50,47 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
     """
     import cv2  # takes a tenth of a second to import
 
+    found = _decoded(path)
+    height, width = found.shape[:2]
+    rows = max(1, round(height * columns / width))
+    if (rows, columns) != (height, width):
+        found = np.asarray(cv2.resize(found, (columns, rows)), np.uint8)
+    above = max(0, rows - pixels.rows)
+    order = slice(None, None, -1) if pixels.order == "rgb" else slice(None)
+    planes = np.moveaxis(found[above:, :, order], -1, 0)
+    place = np.diag([columns / width, rows / height, 1.0, 1.0])
+    place[1, 2] = -above
+    return Picture(np.ascontiguousarray(planes, np.uint8), place)
+
+
+def read_pixels(path: Path, size: tuple[int, int]) -> tuple[Bytes, Floats]:
+    """Read a JPEG or PNG and scale it as a whole.
+
+    Args:
+        path: of the file.
+        size: rows and columns.
+
+    Returns:
+        RGB [rows, columns, 3], and [4, 4] pixels of the picture to those, both times
+        depth.
+
+    Raises:
+        FramesError: it is missing, half-written, or no picture.
+    """
+    import cv2
+
+    found, (rows, columns) = _decoded(path), size
+    height, width = found.shape[:2]
+    if size != (height, width):
+        found = np.asarray(cv2.resize(found, (columns, rows)), np.uint8)
+    place = np.diag([columns / width, rows / height, 1.0, 1.0])
+    return np.ascontiguousarray(found[..., ::-1], np.uint8), place
+
+
+def _decoded(path: Path) -> Bytes:
+    """Return BGR [h, w, 3]."""
+    import cv2
+
     try:
         check_regular(path)
         content = path.read_bytes()
@@ -59,16 +103,7 @@ def read_picture(path: Path, pixels: PixelInput, columns: int) -> Picture:
     found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     if found is None:
         raise FramesError(f"{path}: not a readable picture")
-    height, width = found.shape[:2]
-    rows = max(1, round(height * columns / width))
-    if (rows, columns) != (height, width):
-        found = cv2.resize(found, (columns, rows))
-    above = max(0, rows - pixels.rows)
-    order = slice(None, None, -1) if pixels.order == "rgb" else slice(None)
-    planes = np.moveaxis(found[above:, :, order], -1, 0)
-    place = np.diag([columns / width, rows / height, 1.0, 1.0])
-    place[1, 2] = -above
-    return Picture(np.ascontiguousarray(planes, np.uint8), place)
+    return np.asarray(found, np.uint8)
 
 
 def _is_whole(content: bytes) -> bool:

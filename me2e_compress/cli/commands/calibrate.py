@@ -37,6 +37,7 @@ def calibrate(
     seed: given.Seed = 0,
     module_map: given.ModuleMap = None,
     set_dim: given.SetDim = None,
+    adapter: given.Adapter = None,
     shard: Shard = None,
     merge: Merge = None,
     imported: given.Import = None,
@@ -57,7 +58,7 @@ def calibrate(
     options = workflow.CalibrateOptions(
         recipe=recipe, method=method, count=count, seed=seed, module_map=module_map,
         shard=shard, merge=tuple(merge or ()), imported=imported, threads=threads,
-        force=force,
+        force=force, adapter=adapter,
         tensorrt_cache=tensorrt_cache, onnxruntime_table=onnxruntime_table,
         dims=sizes(set_dim or ()), provider=provider_named(provider, plugins or ()),
     )  # fmt: skip

@@ -21,6 +21,7 @@ def compare(
             help="the first without onnxruntime's optimizations, the second with all",
         ),
     ] = False,
+    adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     as_json: given.Json = False,
@@ -34,5 +35,6 @@ def compare(
             listener,
             as_it_stands=as_it_stands,
             provider=provider_named(provider, plugins or ()),
+            adapter=adapter,
         )
     show(found, as_json)

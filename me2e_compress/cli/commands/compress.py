@@ -52,6 +52,7 @@ def compress(
     floor: Floor = SQNR_FLOOR_DB,
     allow_empty: AllowEmpty = False,
     set_dim: given.SetDim = None,
+    adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
@@ -69,7 +70,8 @@ def compress(
         method=method, module_map=module_map, seed=seed, verify_frames=verify_frames,
         measure_frames=measure_frames, floor=floor, allow_empty=allow_empty,
         weight_only_gemv=weight_only_gemv, force=force, dims=sizes(set_dim or ()),
-        unproven=unproven, provider=provider_named(provider, plugins or ()),
+        adapter=adapter, unproven=unproven,
+        provider=provider_named(provider, plugins or ()),
     )  # fmt: skip
     with listening() as listener:
         do = compress_stack if is_stack(model) else workflow.compress

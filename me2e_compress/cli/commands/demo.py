@@ -1,17 +1,17 @@
 """``me2e-compress demo``."""
 
+import time
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from me2e_compress.cli import arguments as given
-from me2e_compress.cli.console import console, listening, show
+from me2e_compress.cli.console import listening, say, show
+from me2e_compress.cli.verbosity import is_verbose
 from me2e_compress.extras import need_extra
-from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.providers import provider_named
-from me2e_compress.workflows.claims import check_ours, writing
-from me2e_compress.workflows.demo_result import DemoResult
+from me2e_compress.workflows.demo_result import DemoResult, figure
 from me2e_compress.workflows.demo_stack import StackDemo
 from me2e_compress.workflows.result import Result
 from me2e_compress.zoo.shipped import SHIPPED
@@ -19,14 +19,11 @@ from me2e_compress.zoo.shipped import SHIPPED
 Output = Annotated[
     Path, typer.Option("-o", "--output", "--out", help="the folder to write")
 ]
-PICTURE = "demo.svg"
 Stack = Annotated[
     Literal["highway", "vad-tiny"],
     typer.Option(help="the trained driver, or a stack of published size"),
 ]
-Scheme = Annotated[
-    str, typer.Option(help="int8 modules: feature-ext, prediction or full")
-]
+Recipe = Annotated[str, typer.Option("-r", "--recipe", "--scheme", help=given.RECIPE)]
 Routes = Annotated[str, typer.Option(help=f"{given.ROUTES}; highway")]
 Rounds = Annotated[int, typer.Option(min=1, help="latency rounds of vad-tiny")]
 Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; for vad-tiny")]
@@ -35,7 +32,7 @@ Threads = Annotated[int, typer.Option(min=0, help="of onnxruntime; for vad-tiny"
 def demo(
     output: Output = Path("out"),
     stack: Stack = "highway",
-    scheme: Scheme = "feature-ext",
+    recipe: Recipe = "full-fused",
     routes: Routes = "5",
     workers: given.Workers = 2,
     rounds: Rounds = 4,
@@ -55,20 +52,22 @@ def demo(
         need_extra("highway", "driving in the demo")
         from me2e_compress.study.demo import DriverDemo
 
-        steps = DriverDemo(stack, output, scheme, routes, workers, runs, force).steps
+        steps = DriverDemo(stack, output, recipe, routes, workers, runs, force).steps
     else:
-        steps = StackDemo(stack, output, scheme, rounds, threads, runs, force).steps
+        steps = StackDemo(stack, output, recipe, rounds, threads, runs, force).steps
     output.mkdir(parents=True, exist_ok=True)
-    check_ours([output / PICTURE], force=force)
     found = dict[str, Result]()
     for name, step in steps.items():
+        begun = time.monotonic()
         with listening() as listener:
             found[name] = step(listener)
         if not as_json:
-            show(found[name])
+            seconds = time.monotonic() - begun
+            say(f"{name:<10}{seconds:4.0f} s   {figure(found[name])}")
+            if is_verbose():
+                show(found[name])
+    whole = DemoResult(found)
     if as_json:
-        show(DemoResult(found), as_json)
-        return
-    with writing([output / PICTURE], force=force):
-        picture = console.export_svg(title="me2e-compress demo")
-        write_bytes(output / PICTURE, picture.encode())
+        show(whole, as_json)
+    elif not is_verbose():
+        show(whole)

@@ -31,7 +31,7 @@ Check = Annotated[
 Latency = Annotated[
     str, typer.Option(help="none, fps:F, trace:FILE, measured, or see list")
 ]
-Scale = Annotated[float, typer.Option(help="of a trace or a measurement")]
+Scale = Annotated[float, typer.Option(help="factor on a trace or a measurement")]
 Model = Annotated[
     str, typer.Option(help="drop decisions meanwhile, or fifo: delay every control")
 ]

@@ -17,11 +17,11 @@ Heads = Annotated[
     ),
 ]
 Opset = Annotated[
-    int, typer.Option(help="of the file: 13 to 18, the last by torch's dynamo exporter")
+    int, typer.Option(help="opset of the file: 13 to 18; 18 by torch's dynamo exporter")
 ]
 Seed = Annotated[
     int | None,
-    typer.Option(min=0, help="of everything random: of the weights; default 0"),
+    typer.Option(min=0, help="seed of everything random: the weights; default 0"),
 ]
 
 Operators = Annotated[
@@ -30,7 +30,7 @@ Operators = Annotated[
 ]
 DialectName = Annotated[
     str | None,
-    typer.Option(help="of that node's plugin library; default me2e, our own form"),
+    typer.Option(help="dialect of that node's plugin library; default me2e, our own"),
 ]
 Weights = Annotated[
     Path | None,
@@ -58,7 +58,7 @@ def export(
     force: given.Force = False,
     as_json: given.Json = False,
 ) -> None:
-    """Write a reference stack as ONNX: drawn, of a checkpoint, or our driver."""
+    """Write a reference stack: random weights, a checkpoint's, or our driver."""
     options = workflow.ExportOptions(
         opset, heads, seed, force, operators, dialect, weights, ema
     )

@@ -25,6 +25,7 @@ def inspect(
         Path | None, typer.Option(help="latencies by module, of profile --by-module")
     ] = None,
     frames: Annotated[Path | None, typer.Option(help="the recorded FRAMES")] = None,
+    adapter: given.Adapter = None,
     as_json: given.Json = False,
 ) -> None:
     """Show what a graph holds: interface, and nodes, parameters, MACs by module.
@@ -35,5 +36,6 @@ def inspect(
     dims = sizes(set_dim or ())
     with listening() as listener:
         do = inspect_stack if is_stack(model) else workflow.inspect
-        found = do(*(model, module_map, dims, modelled_energy, trace, frames, listener))
+        read = module_map, dims, modelled_energy, trace, frames, listener, adapter
+        found = do(model, *read)
     show(found, as_json)

@@ -26,10 +26,10 @@ def lint(
     set_dim: given.SetDim = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
-    shown: Annotated[int, typer.Option(min=0, help="nodes shown of each rule")] = 3,
+    shown: Annotated[int, typer.Option(min=0, help="nodes shown for each rule")] = 3,
     as_json: given.Json = False,
 ) -> None:
-    """Check a graph for the program that will run it; 1 if it would be refused."""
+    """Check a graph for the runtime that will run it; exit code 1 if it refuses."""
     runs = provider_named(provider, plugins or ())
     options = workflow.LintOptions(target, trt_check, sm, sizes(set_dim or ()), runs)
     with listening() as listener:

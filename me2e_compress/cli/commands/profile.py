@@ -22,24 +22,25 @@ def profile(
         Path | None, typer.Argument(help="the recorded FRAMES; none for --import")
     ] = None,
     imported: given.Import = None,
-    samples: Annotated[int | None, typer.Option(help="how many latencies")] = None,
+    samples: Annotated[int | None, typer.Option(help="number of latencies")] = None,
     warm_up: Annotated[int, typer.Option(help="inferences before")] = WARM_UP,
     threads: given.Threads = 1,
     by_module: Annotated[
-        bool, typer.Option("--by-module", help="then modules and operators too")
+        bool, typer.Option("--by-module", help="modules and operators too")
     ] = False,
     figure: Annotated[
         Path | None, typer.Option(help="draw modules over inferences: PNG, SVG, PDF")
     ] = None,
     energy: Annotated[
         str | None,
-        typer.Option(help="then joules: auto, nvml, ina3221, rapl, recorded:FILE"),
+        typer.Option(help="joules too: auto, nvml, ina3221, rapl, recorded:FILE"),
     ] = None,
     energy_out: Annotated[
         Path | None, typer.Option(help="joules as JSON; beside the trace if not named")
     ] = None,
     budget_ms: given.Budget = BUDGET_MS,
     module_map: given.ModuleMap = None,
+    adapter: given.Adapter = None,
     provider: given.Provider = "cpu",
     plugins: given.Plugins = None,
     force: given.Force = False,
@@ -55,6 +56,7 @@ def profile(
         energy=energy,
         energy_output=energy_out,
         budget_ms=budget_ms,
+        adapter=adapter,
     )
     with listening() as listener:
         if imported is not None:

@@ -25,7 +25,9 @@ Picked = Annotated[
 def routes(
     output: Output = None,
     seed: given.Seed = 0,
-    variants: Annotated[int, typer.Option(min=1, help="of each type")] = VARIANTS,
+    variants: Annotated[
+        int, typer.Option(min=1, help="routes of each type")
+    ] = VARIANTS,
     scenarios: Scenarios = "all",
     workers: given.Workers = 1,
     examine: Examine = None,

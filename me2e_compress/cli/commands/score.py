@@ -21,10 +21,10 @@ Junctions = Annotated[
     Path | None, typer.Option(help="JSON: where each route passes its junction")
 ]
 AbilityRules = Annotated[
-    str | None, typer.Option("--abilities", help="by the rules of 0.0.3 or 0.0.4")
+    str | None, typer.Option("--abilities", help="rules of abilities: 0.0.3 or 0.0.4")
 ]
 Penalties = Annotated[
-    str | None, typer.Option(help="of infractions: b2d, 1.0, 2.0 or 2.1")
+    str | None, typer.Option(help="penalties of infractions: b2d, 1.0, 2.0 or 2.1")
 ]
 Joules = Annotated[
     list[str] | None,

@@ -44,13 +44,13 @@ BaselineMedian = Annotated[
     float | None, typer.Option(help=f"seconds of float on the device; {ROAD}")
 ]
 FirstRung = Annotated[
-    int | None, typer.Option(min=1, help=f"so many routes all drive: 22; {ROAD}")
+    int | None, typer.Option(min=1, help=f"routes that all drive: 22; {ROAD}")
 ]
 Seed = Annotated[
-    int | None, typer.Option(min=0, help=f"of everything random: 0; {ROAD}")
+    int | None, typer.Option(min=0, help=f"seed of everything random: 0; {ROAD}")
 ]
 Workers = Annotated[
-    int | None, typer.Option(min=1, help=f"processes: as many at a time; {ROAD}")
+    int | None, typer.Option(min=1, help=f"processes at a time; {ROAD}")
 ]
 
 
@@ -94,12 +94,13 @@ def search(
             "drives": drives, "modules": modules, "ablate": ablate,
             "most-ablated": most_ablated, "routes": routes, "latency": latency,
             "baseline-median-s": baseline_median_s, "first-rung": first_rung,
-            "seed": seed, "adapter": adapter, "workers": workers,
+            "seed": seed, "workers": workers,
         })  # fmt: skip
         options = workflow.SearchOptions(
             max_mb=max_mb, max_ms=max_ms, max_joules=max_joules, scheme=scheme,
             rules=rules, target=target, ranges=ranges, module_map=module_map,
             count=count, threads=threads, dims=dims, force=force, provider=runs_on,
+            adapter=adapter,
         )  # fmt: skip
         with listening() as listener:
             found = workflow.search(model, frames, output, options, listener)

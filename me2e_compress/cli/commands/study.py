@@ -15,7 +15,7 @@ Provider = Annotated[
 ]
 Routes = Annotated[str | None, typer.Option(help=f"{given.ROUTES}; not the study's")]
 Tables = Annotated[
-    str | None, typer.Option(help="of its blocks only these: 2,3 or names")
+    str | None, typer.Option(help="only these of its blocks: 2,3 or names")
 ]
 Records = Annotated[
     Path | None,
@@ -93,4 +93,4 @@ def study(
     show(found, as_json)
     if not as_json:
         *first, last = map(str, files)
-        say(f"{', '.join(first)} and {last} are yours.")
+        say(f"wrote {', '.join(first)} and {last}")

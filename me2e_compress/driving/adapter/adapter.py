@@ -1,5 +1,7 @@
 """The TOML file that adapts a model."""
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, Self, TypeAlias
 
@@ -17,7 +19,8 @@ from me2e_compress.driving.axes import Axes
 from me2e_compress.driving.head_fusion import FusionOptions
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
-from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
+from me2e_compress.runtime.recurrence import RECURRENT, declared_pairs
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]
 
@@ -93,6 +96,29 @@ class Adapter(BaseModel):
         if missing := [file for file in files if not file.is_file()]:
             raise EvaluationError(f"{path}: adapter: no such file: {missing[0]}")
         return "+".join(map(sha256_of, files))
+
+    def metadata(self, own: Mapping[str, str]) -> dict[str, str]:
+        """Return what it says of a graph's state and plan, as metadata of the graph.
+
+        Args:
+            own: Of the graph: holds of what the adapter does not name.
+
+        Raises:
+            GraphError: These are malformed.
+        """
+        named = (self.recurrent or {}).items()
+        pairs = {
+            **(declared_pairs(own) or {}),
+            **dict.fromkeys((*self.feeds, *self.images)),
+            **{name: each.answer for name, each in named if each.answer is not None},
+        }
+        said = {RECURRENT: json.dumps(pairs)} if pairs else {}
+        if self.plan is not None:
+            picks = self.plan.command_input
+            renamed = self.inputs.get("command") if picks == "command" else None
+            plan = self.plan.model_copy(update={"command_input": renamed or picks})
+            said[PLAN] = plan.model_dump_json(exclude_none=True)
+        return said
 
     def to_ego(self, waypoints: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Turn [n, 2] waypoints of the model's frame into the ego frame."""

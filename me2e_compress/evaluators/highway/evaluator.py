@@ -84,7 +84,8 @@ class HighwayEvaluator:
             raise EvaluationError("there is no route to drive")
         opened(self.job.driver)
         made_by = fingerprint(self.job, self.routes, self.set_size)
-        folder = ResultsFolder.create(self.folder, made_by)
+        measured = self.job.conditions.latency.measured
+        folder = ResultsFolder.create(self.folder, made_by, measured)
         done = folder.episodes()
         for path, reason in folder.corrupt.items():
             self.on_warning(f"{path}: {reason}: driven again")

@@ -21,6 +21,9 @@ MANIFEST = "evaluation.json"
 ROUTES = "routes"
 BEFORE = {"latency_model": "drop"}
 """What holds of a folder from before its manifest had the key."""
+MEASURED = "latency_samples"
+"""Key of a manifest: how many the latencies were drawn from. It follows from what
+decides the results, of which it is none."""
 LARGEST_SET = 1_000_000
 """Routes of a set that a manifest may claim."""
 
@@ -65,8 +68,16 @@ class ResultsFolder:
     corrupt: dict[Path, str] = field(default_factory=dict)
 
     @classmethod
-    def create(cls, path: Path, made_by: dict[str, Any]) -> Self:
+    def create(
+        cls, path: Path, made_by: dict[str, Any], measured: int | None = None
+    ) -> Self:
         """Make the folder, or go on with one of the same evaluation.
+
+        Args:
+            path: The folder.
+            made_by: The fingerprint.
+            measured: Samples of the trace that latencies are drawn from; None where
+                none are drawn.
 
         Raises:
             EvaluationError: It holds the results of another evaluation, or something
@@ -78,12 +89,13 @@ class ResultsFolder:
                 _refuse_foreign(path)
             (path / ROUTES).mkdir(exist_ok=True)
             if not (path / MANIFEST).exists():
-                write_json(path / MANIFEST, made_by, indent=1)
+                drawn = {} if measured is None else {MEASURED: measured}
+                write_json(path / MANIFEST, made_by | drawn, indent=1)
         except OSError as error:
             raise _unwritable(path, error) from error
         folder = cls.open(path)
         both = folder.made_by, made_by
-        for key in sorted({*made_by, *folder.made_by}):
+        for key in sorted({*made_by, *folder.made_by} - {MEASURED}):
             old, new = (each.get(key, BEFORE.get(key)) for each in both)
             if old != new:
                 raise EvaluationError(
@@ -116,6 +128,12 @@ class ResultsFolder:
     def set_size(self) -> int:
         """How many routes the whole set has."""
         return int(self.made_by.get("set_size", len(self.made_by["routes"])))
+
+    @property
+    def measured(self) -> int | None:
+        """How many samples latencies were drawn from; None where none were."""
+        found = self.made_by.get(MEASURED)
+        return found if type(found) is int and found > 0 else None
 
     @property
     def log(self) -> Path:
@@ -201,7 +219,7 @@ def _check_manifest(path: Path, made_by: object) -> None:
     routes = made_by["routes"]
     for route in routes:
         if not isinstance(route, str) or not is_route_id(route):
-            raise EvaluationError(f"{path}: {MANIFEST}: {_short(route)} is no route")
+            raise EvaluationError(f"{path}: {MANIFEST}: {_short(route)} is not a route")
     if len(set(routes)) < len(routes):
         raise EvaluationError(f"{path}: {MANIFEST} names a route twice")
     size = made_by.get("set_size", len(routes))

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import opset_of
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -97,7 +98,9 @@ def _notes(
         for node, reason in wide.items()
         if any(each is not None and each.dtype == FLOAT for each in node.inputs)
     )
-    notes = [f"{len(narrow)} nodes in float16, {floats.total()} stay in float32"]
+    notes = [
+        f"{counted(len(narrow), 'node')} in float16, {floats.total()} stay in float32"
+    ]
     if floats:
         listed = ", ".join(f"{reason} {n}" for reason, n in floats.most_common())
         notes.append(f"float32: {listed}")

@@ -10,6 +10,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph as graphs
+from me2e_compress.display import counted
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import evaluation
@@ -130,13 +131,13 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
     notes = []
     if tally.folded:
         notes.append(
-            f"{tally.folded} nodes became {tally.stored} initializers"
+            f"{counted(tally.folded, 'node')} became"
+            f" {counted(tally.stored, 'initializer')}"
             f" ({tally.growth_bytes:+,} bytes)"
         )
     if tally.kept:
-        notes.append(
-            f"{tally.kept} nodes go on computing constants: cheaper than their bytes"
-        )
+        kept = counted(tally.kept, "node")
+        notes.append(f"{kept} left to compute constants: cheaper than their bytes")
     if tally.refused:
         what = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))
         notes.append(f"onnxruntime cannot evaluate {what}: left as they are")

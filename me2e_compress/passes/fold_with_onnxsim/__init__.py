@@ -51,7 +51,9 @@ class FoldWithOnnxsim(Pass):
     def __post_init__(self) -> None:
         """Check the time."""
         if not 0.0 < self.timeout_s < float("inf"):
-            raise RecipeError(f"{self.name}: timeout_s {self.timeout_s:g} is no time")
+            raise RecipeError(
+                f"{self.name}: timeout_s {self.timeout_s:g} is not a positive time"
+            )
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Fold a copy.

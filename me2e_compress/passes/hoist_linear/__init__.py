@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
+from me2e_compress.display import counted
 from me2e_compress.graph import opset_of
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.hoist_linear.batch_operands import split_operand
@@ -43,13 +44,15 @@ class _Tally:
         found = []
         if products := self.products + self.operands:
             less = f"{self.macs / 1e6:,.1f} MMACs fewer"
-            found.append(f"moved {products} products: {less}")
+            found.append(f"moved {counted(products, 'product')}: {less}")
         if self.others:
-            found.append(f"moved {self.others} other nodes in front of repeated rows")
+            found.append(
+                f"moved {counted(self.others, 'other node')} before repeated rows"
+            )
         if self.merged:
-            found.append(f"merged {self.merged} layers that share what they read")
+            found.append(f"merged {counted(self.merged, 'layer')} by a shared input")
         if self.unread:
-            found.append(f"removed {self.unread} nodes and weights that nothing reads")
+            found.append(f"removed what nothing reads: {self.unread}")
         return tuple(found)
 
 

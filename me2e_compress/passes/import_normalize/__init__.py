@@ -28,7 +28,7 @@ _FUNCTIONS_SINCE_IR = 8
 
 @dataclasses.dataclass(frozen=True)
 class ImportNormalize(Pass):
-    """Give every node a name and a past, and write four things in one way only.
+    """Give every node a name and an origin, and write four things in one way only.
 
     1. Nodes without a name, or with one that is taken, get one.
     2. Every node is told its module and its origin, before anything renames it.

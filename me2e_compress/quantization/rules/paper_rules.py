@@ -26,7 +26,7 @@ class WeightedOperator(Rule):
         if int8_inputs(node):
             return None if facts.fused is None else facts.fused(node)
         if node not in facts.attention:
-            return f"{node.op_type} is no weighted layer"
+            return f"{node.op_type} is not a weighted layer"
         if not is_fused(node):
             return f"{node.op_type} in an attention has no int8 kernel"
         size = facts.attention[node]

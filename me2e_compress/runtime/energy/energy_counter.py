@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from me2e_compress.display import prefixed
 from me2e_compress.errors import EnergyError
 from me2e_compress.registry import Registry, name_in
 from me2e_compress.runtime.energy.energy_recording import EnergyRecording
@@ -102,5 +103,5 @@ def _first(counters: Sequence[EnergyCounter]) -> Reader | EnergyRecording | Abse
         found = each.open()
         if not isinstance(found, Absent):
             return found
-        answers.append(f"{each.name}: {found.reason}")
+        answers.append(prefixed(each.name, found.reason))
     return Absent(f"no energy counter answers ({'; '.join(answers)})")

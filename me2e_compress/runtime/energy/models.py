@@ -30,6 +30,7 @@ def measure_energy(
     *,
     threads: int = 1,
     provider: Provider = CPU,
+    said: Mapping[str, str] | None = None,
     on_window: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, EnergyResult]:
     """Measure the energy of models, one frame at a time, window by window in turn.
@@ -45,6 +46,7 @@ def measure_energy(
         schedule: How long, and how often; None takes the defaults.
         threads: Of onnxruntime.
         provider: What runs them.
+        said: What is known of them beside their own metadata.
         on_window: Called with windows done, windows in all, and the model's name.
 
     Returns:
@@ -68,7 +70,9 @@ def measure_energy(
             )
         found = dict.fromkeys(models, opened.measured(schedule or EnergySchedule()))
     else:
-        found = _metered(models, frames, opened, schedule, threads, provider, on_window)
+        found = _metered(
+            *(models, frames, opened, schedule, threads, provider, on_window, said)
+        )
     return {
         name: dataclasses.replace(result, model_sha256=digests[name])
         for name, result in found.items()
@@ -83,11 +87,12 @@ def _metered(
     threads: int,
     provider: Provider,
     on_window: Callable[[int, int, str], None],
+    said: Mapping[str, str] | None,
 ) -> dict[str, EnergyResult]:
     try:
         held = _held(frames)
         sessions = {
-            name: open_session(path, threads=threads, provider=provider)
+            name: open_session(path, threads=threads, provider=provider, said=said)
             for name, path in models.items()
         }
         work = {

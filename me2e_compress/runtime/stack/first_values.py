@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from me2e_compress.display import reason
 from me2e_compress.documents import check_regular
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.frames import UNREADABLE, Array
@@ -32,8 +33,7 @@ def read_value(path: Path, name: str, where: str) -> Array:
     except KeyError as error:
         raise GraphError(f"{where} holds no array {name}") from error
     except UNREADABLE as error:
-        line = " ".join(str(error).split())
-        raise GraphError(f"{where} cannot be read: {line}") from error
+        raise GraphError(f"{where} cannot be read: {reason(error)}") from error
 
 
 def fitted(value: Array, port: SessionPort, where: str) -> Array:

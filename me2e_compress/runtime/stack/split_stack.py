@@ -12,7 +12,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.recurrence import RECURRENT, SessionPort
+from me2e_compress.runtime.recurrence import RECURRENT, SessionPort, declared_pairs
 from me2e_compress.runtime.stack.joining import join
 from me2e_compress.runtime.stack.joints import Joints
 from me2e_compress.runtime.stack.part_graph import PartGraph
@@ -81,6 +81,13 @@ class SplitStack:
             joined.at_next,
             joined.metadata,
         )
+
+    def saying(self, said: Mapping[str, str]) -> Self:
+        """Return it with metadata that win over its own."""
+        pairs = {**self.recurrent, **(declared_pairs(said) or {})}
+        recurrent = {name: to for name, to in pairs.items() if to is not None}
+        metadata = {**self.metadata, **said}
+        return dataclasses.replace(self, recurrent=recurrent, metadata=metadata)
 
     def paths(self) -> tuple[Path, ...]:
         """Return every file that belongs to it: the TOML, graphs, first values."""

@@ -201,6 +201,7 @@ def open_session(
     stock: bool = False,
     release: bool = False,
     provider: Provider = CPU,
+    said: Mapping[str, str] | None = None,
 ) -> AnySession:
     """Open an ONNX file, or the stack that a TOML file describes.
 
@@ -213,7 +214,7 @@ def open_session(
     """
     if is_stack(path):
         return StackSession.open(
-            SplitStack.load(path),
+            SplitStack.load(path).saying(said or {}),
             threads=threads,
             optimize=optimize,
             stock=stock,
@@ -227,4 +228,5 @@ def open_session(
         stock=stock,
         release=release,
         provider=provider,
+        said=said,
     )

@@ -1,5 +1,6 @@
-"""Pictures of a driven route: one moment, a strip of moments, an animation."""
+"""Pictures of a driven route: a moment, a strip, an animation, two drives at once."""
 
+from me2e_compress.simulator.pictures.overlay import overlay
 from me2e_compress.simulator.pictures.route import (
     Moment,
     RoutePicture,
@@ -7,4 +8,4 @@ from me2e_compress.simulator.pictures.route import (
     write_png,
 )
 
-__all__ = ["Moment", "RoutePicture", "write_gif", "write_png"]
+__all__ = ["Moment", "RoutePicture", "overlay", "write_gif", "write_png"]

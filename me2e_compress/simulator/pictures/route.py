@@ -14,7 +14,12 @@ from PIL import Image
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.cameras import CAMERA_NAMES, GroundTexture
-from me2e_compress.simulator.pictures.canvas import Text, text_width, write
+from me2e_compress.simulator.pictures.canvas import (
+    Colour,
+    Text,
+    text_width,
+    write,
+)
 from me2e_compress.simulator.pictures.top_view import INK, PAPER, BirdsEye
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.traffic.events import INFRACTIONS, Event
@@ -51,6 +56,11 @@ class Moment:
     events: tuple[Event, ...] = ()
     score: float | None = None
 
+    @property
+    def waypoints(self) -> Floats | None:
+        """The plan in float64, or None."""
+        return None if self.plan is None else np.asarray(self.plan, float)
+
 
 @dataclass(frozen=True, eq=False)
 class RoutePicture:
@@ -80,13 +90,11 @@ class RoutePicture:
 
     def frame(self, index: int) -> Bytes:
         """Draw the six cameras, the view from above and a caption: uint8 [H, W, 3]."""
-        rows = [
-            _beside([self._tile(index, name) for name in names]) for names in MONTAGE
-        ]
-        montage = _above(rows)
+        rows = [in_row([self.tile(index, name) for name in names]) for names in MONTAGE]
+        montage = in_column(rows)
         height = montage.shape[0]
         above = self._from_above(index, (height, round(height * 0.82)))
-        picture = _beside([montage, above])
+        picture = in_row([montage, above])
         return self._captioned(picture, index)
 
     def frames(self, every: int = 1) -> Iterable[Bytes]:
@@ -99,15 +107,16 @@ class RoutePicture:
         """Draw moments side by side, the front camera above the view from above."""
         columns = []
         for index in indices:
-            tile = self._tile(index, "FRONT")
+            tile = self.tile(index, "FRONT")
             side = tile.shape[1]
             above = self._from_above(index, (side, side))
             label = np.full((CAPTION, side, 3), PAPER, np.uint8)
             write(label, [Text(_state(self.moments[index]), 4, 7, 14, INK)])
-            columns.append(_above([label, tile, above]))
-        return _beside(columns)
+            columns.append(in_column([label, tile, above]))
+        return in_row(columns)
 
-    def _tile(self, index: int, name: str) -> Bytes:
+    def tile(self, index: int, name: str) -> Bytes:
+        """Draw what one camera sees, with its name."""
         images = self.moments[index].images
         if images is None:
             height, width = self._image_size
@@ -131,35 +140,40 @@ class RoutePicture:
 
     def _from_above(self, index: int, size: tuple[int, int]) -> Bytes:
         moment = self.moments[index]
-        plan = None if moment.plan is None else np.asarray(moment.plan, float)
-        trail = self._trail[: index + 1]
-        return self._birdseye.draw(
-            moment.scene, trail, plan, self._infractions(index), size
+        trail = self.trail[: index + 1]
+        return self.birdseye.draw(
+            moment.scene, trail, moment.waypoints, self.infractions(index), size
         )
 
     def _captioned(self, picture: Bytes, index: int) -> Bytes:
         caption = np.full((CAPTION, picture.shape[1], 3), PAPER, np.uint8)
-        words = f"{self.title}   {_state(self.moments[index])}"
-        texts = [Text(words, 6, 7, 15, INK)]
-        done = self._infractions(index)
+        write(caption, self.words(index, INK, 7))
+        return in_column([picture, caption])
+
+    def words(self, index: int, colour: Colour, row: int) -> list[Text]:
+        """Return title, time and speed at a height of the caption; infractions red."""
+        said = f"{self.title}   {_state(self.moments[index])}"
+        texts = [Text(said, 6, row, 15, colour)]
+        done = self.infractions(index)
         if done:
             names = list(dict.fromkeys(e.kind.replace("_", " ") for e in done))
-            left = 6 + text_width(words, 15) + 16
-            texts.append(Text(", ".join(names), left, 7, 15, RED))
-        write(caption, texts)
-        return _above([picture, caption])
+            left = 6 + text_width(said, 15) + 16
+            texts.append(Text(", ".join(names), left, row, 15, RED))
+        return texts
 
-    def _infractions(self, index: int) -> tuple[Event, ...]:
+    def infractions(self, index: int) -> tuple[Event, ...]:
         """Return the infractions up to a moment, each once, in order."""
         events = (e for moment in self.moments[: index + 1] for e in moment.events)
         return tuple(dict.fromkeys(e for e in events if e.kind in INFRACTIONS))
 
     @cached_property
-    def _trail(self) -> Floats:
+    def trail(self) -> Floats:
+        """[N, 2] where the ego was, world metres."""
         return np.array([(m.scene.ego.x, m.scene.ego.y) for m in self.moments])
 
     @cached_property
-    def _birdseye(self) -> BirdsEye:
+    def birdseye(self) -> BirdsEye:
+        """Draws the view from above."""
         return BirdsEye(self.texture, self.route)
 
 
@@ -169,13 +183,15 @@ def _state(moment: Moment) -> str:
     return words if moment.score is None else f"{words}   score {moment.score:.1f}"
 
 
-def _beside(pictures: list[Bytes]) -> Bytes:
+def in_row(pictures: list[Bytes]) -> Bytes:
+    """Put pictures of one height side by side."""
     gap = np.full((pictures[0].shape[0], GAP, 3), PAPER, np.uint8)
     parts = [part for picture in pictures for part in (picture, gap)]
     return np.concatenate(parts[:-1], axis=1)
 
 
-def _above(pictures: list[Bytes]) -> Bytes:
+def in_column(pictures: list[Bytes]) -> Bytes:
+    """Put pictures of one width below each other."""
     gap = np.full((GAP, pictures[0].shape[1], 3), PAPER, np.uint8)
     parts = [part for picture in pictures for part in (picture, gap)]
     return np.concatenate(parts[:-1], axis=0)

@@ -19,6 +19,7 @@ from me2e_compress.simulator.pictures.canvas import (
 from me2e_compress.simulator.scene import (
     Actor,
     ActorKind,
+    Ego,
     Scene,
     SignalKind,
     SignalState,
@@ -62,6 +63,25 @@ STATES: dict[SignalState, Colour] = {
 AHEAD_M, BEHIND_M = 50.0, 22.0
 SCALE_BAR_M = 10.0
 LABEL_PX = 14
+OTHER: Colour = (64, 68, 76)
+OTHER_TRAIL: Colour = (150, 154, 162)
+MARGIN = 0.9
+"""Share of the way to the edge within which both egos of an overlay are shown."""
+
+
+@dataclass(frozen=True, eq=False)
+class OtherDrive:
+    """Another drive of the same route, drawn under the ego in grey.
+
+    Attributes:
+        ego: Where its ego is.
+        trail: [N, 2] where that was, world metres.
+        plan: [n, 2] metres in its frame, or None.
+    """
+
+    ego: Ego
+    trail: Floats
+    plan: Floats | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +103,7 @@ class BirdsEye:
         plan: Floats | None,
         events: tuple[Event, ...],
         size: tuple[int, int],
+        other: OtherDrive | None = None,
     ) -> Bytes:
         """Draw one moment, uint8 [rows, columns, 3].
 
@@ -92,24 +113,28 @@ class BirdsEye:
             plan: [n, 2] metres in the ego frame, or None.
             events: Infractions to mark.
             size: Rows and columns of the picture; it shows 72 m from top to bottom.
+            other: Another drive, laid over this one; where it is far, more is shown.
         """
         rows, columns = size
-        scale = rows / (AHEAD_M + BEHIND_M)
         ego = scene.ego
+        scale = rows / (AHEAD_M + BEHIND_M)
         anchor = (columns / 2, AHEAD_M * scale)
+        if other is not None:
+            scale /= _zoom(ego, other.ego, columns / scale / 2)
         pixels = np.empty((rows, columns, 3), np.uint8)
         canvas = Canvas(pixels, (ego.x, ego.y), ego.heading, scale, anchor)
         self._ground(canvas)
         canvas.line(self.route, ROUTE, 2)
+        if other is not None and len(other.trail) > 1:
+            canvas.line(other.trail, OTHER_TRAIL, 5)
         if len(trail) > 1:
             canvas.line(trail, TRAIL, 3)
         _signals(canvas, scene)
         for actor in scene.actors:
             _actor(canvas, actor)
-        corners = canvas.box(ego.x, ego.y, ego.heading, (ego.length, ego.width))
-        _vehicle(canvas, corners, EGO)
-        if plan is not None:
-            _plan(canvas, scene, plan)
+        if other is not None:
+            _ego(canvas, other.ego, other.plan, OTHER, OTHER)
+        _ego(canvas, ego, plan, EGO, PLAN)
         _infractions(canvas, events)
         _scale_bar(canvas)
         return pixels
@@ -145,6 +170,24 @@ class BirdsEye:
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
+
+
+def _zoom(ego: Ego, other: Ego, side_m: float) -> float:
+    """Return how many times more must be shown for the other to be in the picture."""
+    east, north = other.x - ego.x, other.y - ego.y
+    cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+    ahead, left = cos * east + sin * north, cos * north - sin * east
+    shares = (ahead / AHEAD_M, -ahead / BEHIND_M, abs(left) / side_m)
+    return max(1.0, *(float(share) / MARGIN for share in shares))
+
+
+def _ego(
+    canvas: Canvas, ego: Ego, plan: Floats | None, colour: Colour, planned: Colour
+) -> None:
+    corners = canvas.box(ego.x, ego.y, ego.heading, (ego.length, ego.width))
+    _vehicle(canvas, corners, colour)
+    if plan is not None:
+        _plan(canvas, ego, plan, planned)
 
 
 def _vehicle(canvas: Canvas, corners: Floats, colour: Colour) -> None:
@@ -195,15 +238,14 @@ def _signals(canvas: Canvas, scene: Scene) -> None:
         canvas.polygon(ring + place, colour)
 
 
-def _plan(canvas: Canvas, scene: Scene, plan: Floats) -> None:
-    ego = scene.ego
+def _plan(canvas: Canvas, ego: Ego, plan: Floats, colour: Colour) -> None:
     cos, sin = np.cos(ego.heading), np.sin(ego.heading)
     away = plan @ np.array([(cos, sin), (-sin, cos)]) + (ego.x, ego.y)
     points = np.concatenate([[(ego.x, ego.y)], away])
-    canvas.line(points, PLAN, 2)
+    canvas.line(points, colour, 2)
     for point in points[1:]:
         canvas.dot(point, PAPER, 4.0)
-        canvas.dot(point, PLAN, 3.0)
+        canvas.dot(point, colour, 3.0)
 
 
 def _infractions(canvas: Canvas, events: tuple[Event, ...]) -> None:

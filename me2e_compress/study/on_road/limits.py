@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from me2e_compress.display import significant
 from me2e_compress.sensitivity.search import nothing_fits
 from me2e_compress.workflows.budgets import Joules, check_budgets
 
@@ -51,7 +52,8 @@ class Limits:
         """Say what is spent of what."""
         pairs = zip(self._pairs(weighed), self.units(kind), strict=True)
         return ", ".join(
-            f"{cost:.4g} of {most:g} {unit}" for (cost, most), unit in pairs
+            f"{significant(cost)} of {significant(most)} {unit}"
+            for (cost, most), unit in pairs
         )
 
     def refusal(self, whole: Weighed, found: Sequence[Weighed], kind: Joules) -> str:

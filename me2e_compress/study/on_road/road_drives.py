@@ -122,11 +122,11 @@ def make_drives(
     spent = _joules(study, firsts, joules, listener)
     weighed = dict[str, Weighed]()
     for each in firsts:
-        name, ms = each.variant.name, clock.milliseconds(each.variant.name, 50)
-        if each.model is None or ms is None:
+        name, median = each.variant.name, clock.latency(each.variant.name, 50)
+        if each.model is None or median.value is None:
             raise StudyError(f"variant {name}: {each.variant.policy} is not a model")
         size = graph.size(graph.load(each.model)).weight_bytes
-        weighed[name] = Weighed(size / 1e6, ms, spent[name])
+        weighed[name] = Weighed(size / 1e6, median.value, spent[name])
     prepared = {
         each.variant.name: by_file[each.sha256] for each in made if not each.failure
     }

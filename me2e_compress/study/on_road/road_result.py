@@ -11,7 +11,14 @@ from me2e_compress.study.on_road.grid import GridPoint
 from me2e_compress.study.on_road.halving import Rung, Standing
 from me2e_compress.study.on_road.limits import Weighed
 from me2e_compress.workflows.budgets import Joules
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.workflows.result import (
+    Result,
+    Table,
+    counted,
+    number,
+    significant,
+    table,
+)
 
 
 @dataclass(frozen=True)
@@ -78,12 +85,14 @@ class RoadSearchResult(Result):
         """The scheme, and how much worse than float it may be."""
         score, routes = self.difference.driving_score, self.coverage[0]
         mean, most = score.value or 0.0, self.worse_by_at_most
-        said = f"this one: {self.winner.name} ({mean:+.1f} DS); on {routes} routes"
+        said = f"this one: {self.winner.name} ({number(mean, '+.1f')} DS); on"
+        said += f" {counted(routes, 'route')}"
         if most is None:
-            return f"{said} there is no interval: they are too few"
+            return f"{said} there is no interval: too few routes"
         said += (
             f" it is not worse than float by more than {most:.1f} DS (95 %, two-sided:"
-            f" {score.low:+.1f} to {score.high:+.1f}, over these scenario types"
+            f" {number(score.low, '+.1f')} to {number(score.high, '+.1f')}, over these"
+            " scenario types"
         )
         if score.anew_low is not None:
             said += f"; {max(0.0, -score.anew_low):.1f} over types drawn anew"
@@ -179,9 +188,10 @@ class RoadSearchResult(Result):
         if not stood:
             return f"the same file as {scheme.same_as}" if scheme.same_as else ""
         rung, standing = stood[-1]
+        routes = counted(rung.routes, "route")
         if rung is self.rungs[-1]:
-            return "this one" if standing.kept else f"second on {rung.routes} routes"
-        return f"dropped after {rung.routes} routes, {standing.difference:+.1f} DS"
+            return "this one" if standing.kept else f"second on {routes}"
+        return f"dropped after {routes}, {number(standing.difference, '+.1f')} DS"
 
     def _climb(self) -> Table:
         rows = [
@@ -195,7 +205,7 @@ class RoadSearchResult(Result):
             for rung in self.rungs
         ]
         columns = ("routes", "schemes", "kept", "best", "last that was kept")
-        note = f"points of driving score beside float, paired; {self._conditions()}"
+        note = f"points of driving score against float, paired; {self._conditions()}"
         return table("Rungs", columns, rows, note)
 
     def _conditions(self) -> str:
@@ -205,8 +215,8 @@ class RoadSearchResult(Result):
 def _costs(weighed: Weighed | None) -> tuple[str, str, str]:
     if weighed is None:
         return ("-", "-", "-")
-    return (f"{weighed.mb:.2f}", f"{weighed.ms:.1f}", f"{weighed.joules:.4g}")
+    return (f"{weighed.mb:.2f}", f"{weighed.ms:.1f}", significant(weighed.joules))
 
 
 def _said(standing: Standing) -> str:
-    return f"{standing.name} {standing.difference:+.1f}"
+    return f"{standing.name} {number(standing.difference, '+.1f')}"

@@ -23,6 +23,7 @@ from me2e_compress.workflows.budgets import joules_here
 from me2e_compress.workflows.checks import check_folder, load_map, model_path
 from me2e_compress.workflows.claims import writing
 from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.result import counted, duration, number
 
 BASELINE = "float"
 """The model as it is given: what all are held against."""
@@ -151,9 +152,9 @@ def ahead(
     hours = whole.hours * driven / of_all
     how = "by this folder's logs" if whole.measured else "an estimate"
     return (
-        f"{len(grid)} schemes; if all are within the budgets, {driven:,} of"
-        f" {of_all:,} routes are driven: about {hours:.1f} hours on {workers} worker"
-        f"{'s' * (workers > 1)} ({how}), besides making and timing the models"
+        f"{counted(len(grid), 'scheme')}; if all are within the budgets, {driven:,} of"
+        f" {of_all:,} routes are driven: about {duration(3600 * hours)} on"
+        f" {counted(workers, 'worker')} ({how}), besides making and timing the models"
     )
 
 
@@ -189,8 +190,9 @@ def climbed(
         best = rung.standings[0]
         left = sum(each.kept for each in rung.standings)
         tell(
-            f"{rung.routes} routes: {len(rung.standings)} schemes, best {best.name}"
-            f" ({best.difference:+.1f} DS beside float); {left} kept"
+            f"{counted(rung.routes, 'route')}:"
+            f" {counted(len(rung.standings), 'scheme')}, best {best.name}"
+            f" ({number(best.difference, '+.1f')} DS against float); {left} kept"
         )
 
     routes = made.study.routes

@@ -140,7 +140,7 @@ def _begun(
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
     facts = _facts(study, prepared, clock, workspace, listener, others)
-    result = PaperResult(study, facts, {}, {}, clock.scale, this_machine())
+    result = PaperResult(study, facts, {}, {}, clock.scale, this_machine(clock.load))
     setup = DriveSetup(study, clock, workspace, engine, listener)
     return setup, prepared, result
 
@@ -231,7 +231,7 @@ def _facts(
     found = [*_with_joules(study, prepared, found, listener), *others]
     names = [each.variant for each in found]
     more = [each for name, each in known.items() if name not in names]
-    about = {"machine": this_machine(), "device_scale": clock.scale}
+    about = {"machine": this_machine(clock.load), "device_scale": clock.scale}
     save_facts(path, (*found, *more), about)
     return (*found, *(each for each in more if each.of_another_stack))
 

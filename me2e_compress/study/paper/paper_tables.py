@@ -246,7 +246,7 @@ def tail(result: "PaperResult", block: "StudyBlock") -> Table:
     return Table(
         f"The long tail{result.preview}",
         (
-            *("variant", "condition", "mean ms", "worst p99 ms", "decisions a second"),
+            *("variant", "condition", "mean ms", "slowest ms", "decisions a second"),
             *(*SCORES, f"DS to {base}"),
         ),
         tuple(rows),
@@ -254,7 +254,7 @@ def tail(result: "PaperResult", block: "StudyBlock") -> Table:
         " host where its occupancy says that something is near. tail charges each"
         " call's iterations beside 100 ms, device-tail beside what the model takes on"
         " the slow device; even charges every decision what that costs on average."
-        " Milliseconds are what decisions were charged; the worst p99 is of a route."
+        " Milliseconds are what decisions were charged; slowest is the slowest of all."
         " Equation 4 drops what is beyond a whole step, so equal means are not equal"
         " rates in the world.",
         words=2,
@@ -271,7 +271,7 @@ def _latency(
         missing = Cell(MISSING, reason=reason)
         return missing, missing, missing
     ends = [
-        each.latency_us[PERCENTS.index(99)] for each in cell.routes if each.decisions
+        each.latency_us[PERCENTS.index(100)] for each in cell.routes if each.decisions
     ]
     return (
         Cell(f"{mean_us / 1e3:.0f}"),

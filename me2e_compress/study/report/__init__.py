@@ -1,5 +1,5 @@
 """One HTML page that holds a study: nothing beside it is needed to read it."""
 
-from me2e_compress.study.report.page import html
+from me2e_compress.study.report.page import Section, html
 
-__all__ = ["html"]
+__all__ = ["Section", "html"]

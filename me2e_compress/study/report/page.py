@@ -8,8 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from me2e_compress.metrics.infraction import InfractionKind
-from me2e_compress.study.all_tables import near_misses
+from me2e_compress.study.all_tables import near_misses, route_table
 from me2e_compress.study.outcome import StudyResult
 from me2e_compress.study.report.curves import curves
 from me2e_compress.study.report.figures import forest, pareto
@@ -22,38 +21,39 @@ from me2e_compress.study.tables import (
     differences,
     scoreboards,
 )
+from me2e_compress.workflows.result import Table
 
 TEMPLATE = "report.html"
-WORDS = {
-    InfractionKind.COLLISION_PEDESTRIAN: "collision with a pedestrian",
-    InfractionKind.COLLISION_VEHICLE: "collision with a vehicle",
-    InfractionKind.COLLISION_LAYOUT: "collision with an obstacle",
-    InfractionKind.RED_LIGHT: "red light",
-    InfractionKind.STOP: "stop sign",
-    InfractionKind.GIVE_WAY: "give-way sign",
-    InfractionKind.OUTSIDE_ROUTE_LANES: "outside its lanes",
-    InfractionKind.MIN_SPEED: "too slow",
-    InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: "no way for an emergency vehicle",
-    InfractionKind.SCENARIO_TIMEOUT: "scenario timed out",
-    InfractionKind.ROUTE_DEVIATION: "left the route",
-    InfractionKind.VEHICLE_BLOCKED: "blocked",
-    InfractionKind.ROUTE_TIMEOUT: "timed out",
-}
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a page holds beside the study: a heading, and tables or files below it.
+
+    Attributes:
+        title: The heading.
+        tables: In order.
+        files: What each is, and its path from the page; they are linked.
+    """
+
+    title: str
+    tables: tuple[Table, ...] = ()
+    files: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A contrast, its pictures inside the page.
+    """A contrast, its picture inside the page.
 
     Attributes:
         title: The route and the moment.
-        before: Words and data URI of the baseline.
-        after: The same of the variant.
+        words: How it ended for the baseline and for the variant.
+        uri: The picture, as data.
     """
 
     title: str
-    before: tuple[str, str]
-    after: tuple[str, str]
+    words: str
+    uri: str
 
 
 def template(name: str) -> Template:
@@ -67,12 +67,17 @@ def template(name: str) -> Template:
     ).get_template(name)
 
 
-def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
-    """Build the whole page; it refers to nothing outside itself.
+def html(
+    outcome: StudyResult,
+    command: Sequence[str] = (),
+    sections: Sequence[Section] = (),
+) -> str:
+    """Build the whole page; it needs nothing outside itself.
 
     Args:
         outcome: What was found.
         command: What makes it again, word by word.
+        sections: What else is to be told.
     """
     study = outcome.study
     return template(TEMPLATE).render(
@@ -80,6 +85,9 @@ def html(outcome: StudyResult, command: Sequence[str] = ()) -> str:
         preview=study.preview,
         baseline=study.baseline,
         lede=_lede(outcome),
+        alerts=outcome.alerts(),
+        routes=route_table(outcome),
+        sections=sections,
         findings=findings(outcome),
         scoreboards=scoreboards(outcome),
         curves=_markup(curves(outcome)),
@@ -105,9 +113,17 @@ def _lede(outcome: StudyResult) -> str:
     share = f"{driven}" if driven == whole else f"{driven} of {whole}"
     where = f"of {study.evaluator}" if study.elsewhere else "of highway-env"
     names = ", ".join(each.name for each in study.conditions)
-    return (
+    said = (
         f"{_count(len(study.variants), 'variant')} on {share} routes {where}, "
         f"closed loop; {_count(len(study.conditions), 'condition')}: {names}."
+    )
+    found = [each.difference for each in outcome.drives if each.difference is not None]
+    if not found:
+        return said
+    least = max(each.smallest_shown for each in found)
+    return (
+        f"{said} {_count(driven, 'route')} cannot show a difference below {least:.1f}"
+        " points of driving score."
     )
 
 
@@ -121,16 +137,14 @@ def _shown(contrast: Contrast, baseline: str) -> Shown:
         f"{route.scenario}, {contrast.condition}, "
         f"{contrast.time_us / 1e6:.1f} s into the route {route.route}; "
         f"at most {contrast.other.apart_m or 0.0:.1f} m apart",
-        (f"{baseline}: {_fate(route)}", _data_uri(contrast.before)),
-        (f"{contrast.variant}: {_fate(contrast.other)}", _data_uri(contrast.after)),
+        f"{baseline}, in grey: {_ended(route)}; {contrast.variant}, in colour:"
+        f" {_ended(contrast.other)}",
+        _data_uri(contrast.picture),
     )
 
 
-def _fate(route: RouteOutcome) -> str:
-    """Describe in words how a route went."""
-    kinds = [WORDS[InfractionKind(kind)] for kind, _ in route.infractions]
-    words = ", ".join(dict.fromkeys(kinds)) or route.ending
-    return f"driving score {route.driving_score:.1f}, {words}"
+def _ended(route: RouteOutcome) -> str:
+    return f"driving score {route.driving_score:.1f}, {route.fate}"
 
 
 def _recipe(name: str, outcome: StudyResult) -> tuple[str, str, str]:
@@ -147,7 +161,8 @@ def _recipe(name: str, outcome: StudyResult) -> tuple[str, str, str]:
 def _made(outcome: StudyResult, command: Sequence[str]) -> list[tuple[str, str]]:
     study, timing = outcome.study, outcome.study.timing
     versions = ", ".join(f"{name} {text}" for name, text in outcome.versions.items())
-    rows = [("Command", " ".join(command)), ("Machine", outcome.machine)]
+    load = "" if outcome.load is None else f"; while it was timed, {outcome.load}"
+    rows = [("Command", " ".join(command)), ("Machine", f"{outcome.machine}{load}")]
     if outcome.timed:
         rows.append(
             (

@@ -196,7 +196,7 @@ def test_what_is_wrong_in_bench2drive_is_named(
     ("text", "message"),
     [
         ("nuscenes:{root}/nowhere", "nowhere: no such folder"),
-        ("nuscenes:{root}/empty", "name the version; there is none"),
+        ("nuscenes:{root}/empty", "name the version; no v1.0-\\* is in it"),
         (
             "nuscenes{{root={root}, version=v1.0-test}}",
             "no version v1.0-test; there",

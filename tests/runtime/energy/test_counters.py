@@ -1,13 +1,20 @@
 """Counters are found by asking them: they answer in joules, or say why not."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import pynvml
 import pytest
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS, open_counter
+from me2e_compress.runtime.energy import energy_counter
+from me2e_compress.runtime.energy.energy_counter import (
+    ENERGY_COUNTERS,
+    EnergyCounter,
+    open_counter,
+)
 from me2e_compress.runtime.energy.ina3221 import Ina3221, counted
 from me2e_compress.runtime.energy.nvml import Nvml
 from me2e_compress.runtime.energy.rapl import Rapl
@@ -284,3 +291,22 @@ def test_every_counter_of_ours_loads() -> None:
 @pytest.mark.parametrize("text", ["nvml:1", "ina3221", "rapl", "recorded:r.csv"])
 def test_ours_hold(text: str) -> None:
     check_form(ENERGY_COUNTERS.parse(text), ENERGY_COUNTERS)
+
+
+@dataclass(frozen=True)
+class Battery(EnergyCounter):
+    name: ClassVar[str] = "battery"
+
+    def open(self) -> Absent:
+        return Absent("battery: none in this machine")
+
+
+def test_a_counter_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = {"battery": f"{__name__}:Battery"}
+    monkeypatch.setattr(
+        energy_counter, "ENERGY_COUNTERS", replace(ENERGY_COUNTERS, builtin=here)
+    )
+
+    assert reason(open_counter("battery")) == (
+        "no energy counter answers (battery: none in this machine)"
+    )

@@ -12,10 +12,11 @@ from me2e_compress.simulator.cameras import CAMERA_NAMES, CameraRig, Cameras
 from me2e_compress.simulator.pictures import (
     Moment,
     RoutePicture,
+    overlay,
     write_gif,
     write_png,
 )
-from me2e_compress.simulator.pictures.top_view import EGO, PLAN, TRAIL
+from me2e_compress.simulator.pictures.top_view import EGO, OTHER, PLAN, TRAIL
 from me2e_compress.simulator.scene import ActorKind, SignalState
 from me2e_compress.simulator.traffic.events import Event, EventKind
 from tests.simulator.cameras import town
@@ -35,8 +36,8 @@ def moment(i: int, *events: Event, images: Image8 | None = None) -> Moment:
     return Moment(scene, images, PLAN_AHEAD, events, score=100.0 - i)
 
 
-def picture(*moments: Moment) -> RoutePicture:
-    return RoutePicture("Accident_1", TEXTURE, town.ROUTE, moments, tile_width=160)
+def picture(*moments: Moment, tile_width: int = 160) -> RoutePicture:
+    return RoutePicture("Accident_1", TEXTURE, town.ROUTE, moments, tile_width)
 
 
 def count(pixels: Image8, colour: tuple[int, int, int]) -> int:
@@ -198,3 +199,29 @@ def test_two_infractions_at_one_place_are_both_named() -> None:
     again = picture(moment(0, red, replace(red, time_us=50_000)))
     assert two > one + 20
     assert count(above(again.frame(0)), mark) == one
+
+
+def test_an_overlay_shows_both_egos_and_both_cameras() -> None:
+    one, two = (
+        np.stack([np.full((96, 160, 3), shade, np.uint8) for _ in range(6)])
+        for shade in (40, 200)
+    )
+    drives = picture(moment(3, images=one)), picture(moment(9, images=two))
+
+    drawn = overlay(*drives)
+
+    view = drawn[:-64, 3 * 164 :]
+    assert count(view, EGO) > 20
+    assert count(view, OTHER) > 20
+    assert drawn[60, 80].tolist() == [200] * 3  # the other's camera is above
+    assert drawn[160, 80].tolist() == [40] * 3
+
+
+@pytest.mark.parametrize("far", [90, -60])
+def test_an_overlay_shows_more_where_the_other_is_far(far: int) -> None:
+    drives = [picture(moment(at), tile_width=640) for at in (0, far)]
+
+    view = overlay(*drives)[:-64, 3 * 644 :]
+
+    assert count(view, EGO) > 5
+    assert count(view, OTHER) > 5

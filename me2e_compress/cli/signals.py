@@ -1,0 +1,83 @@
+"""Ctrl-C and SIGTERM end a command in order, and soon, whatever it is doing."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+"""Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
+DEAF_S = 5.0
+"""What native code may take until Python hears of a signal; then the process ends."""
+_LOST: dict[type[BaseException], signal.Signals] = {
+    KeyboardInterrupt: signal.SIGINT,
+    SystemExit: signal.SIGTERM,
+}
+"""What signals raise, by what they are."""
+_MOMENT_S = 0.02
+
+
+@contextlib.contextmanager
+def signals_in_order() -> Iterator[None]:
+    """Make SIGTERM an exit like Ctrl-C: processes and drafts are cleared away.
+
+    What is raised while Python clears something away, or in a callback of native code,
+    is lost. Python tells of it; the signal is then sent once more, a moment later.
+    Native code that does not come back, such as a loop without end in a graph, hears
+    nothing: the process ends all the same, and leaves what a kill leaves.
+    """
+    heard = threading.Event()
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        heard.set()
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(TERMINATED)
+
+    def again(lost: "sys.UnraisableHookArgs") -> None:
+        number = _LOST.get(lost.exc_type)
+        if number is None:
+            hook(lost)
+        else:
+            threading.Timer(_MOMENT_S, os.kill, (os.getpid(), number)).start()
+
+    hook, sys.unraisablehook = sys.unraisablehook, again
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, leave)}
+    # what is started in the background ignores Ctrl-C, and goes on doing so
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, leave)
+    try:
+        with _ended_where_unheard(heard):
+            yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        sys.unraisablehook = hook
+
+
+@contextlib.contextmanager
+def _ended_where_unheard(heard: threading.Event) -> Iterator[None]:
+    """Watch for signals in a thread: Python writes their numbers into a pipe."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+
+    def watch() -> None:
+        while number := os.read(reader, 1):
+            wanted = number[0] in (signal.SIGINT, signal.SIGTERM)
+            if wanted and not heard.wait(DEAF_S):
+                os.write(2, b"me2e-compress: interrupted\n")
+                os._exit(128 + number[0])
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(writer)
+        thread.join()
+        os.close(reader)

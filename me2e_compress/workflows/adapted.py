@@ -1,0 +1,49 @@
+"""What a user's adapter says of a graph's state and plan, for those who run it."""
+
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter.outputs import plan_of
+from me2e_compress.driving.shipped_adapters import adapter_file
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.runtime.recurrence import recurrent_inputs
+
+
+def adapted(model: ir.Model, adapter: str | Path | None) -> dict[str, str]:
+    """Write what an adapter says into the metadata of a graph in memory.
+
+    Args:
+        model: the graph, or the interface of a stack.
+        adapter: TOML file, or the name of one that ships; None says nothing.
+
+    Returns:
+        The metadata that were written, for a session that opens the file.
+
+    Raises:
+        EvaluationError: no such adapter, or it is not of this graph.
+        GraphError: the graph's own metadata are malformed.
+    """
+    if adapter is None:
+        return {}
+    found = Adapter.load(adapter_file(Path(adapter)))
+    said = found.metadata(model.metadata_props)
+    inputs, outputs = (
+        [str(each.name) for each in side]
+        for side in (model.graph.inputs, model.graph.outputs)
+    )
+    for name in (*found.feeds, *found.images):
+        if name not in inputs:
+            raise EvaluationError(
+                f"adapter {adapter}: it feeds input {name}; there are"
+                f" {', '.join(inputs)}"
+            )
+    model.metadata_props.update(said)
+    try:
+        if found.plan is not None:
+            plan_of(found.plan, {}, outputs)
+        recurrent_inputs(model)
+    except (EvaluationError, GraphError) as error:
+        raise EvaluationError(f"adapter {adapter}: {error}") from error
+    return said

@@ -1,0 +1,120 @@
+"""Recorded driving as a policy sees it, for a graph that drives through an adapter."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from me2e_compress.calibration.logs.base import (
+    CAMERAS,
+    DriveLog,
+    Floats,
+    LogMoment,
+    LogScene,
+)
+from me2e_compress.calibration.logs.futures import command_at
+from me2e_compress.calibration.logs.log_frames import changes
+from me2e_compress.calibration.logs.pictures import read_pixels
+from me2e_compress.driving.contract import Observation
+from me2e_compress.driving.ego_kinematics import EgoKinematics
+from me2e_compress.driving.onnx_policy import OnnxPolicy
+from me2e_compress.errors import EvaluationError, FramesError
+from me2e_compress.runtime.frames import Array
+
+
+@dataclass(frozen=True)
+class AdaptedInputs:
+    """Lays the moments of a log out as the inputs of a graph, as its adapter says.
+
+    Attributes:
+        policy: the graph with its adapter.
+    """
+
+    policy: OnnxPolicy
+
+    def log_for(self, log: DriveLog) -> DriveLog:
+        """Return a log with the cameras that the graph sees, in the contract's words.
+
+        Raises:
+            FramesError: cameras or a size are said twice.
+        """
+        for option in ("cameras", "size", "width"):
+            if getattr(log, option):
+                raise FramesError(
+                    f"{log.name}: {option} and the adapter's [images] both say what"
+                    " the model sees: leave one out"
+                )
+        seen = tuple(CAMERAS[at] for at in self.policy.inputs.cameras)
+        return dataclasses.replace(log.as_contract(), cameras=seen)
+
+    def check(self, log: DriveLog) -> None:
+        """Check nothing: the policy was run on zeros when it was opened."""
+
+    def ground(self, now: LogMoment) -> Floats | None:
+        """Return [4, 4] to the frame of the plan; None where that is left-handed.
+
+        What happened next has headings, which mean nothing in a mirror.
+        """
+        axes = self.policy.adapter.axes
+        if axes.is_left_handed:
+            return None
+        from_ego = np.eye(4)
+        from_ego[:3, :3] = axes.to_ego.T
+        return from_ego @ now.lidar_to_ego
+
+    def arrays(
+        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+    ) -> dict[str, Array]:
+        """Return the feeds of a moment; those of a scene's first with first values.
+
+        Raises:
+            FramesError: a picture cannot be read, or the log does not tell what an
+                input is made of.
+        """
+        if before is None:
+            self.policy.reset(None)
+        seen = self._observation(log, scene, at, before)
+        try:
+            feeds = self.policy.feeds(seen)
+            first = self.policy.first.at(feeds) if before is None else {}
+        except EvaluationError as error:
+            raise FramesError(f"{log.name}: {error}") from error
+        return {**feeds, **first}
+
+    def _observation(
+        self, log: DriveLog, scene: LogScene, at: int, before: int | None
+    ) -> Observation:
+        now = scene[at]
+        to_ego = np.linalg.inv(now.lidar_to_ego)
+        rows, columns = self.policy.image_size
+        images = np.zeros((len(CAMERAS), rows, columns, 3), np.uint8)
+        projections = np.tile(np.eye(4), (len(CAMERAS), 1, 1))
+        for camera in log.seen:
+            if camera not in now.pictures:
+                there = ", ".join(now.pictures)
+                raise FramesError(f"{log.name}: no camera {camera}; there is {there}")
+            picture, place = read_pixels(now.pictures[camera], (rows, columns))
+            images[CAMERAS.index(camera)] = picture
+            looks = place @ now.lidar_to_image[camera] @ to_ego
+            projections[CAMERAS.index(camera)] = looks
+        bus = changes(now, None if before is None else scene[before])
+        return Observation(
+            now.time_us - scene[0].time_us,
+            images,
+            projections.astype(np.float32),
+            bus.astype(np.float32),
+            command_at(log, scene, at),
+            float(now.can_bus[7]),
+            motion=_motion(now),
+        )
+
+
+def _motion(now: LogMoment) -> EgoKinematics:
+    """Return where the ego is, of a CAN bus that is laid out as the contract's."""
+    to_world = now.lidar_to_world @ np.linalg.inv(now.lidar_to_ego)
+    x, y = to_world[:2, 3].tolist()
+    heading = math.atan2(to_world[1, 0], to_world[0, 0])
+    speed, *moving = now.can_bus[[7, *range(10, 16)]].tolist()
+    ax, ay, az, roll, pitch, yaw = moving
+    return EgoKinematics(x, y, heading, speed, (ax, ay, az), (roll, pitch, yaw))

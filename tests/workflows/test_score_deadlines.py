@@ -1,0 +1,36 @@
+"""Percentiles of what decisions were charged: of a trace, no more than it tells."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.metrics.episode import InferenceRecord
+from me2e_compress.workflows.score import score
+from tests.metrics.drives import cruise, drive
+
+MADE_BY = {"routes": ["r"], "set_size": 1}
+
+
+def kept(path: Path, measured: int | None) -> ResultsFolder:
+    folder = ResultsFolder.create(path, MADE_BY, measured)
+    decisions = tuple(InferenceRecord(50_000 * at, 40_000) for at in range(1000))
+    folder.keep(replace(drive(driven=cruise()), route="r", decisions=decisions))
+    return folder
+
+
+def test_a_folder_keeps_how_many_samples_its_latencies_are_of(tmp_path: Path) -> None:
+    for name, measured in {"trace": 16, "measured": None}.items():
+        kept(tmp_path / name, measured)
+    drawn, own = str(tmp_path / "trace"), str(tmp_path / "measured")
+
+    late = score(drawn, own).late
+
+    why = late[drawn].percentiles_ms[99.0].reason
+    assert why == "needs 100 samples, has 16"
+    assert late[own].percentiles_ms[99.9].value == 40.0
+
+
+def test_that_number_makes_no_other_evaluation(tmp_path: Path) -> None:
+    before = kept(tmp_path, None)
+
+    assert ResultsFolder.create(tmp_path, MADE_BY, 16).episodes() == before.episodes()
