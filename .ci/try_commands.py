@@ -63,7 +63,6 @@ USES = (
     "score real",
     "study study.toml -o study",
     "routes --scenarios ParkingCutIn --variants 1 -o routes.json",
-    "train highway --small --workers 2 -o trained",
     "demo -o out",
 )
 

@@ -162,7 +162,7 @@ def _truth(given: argparse.Namespace) -> dict[str, object]:
     import onnx_ir as ir
 
     from me2e_compress.modules import ModuleMap, assign
-    from me2e_compress.zoo.truth import record
+    from tests.zoo.truth import record
 
     known = record(given.stack, opset=given.opset)
     graph = ir.load(_model(given))

@@ -11,8 +11,8 @@ import pytest
 from me2e_compress.modules import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime import first_opening
-from me2e_compress.zoo import truth
 from tests import profiles
+from tests.zoo import truth
 
 if TYPE_CHECKING:
     from me2e_compress.zoo.vad.stack import VadTiny

@@ -24,14 +24,10 @@ TOOLS = ("bench", "docs", "models", "test")
 ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
 
 TORCH = (
-    "training",
-    "workflows.train",
     "zoo.bev",
-    "zoo.highway",
     "zoo.tcp",
     "zoo.uniad",
     "zoo.vad",
-    "zoo.counter",
     "zoo.drawing",
     "zoo.resnet",
 )
@@ -49,8 +45,6 @@ PICTURES = (
     "simulator.cameras",
     "simulator.pictures",
     "study",
-    "training",
-    "workflows.train",
 )
 WORLD = (
     *PICTURES,

@@ -2,42 +2,56 @@
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, signals_in_order
 from me2e_compress.display import printable
 from me2e_compress.errors import Me2eError
 
-_AGAIN = "run again to go on"
+AGAIN = "run again to go on"
 RESUMES = {
-    **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study", "train"), _AGAIN),
-    "frames": f"{_AGAIN} after the last whole scene, if there is one",
+    **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study"), AGAIN),
+    "frames": f"{AGAIN} after the last whole scene, if there is one",
 }
 """Commands that go on where they were interrupted, and what to do for that."""
 
 
 def main() -> int:
-    """Run the command and give its exit code; our own errors are one line and code 1.
+    """Run the command and return its exit code."""
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
+    again = [RESUMES[word] for word in words[:1] if word in RESUMES]
+    return run_in_order(_commands, *again)
 
-    The commands are imported here, not above: the processes that ``evaluate`` spawns
-    import this module again, and need none of them.
+
+def run_in_order(run: Callable[[], None], again: str = "") -> int:
+    """Run a command line; errors of ours are one line and code 1, signals another.
+
+    Args:
+        run: reads ``sys.argv``, and ends by itself or by ``SystemExit``.
+        again: what to do after an interruption; empty says nothing.
     """
     try:
         with signals_in_order():
-            code = _run()
+            code = _run(run)
     except SystemExit as done:
         code = done.code if isinstance(done.code, int) else int(bool(done.code))
     except KeyboardInterrupt:
         code = INTERRUPTED
     if code in (INTERRUPTED, TERMINATED):
-        words = [word for word in sys.argv[1:] if not word.startswith("-")]
-        again = [RESUMES[word] for word in words[:1] if word in RESUMES]
-        sys.stderr.write(f"me2e-compress: {'; '.join(['interrupted', *again])}\n")
+        said = "; ".join(filter(None, ["interrupted", again]))
+        sys.stderr.write(f"me2e-compress: {said}\n")
     return code
 
 
-def _run() -> int:
+def _commands() -> None:
+    # not imported above: processes that evaluate spawns import this module, not these
     from me2e_compress.cli.app import app
+
+    app(standalone_mode=True, prog_name="me2e-compress")
+
+
+def _run(run: Callable[[], None]) -> int:
     from me2e_compress.cli.console import errors
     from me2e_compress.cli.verbosity import Verbosity, set_verbosity
     from me2e_compress.extras import explained
@@ -45,7 +59,7 @@ def _run() -> int:
     set_verbosity(Verbosity.NORMAL)
     try:
         _check_place()
-        app(standalone_mode=True, prog_name="me2e-compress")
+        run()
     except (Me2eError, OSError, ImportError) as error:
         told = explained(error)
         if isinstance(told, ImportError):

@@ -153,12 +153,6 @@ _ENTRIES = (
         "Make a fresh set of admitted routes, or examine an existing set again.",
         "highway",
     ),
-    CommandEntry(
-        DRIVE,
-        "train",
-        "Train the driver from nothing: collect, learn, drive, learn again (hours).",
-        "zoo,highway",
-    ),
 )
 
 COMMANDS = {entry.name: entry for entry in _ENTRIES}

@@ -36,7 +36,7 @@ INPUTS = {
     f"search {F} --max-mb 1 --ranges ranges.json": "ranges.json",
     f"sensitivity {F} --drive 1 --adapter a.toml": "a.toml",
 }
-FOLDERS = [f"frames {M}", f"evaluate {M}", "study study.toml", "train highway"]
+FOLDERS = [f"frames {M}", f"evaluate {M}", "study study.toml"]
 
 
 @pytest.fixture

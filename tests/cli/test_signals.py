@@ -15,7 +15,6 @@ import pytest
 from tests.cli.test_kills import COMMANDS, check_whole, contents
 
 START = "import sys; from me2e_compress.cli import main; sys.exit(main())"
-TRAIN = "train -o course --small --workers 2"
 
 
 def started(folder: Path, words: str) -> "subprocess.Popen[str]":
@@ -49,18 +48,3 @@ def test_a_signal_at_any_time_leaves_what_was_there(
     with started(dense, words) as again:
         _, said = again.communicate(timeout=120)
         assert again.returncode == 0, said
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_training_that_a_signal_ends_says_nothing_of_the_interpreter(
-    tmp_path: Path, number: signal.Signals
-) -> None:
-    pytest.importorskip("torch")
-    process = started(tmp_path, TRAIN)
-    time.sleep(15)
-    process.send_signal(number)
-    _, said = process.communicate(timeout=60)
-    assert "Traceback" not in said
-    assert "Warning" not in said
-    assert not list(tmp_path.rglob("*.part"))

@@ -5,15 +5,11 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.cli.console import show
-from me2e_compress.metrics.scores import score
-from me2e_compress.training.course import RoundResult
 from me2e_compress.workflows.export import ExportResult
 from me2e_compress.workflows.frames import FramesOptions, FramesResult
-from me2e_compress.workflows.train import TrainResult
 from me2e_compress.zoo.weights_record import WeightsRecord
 from tests.cli.conftest import Command, strict
 from tests.docs.documents import faults
-from tests.metrics.drives import drive
 
 
 def test_an_exported_stack(
@@ -51,13 +47,3 @@ def test_recorded_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     found = strict(capsys.readouterr().out)
     assert faults("frames", found) == []
     assert found["frames"] == 2, "those that there are, not those that were asked for"
-
-
-def test_a_course_of_training(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = RoundResult(tmp_path / "m.onnx", score((drive(),)), tmp_path / "log")
-
-    show(TrainResult((made,)), as_json=True)
-
-    assert faults("train", strict(capsys.readouterr().out)) == []

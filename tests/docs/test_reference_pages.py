@@ -12,7 +12,7 @@ import pytest
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.errors import GraphError
 from tests.docs.conftest import run
-from tests.docs.pages import PAGES, WRITING, Block, blocks
+from tests.docs.pages import PAGES, ROOT, WRITING, Block, blocks
 
 pytestmark = pytest.mark.xdist_group("installed")
 OTHERS = [page for page in PAGES if page not in WRITING]
@@ -24,9 +24,10 @@ from me2e_compress.simulator.routes import load_routes
 from me2e_compress.simulator.world import World
 world = World(load_routes()[0])
 """,
-    "driver": """
-import types
-from me2e_compress.training import course
+    "driver": f"""
+import sys, types
+sys.path.append({str(ROOT)!r})  # it is no part of the package
+from driver import course
 won = types.SimpleNamespace(driver="driver.onnx", scores=types.SimpleNamespace())
 won.scores.driving_score = 0.0
 course.run = lambda asked, folder, workers: (won,)  # days of work

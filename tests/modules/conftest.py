@@ -9,8 +9,8 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.modules import Assignment, ModuleMap, assign
-from me2e_compress.zoo import truth
 from me2e_compress.zoo.vad.stack import VadTiny
+from tests.zoo import truth
 
 
 @dataclasses.dataclass(frozen=True)

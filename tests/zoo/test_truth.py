@@ -9,11 +9,11 @@ import torch
 from torch import nn
 
 from me2e_compress.errors import GraphError
-from me2e_compress.zoo import truth
-from me2e_compress.zoo.counter import MacCounter
 from me2e_compress.zoo.regions import listening, region
 from me2e_compress.zoo.stacks import VAD_TINY
-from me2e_compress.zoo.truth import NOT_COMPUTE, Truth
+from tests.zoo import truth
+from tests.zoo.counter import MacCounter
+from tests.zoo.truth import NOT_COMPUTE, Truth
 
 pytestmark = pytest.mark.xdist_group("vad")
 

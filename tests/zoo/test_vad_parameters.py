@@ -8,9 +8,9 @@ from torch import nn
 
 from me2e_compress.zoo.export import example
 from me2e_compress.zoo.stacks import VAD_TINY
-from me2e_compress.zoo.truth import count_macs
 from me2e_compress.zoo.vad.config import HeadsName
 from me2e_compress.zoo.vad.stack import VadTiny
+from tests.zoo.truth import count_macs
 from tests.zoo.vad.sizes import SIZES, VadSize
 
 pytestmark = pytest.mark.xdist_group("vad")

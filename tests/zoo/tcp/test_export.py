@@ -15,8 +15,8 @@ from me2e_compress.zoo.export import trace
 from me2e_compress.zoo.stacks import Stack
 from me2e_compress.zoo.tcp.config import ActionHeads
 from me2e_compress.zoo.tcp.stack import Tcp
-from me2e_compress.zoo.truth import truth_of
 from tests.zoo.tcp.small import small_spec, small_tcp
+from tests.zoo.truth import truth_of
 
 Arrays = dict[str, NDArray[np.float32]]
 

@@ -19,8 +19,8 @@ from me2e_compress.workflows.export import ExportOptions, export_stack, in_diale
 from me2e_compress.zoo.bev.sizes import Sampling
 from me2e_compress.zoo.export import trace
 from me2e_compress.zoo.stacks import UNIAD_TINY, UNIAD_TRT, Stack
-from me2e_compress.zoo.truth import truth_of
 from me2e_compress.zoo.uniad.config import CONFIGS
+from tests.zoo.truth import truth_of
 from tests.zoo.uniad.small import (
     Arrays,
     nothing_before,

@@ -1,0 +1,231 @@
+"""A course of training, from nothing to a driver: collect, train, drive, repeat."""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from driver import trial
+from driver.checkpoint import Start, fit
+from driver.curriculum import Course, Round, held_out_files
+from driver.episodes import Collection, collect
+from driver.log import Log
+from driver.loop import train
+from driver.network.config import HighwayConfig
+from driver.network.stack import Highway
+from driver.network.to_onnx import write
+from driver.options import difference
+from driver.process import LOG
+from driver.stored_episode import samples_in
+from me2e_compress.driving.latency import FixedLatency, LatencySource
+from me2e_compress.errors import TrainingError
+from me2e_compress.graph import sha256_of
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.runtime.atomic import write_json
+
+MANIFEST = "course.json"
+NO_LATENCY = FixedLatency()
+
+
+@dataclass(frozen=True)
+class CourseProgress:
+    """How far a course is.
+
+    Attributes:
+        what: the present part, in words.
+        done: of the present part.
+        total: of the present part.
+    """
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class RoundResult:
+    """The result of a round.
+
+    Attributes:
+        driver: the ``.onnx``.
+        scores: over the routes of the course's trial.
+        log: losses and scores, one JSON object a line.
+    """
+
+    driver: Path
+    scores: Scores
+    log: Path
+
+
+Listener = Callable[[CourseProgress], None]
+
+
+def run(
+    course: Course,
+    folder: Path,
+    workers: int,
+    on_progress: Listener = lambda progress: None,
+    latency: LatencySource = NO_LATENCY,
+) -> tuple[RoundResult, ...]:
+    """Run the whole course, or what is left of it after an interruption.
+
+    The same course gives the same bytes for the same number of workers, however often
+    it was interrupted.
+
+    Args:
+        course: the rounds.
+        folder: gets a folder a round: ``episodes/``, ``training-0/``, ``trial/``,
+            ``driver.onnx``.
+        workers: processes, for driving and for training.
+        on_progress: called with how far it is.
+        latency: what a decision costs in the trials.
+
+    Returns:
+        The result of each round; the last driver is the one that was asked for.
+
+    Raises:
+        TrainingError: the folder is of another course, an episode is damaged, or a
+            part failed.
+        EvaluationError: episodes or results of something else are in the way.
+    """
+    course = course.on(workers)
+    claim(folder, course)
+    course_run = _CourseRun(course, folder, workers, on_progress, latency)
+    return tuple(
+        course_run.run_round(number, each) for number, each in enumerate(course.rounds)
+    )
+
+
+class _CourseRun:
+    """A course while it runs: what a round hands to the next."""
+
+    def __init__(
+        self,
+        course: Course,
+        folder: Path,
+        workers: int,
+        on_progress: Listener,
+        latency: LatencySource,
+    ) -> None:
+        self.course, self.folder, self.workers = course, folder, workers
+        self.on_progress, self.latency = on_progress, latency
+        self.learned, self.held_out = list[Path](), list[Path]()
+        self.start: Path | None = None
+        self.driver: Path | None = None
+
+    def run_round(self, number: int, each: Round) -> RoundResult:
+        """Run one round."""
+        place, label = self.folder / f"round-{number}", f"round {number}"
+        # drive: the expert, later the last driver and the expert in turns (DAgger)
+        files = self._collect(each, place / "episodes", label)
+        if number == 0:
+            self.held_out = held_out_files(files)
+        fresh = [file for file in files if file not in self.held_out]
+        self.learned += fresh * each.repeat
+        # learn from everything collected so far, from the last weights on
+        self.start, log = self._train(each, place, label)
+        self.driver = place / "driver.onnx"
+        if not self.driver.exists():
+            write(load(self.start, self.course.config), self.driver)
+        # drive routes that were never learned from, for the log
+        scores = self._evaluate(self.driver, place / "trial", label)
+        row = {"learned_frames": frames_in(self.learned), **trial.row_of(scores)}
+        log.add("closed_loop", each.trainings[-1].steps, row)
+        return RoundResult(self.driver, scores, log.path)
+
+    def _collect(self, each: Round, folder: Path, label: str) -> list[Path]:
+        student = None if each.expert_share == 1.0 else self.driver
+        what = Collection(
+            each.seed,
+            each.variants,
+            image_size=self.course.config.image_size,
+            scenarios=each.scenarios,
+            expert_share=each.expert_share,
+            student=None if student is None else sha256_of(student),
+        )
+        on_done = self._progress(f"{label}: driving")
+        collect(
+            folder,
+            what,
+            student,
+            self.workers,
+            lambda now: on_done(now.done, now.total),
+        )
+        return episodes_in(folder)
+
+    def _train(self, each: Round, place: Path, label: str) -> tuple[Path, Log]:
+        """Run all stages and return the last one's checkpoint and log."""
+        made, config = list[Path](), self.course.config
+        for number, training in enumerate(each.trainings):
+            on_done = self._progress(
+                f"{label}: training {number + 1}/{len(each.trainings)}"
+            )
+            folder = place / f"training-{number}"
+            files = (self.learned, self.held_out)
+            start = made[-1] if made else self.start
+            made.append(train(training, config, *files, start, folder, on_done))
+        return made[-1], Log(made[-1].with_name(LOG))
+
+    def _evaluate(self, driver: Path, folder: Path, label: str) -> Scores:
+        what, path = self.course.trial, self.folder / "trial.json"
+        on_done = self._progress("finding routes for the trial")
+        routes = trial.routes_of(what, path, self.workers, on_done)
+        on_done = self._progress(f"{label}: driving the trial")
+        return trial.drive(driver, routes, folder, self.workers, on_done, self.latency)
+
+    def _progress(self, what: str) -> Callable[[int, int], None]:
+        return lambda done, total: self.on_progress(CourseProgress(what, done, total))
+
+
+def load(checkpoint: Path, config: HighwayConfig) -> Highway:
+    """Return the driver of a checkpoint, with its averaged weights.
+
+    Raises:
+        TrainingError: it is not a checkpoint, or one of another model.
+    """
+    model = Highway(config)
+    fit(model, Start.load(checkpoint).mean, checkpoint)
+    return model.eval()
+
+
+def episodes_in(folder: Path) -> list[Path]:
+    """Return the episodes of a folder, in order, without drafts."""
+    return sorted(
+        file for file in folder.glob("*.npz") if not file.name.startswith(".")
+    )
+
+
+def claim(folder: Path, course: Course) -> None:
+    """Make a folder that of a course, or check that it is.
+
+    Raises:
+        TrainingError: it belongs to another one, or holds something else.
+        OSError: it cannot be written.
+    """
+    manifest = folder / MANIFEST
+    folder.mkdir(parents=True, exist_ok=True)
+    if not manifest.exists():
+        if any(not file.name.startswith(".") for file in folder.iterdir()):
+            raise TrainingError(f"{folder}: not empty, and holds no {MANIFEST}")
+        write_json(manifest, asdict(course), indent=1)
+    try:
+        before = json.loads(manifest.read_bytes())
+    except ValueError as error:
+        raise TrainingError(f"{manifest}: not JSON") from error
+    if not isinstance(before, dict):
+        raise TrainingError(f"{manifest}: not a course")
+    if (words := difference(before, asdict(course))) is not None:
+        name, old, new = words
+        raise TrainingError(
+            f"{folder}: holds another course: its {name} is {old}, this one's {new}; "
+            "choose another folder, or the same options"
+        )
+
+
+def frames_in(files: Iterable[Path]) -> int:
+    """Return how many camera frames distinct episodes hold, six images each.
+
+    Raises:
+        TrainingError: a file is not an episode.
+    """
+    return sum(samples_in(file) for file in sorted(set(files)))

@@ -1,0 +1,98 @@
+"""The driver, trained from nothing, and what came of it."""
+
+import dataclasses
+from pathlib import Path
+
+from driver.course import NO_LATENCY, CourseProgress, RoundResult, run
+from driver.curriculum import FULL, SMALL, SMALL_LATENCY
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.workflows.checks import check_folder
+from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.result import Result, Table, number, table
+from me2e_compress.workflows.score import score_records
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class TrainResult(Result):
+    """What came of every round.
+
+    Attributes:
+        rounds: the last one's driver is the one that was asked for.
+    """
+
+    rounds: tuple[RoundResult, ...]
+
+    @property
+    def headline(self) -> str:
+        """The driver."""
+        return f"wrote {self.rounds[-1].driver}"
+
+    def lines(self) -> tuple[str, ...]:
+        """Return driver and log."""
+        return self.headline, f"its log is {self.rounds[-1].log}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return how the driver of every round drives."""
+        rows = [
+            (
+                str(which),
+                str(each.scores.routes),
+                _between(each.scores.driving_score),
+                _between(each.scores.success_rate),
+            )
+            for which, each in enumerate(self.rounds)
+        ]
+        columns = ("round", "routes", "driving score, %", "success rate, %")
+        return (table("driven on fresh routes after every round", columns, rows),)
+
+    def records(self) -> list[dict[str, object]]:
+        """Return a row a score of a round."""
+        return [
+            {"round": which, **record}
+            for which, each in enumerate(self.rounds)
+            for record in score_records(each.scores)
+        ]
+
+    def to_json(self) -> object:
+        """Return driver, log and scores of every round."""
+        rounds = [
+            {"driver": each.driver, "log": each.log, "scores": each.scores.to_json()}
+            for each in self.rounds
+        ]
+        return {"rounds": rounds}
+
+
+def train(
+    output: str | Path,
+    workers: int = 4,
+    listener: Listener = SILENT,
+    *,
+    small: bool = False,
+) -> TrainResult:
+    """Train the driver ``highway``: collect, learn, drive, learn again (hours).
+
+    Args:
+        output: a folder; the same again resumes.
+        workers: processes.
+        listener: is called with progress and warnings.
+        small: go through every part in a minute, and learn nothing.
+
+    Raises:
+        TrainingError: the folder is of another course, or a part failed.
+        GraphError: the folder is a file.
+    """
+    output = Path(output)
+    check_folder(output, ())
+
+    def tell(news: CourseProgress) -> None:
+        listener.on_progress(news.what, news.done, news.total, "")
+
+    course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, NO_LATENCY)
+    with writing(folders=[output]):
+        return TrainResult(run(course, output, workers, tell, latency))
+
+
+def _between(estimate: Estimate) -> str:
+    bounds = f"{number(estimate.low, '.1f')} to {number(estimate.high, '.1f')}"
+    return f"{number(estimate.value, '.1f')} ({bounds})"

@@ -1,0 +1,284 @@
+"""The whole way in small: once through, killed, resumed, refused."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import psutil
+import pytest
+
+from driver.checkpoint import TrainingCheckpoint
+from driver.course import CourseProgress, claim, frames_in, run
+from driver.curriculum import (
+    FULL,
+    SMALL,
+    SMALL_LATENCY,
+    Course,
+    Round,
+    Trial,
+    held_out_files,
+)
+from driver.episodes.collection import Collection, tasks_of
+from driver.log import Log
+from driver.process import Training
+from me2e_compress.driving.onnx_policy import OnnxPolicy
+from me2e_compress.errors import TrainingError
+from me2e_compress.simulator.routes import load_routes
+from tests.driver.made import arrays_of, write
+from tests.driver.small import WORKERS
+
+pytestmark = pytest.mark.xdist_group("small-course")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command comes to, never interrupted."""
+    folder = tmp_path_factory.mktemp("course") / "driver"
+    words = ("train", "highway", "--small", "--workers", str(WORKERS), "-o")
+    subprocess.run(
+        [sys.executable, "-m", "me2e_compress", *words, folder],
+        check=True,
+        capture_output=True,
+    )
+    return folder
+
+
+@pytest.mark.slow
+def test_every_round_leaves_a_driver(small: Path) -> None:
+    for number in range(2):
+        policy = OnnxPolicy.open(small / f"round-{number}" / "driver.onnx")
+        assert policy.image_size == (96, 160)
+
+
+@pytest.mark.slow
+def test_the_log_tells_losses_and_closed_loop_scores(small: Path) -> None:
+    rows = Log(small / "round-1" / "training-1" / "log.jsonl").rows()
+    assert [row["what"] for row in rows] == ["losses", "closed_loop"]
+    mean, low, high = rows[1]["driving_score_percent"]
+    assert 0 <= low <= mean <= high <= 100
+    assert (rows[1]["routes"], len(rows[1]["success_rate_percent"])) == (2, 3)
+
+
+@pytest.mark.slow
+def test_the_log_tells_how_much_was_learned_from(small: Path) -> None:
+    rows = Log(small / "round-1" / "training-1" / "log.jsonl").rows()
+    files = [
+        file
+        for number in range(2)
+        for file in (small / f"round-{number}" / "episodes").glob("*.npz")
+    ]
+    held_out = held_out_files(sorted((small / "round-0" / "episodes").glob("*.npz")))
+    assert rows[1]["learned_frames"] == frames_in(files) - frames_in(held_out)
+
+
+@pytest.mark.slow
+def test_the_student_drives_in_the_second_round(small: Path) -> None:
+    told = [
+        json.loads((small / f"round-{n}" / "episodes" / "dataset.json").read_bytes())
+        for n in range(2)
+    ]
+    assert [each["student"] is None for each in told] == [True, False]
+    assert told[1]["expert_share"] == SMALL.rounds[1].expert_share < 1
+
+
+@pytest.mark.slow
+def test_trial_routes_are_neither_learned_from_nor_judged_on(small: Path) -> None:
+    tried = {
+        (route.scenario, route.seed) for route in load_routes(small / "trial.json")
+    }
+    judged = {(route.scenario, route.seed) for route in load_routes()}
+    learned = {
+        (task.scenario, task.seed)
+        for each in SMALL.rounds
+        for task in tasks_of(
+            Collection(each.seed, each.variants, scenarios=each.scenarios)
+        )
+    }
+    assert len(tried) == SMALL.trial.routes
+    assert not tried & (judged | learned)
+
+
+@pytest.mark.slow
+def test_a_finished_course_is_not_gone_again(small: Path) -> None:
+    def times() -> dict[str, int]:
+        files = sorted(small.rglob("*"))
+        return {
+            str(file): file.stat().st_mtime_ns
+            for file in files
+            if file.is_file() and file.name != "log.jsonl"
+        }
+
+    before, news = times(), list[CourseProgress]()
+    rounds = run(SMALL, small, WORKERS, news.append, SMALL_LATENCY)
+    assert [each.driver.parent.name for each in rounds] == ["round-0", "round-1"]
+    assert times() == before
+    assert all(each.done == each.total for each in news if "training" not in each.what)
+
+
+@pytest.mark.slow
+def test_another_course_is_refused_there(small: Path) -> None:
+    other = replace(SMALL, trial=replace(SMALL.trial, seed=901))
+    words = "holds another course: its trial.seed is 900, this one's 901; choose"
+    with pytest.raises(TrainingError, match=words):
+        run(other, small, WORKERS)
+
+
+def start(folder: Path, rounds: int) -> subprocess.Popen[bytes]:
+    words = [sys.executable, "-m", "tests.driver.small", str(folder), str(rounds)]
+    return subprocess.Popen(words)
+
+
+def kill_when(folder: Path, rounds: int, happened: Callable[[], bool]) -> None:
+    """Begin, wait until it happened, kill; nobody may be left behind."""
+    process = start(folder, rounds)
+    until = time.monotonic() + 300
+    try:
+        while not happened() and process.poll() is None and time.monotonic() < until:
+            time.sleep(0.005)
+        family = psutil.Process(process.pid).children(recursive=True)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert process.returncode == -signal.SIGKILL
+    assert psutil.wait_procs(family, timeout=30)[1] == []
+
+
+def kill_while_driving(folder: Path, rounds: int, which: int) -> None:
+    place = folder / f"round-{which}" / "episodes"
+    total = len(SMALL.rounds[which].scenarios)
+
+    def driven() -> int:
+        return sum(file.name[0] != "." for file in place.glob("*.npz"))
+
+    def begun() -> bool:
+        return (place / "dataset.json").exists() and driven() >= total - 2
+
+    kill_when(folder, rounds, begun)
+    assert driven() < total
+
+
+def kill_while_training(folder: Path, rounds: int, which: int) -> None:
+    last = folder / f"round-{which}" / "training-0" / "last.pt"
+    kill_when(folder, rounds, last.exists)
+    assert TrainingCheckpoint.load(last).step < SMALL.rounds[which].trainings[0].steps
+
+
+def finish(folder: Path, rounds: int) -> None:
+    assert start(folder, rounds).wait(600) == 0
+
+
+@pytest.mark.slow
+def test_killed_twice_it_comes_to_the_same_driver(small: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    kill_while_driving(folder, 1, 0)
+    kill_while_training(folder, 1, 0)
+    finish(folder, 1)
+    drivers = [place / "round-0" / "driver.onnx" for place in (folder, small)]
+    assert drivers[0].read_bytes() == drivers[1].read_bytes()
+
+
+def _has_results(trial: Path) -> bool:
+    return any(trial.glob("*/*.json"))
+
+
+@pytest.mark.slow
+def test_killed_in_every_part_it_comes_to_the_same_driver(
+    small: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "killed"
+    for which in range(2):
+        kill_while_driving(folder, 2, which)
+        kill_while_training(folder, 2, which)
+        trial = folder / f"round-{which}" / "trial"
+        kill_when(folder, 2, partial(_has_results, trial))
+    finish(folder, 2)
+    drivers = [place / "round-1" / "driver.onnx" for place in (folder, small)]
+    assert drivers[0].read_bytes() == drivers[1].read_bytes()
+
+
+def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(TrainingError, match=r"not empty, and holds no course\.json"):
+        claim(tmp_path, SMALL)
+
+
+def test_a_draft_that_a_kill_left_does_not_matter(tmp_path: Path) -> None:
+    (tmp_path / ".course.json.x1").write_text("{")
+    claim(tmp_path, SMALL)
+    assert (tmp_path / "course.json").exists()
+
+
+@pytest.mark.parametrize(("content", "words"), [("{", "not JSON"), ("1", "not a cou")])
+def test_a_broken_manifest_is_named(tmp_path: Path, content: str, words: str) -> None:
+    (tmp_path / "course.json").write_text(content)
+    with pytest.raises(TrainingError, match=rf"course\.json: {words}"):
+        claim(tmp_path, SMALL)
+
+
+def test_other_workers_are_another_course(tmp_path: Path) -> None:
+    claim(tmp_path, FULL.on(4))
+    words = r"its rounds\.0\.trainings\.0\.workers is 4, this one's 2"
+    with pytest.raises(TrainingError, match=words):
+        claim(tmp_path, FULL.on(2))
+
+
+def test_more_workers_than_it_trains_with_do_not_matter(tmp_path: Path) -> None:
+    claim(tmp_path, FULL.on(4))
+    manifest = tmp_path / "course.json"
+    before = manifest.read_bytes()
+
+    claim(tmp_path, FULL.on(8))
+
+    workers = {
+        training["workers"]
+        for each in json.loads(before)["rounds"]
+        for training in each["trainings"]
+    }
+    assert max(workers) == 4
+    assert manifest.read_bytes() == before
+
+
+def test_frames_of_an_episode_named_twice_count_once(tmp_path: Path) -> None:
+    file = write(tmp_path / "0.npz", arrays_of(3))
+    other = write(tmp_path / "1.npz", arrays_of(2))
+    assert frames_in([file, other, file]) == 5
+
+
+@pytest.mark.parametrize("kept", [0, 100, -40])
+def test_a_truncated_episode_is_named(tmp_path: Path, kept: int) -> None:
+    file = write(tmp_path / "0.npz", arrays_of(2))
+    file.write_bytes(file.read_bytes()[:kept])
+    with pytest.raises(TrainingError, match=r"0\.npz: not an episode: ") as caught:
+        frames_in([file])
+    assert "\n" not in str(caught.value)
+
+
+ONE = Round(1, 1, 1.0, (Training(steps=1),))
+
+
+@pytest.mark.parametrize(
+    ("rounds", "trial", "words"),
+    [
+        ((), Trial(), "the expert must drive the first round alone"),
+        ((replace(ONE, expert_share=0.5),), Trial(), "the expert must drive"),
+        ((ONE, replace(ONE, trainings=())), Trial(), "round 1 has no training"),
+        ((ONE,), Trial(seed=1), "the trial and round 0 share the seed 1"),
+    ],
+)
+def test_a_course_that_makes_no_sense(
+    rounds: tuple[Round, ...], trial: Trial, words: str
+) -> None:
+    with pytest.raises(TrainingError, match=f"course: {words}"):
+        Course(rounds, trial)
+
+
+def test_few_episodes_leave_one_to_look_at() -> None:
+    files = [Path(f"{number}.npz") for number in range(60)]
+    assert held_out_files(files[:3]) == [Path("0.npz")]
+    assert held_out_files(files) == [Path("7.npz"), Path("35.npz")]
